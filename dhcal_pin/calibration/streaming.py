@@ -60,7 +60,7 @@ def _apply_to_part(
     function: Callable[[Chunk], _Value], nominal: Chain, scales: Mapping[str, float] | None, part: Part
 ) -> _Value:
     """Read a part, scale its standard deviations and apply a function to it."""
-    item = _read(part)
+    item = _read(part).mounted(nominal)
     return function(Chunk(item.with_scaled_sigma(scales) if scales else item, nominal))
 
 
@@ -157,7 +157,7 @@ def calibrate_stream(
     first = next(iter(parts()), None)
     if first is None:
         raise InvalidArgumentError("no measurements to fit; expected at least one part")
-    head = _read(first)
+    head = _read(first).mounted(chain)
     known = known or {}
     if missing := [parameter.name for parameter in head.instrument_parameters if parameter.name not in known]:
         raise InvalidArgumentError(

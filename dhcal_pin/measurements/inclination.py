@@ -7,7 +7,7 @@ in the link. The sensor sees the upward direction
 
 with the five instrument parameters s (`inclinometer.rx, .ry, .rz`) and t (`up.x, .y`; with the minus sign, if
 the z axis of the measuring frame points down, `down.x, .y`). An accelerometer at rest measures the upward
-direction a. Roll turns the sensor about its x axis, pitch about its y axis:
+direction a. With the rotation Ry(pitch)·Rx(roll) of a sensor that was level,
 
     roll = atan2(a_y, a_z),     pitch = atan2(-a_x, √(a_y² + a_z²)).
 
@@ -53,7 +53,9 @@ _MIN_SINE, _SMALL_ANGLE = 1e-12, 0.03
 _MIN_COSINE = -0.7
 # Steps from each start of the search for the directions of sensor and gravity.
 _N_STEPS = 20
-# Largest excess of an angle over its range by rounding [rad].
+# Multiple of the smallest misfit up to which an earlier start is taken.
+_MAX_MISFIT_RATIO = 2.0
+# Largest excess by rounding of an angle over its range [rad], and of a misfit.
 _ROUNDING = 1e-9
 # Rows and velocity components of the terms: both angles by all three angular velocities.
 _TERMS = (np.repeat([0, 1], 3), np.tile([3, 4, 5], 2))
@@ -275,7 +277,7 @@ class Inclination(Measurement):
         h, to_sensor, _, by_tilt = self._model(frames, u)
         by_sensor = se3.skew(h.T) @ _right_jacobian(u[:3])
         by_gravity = np.einsum("ijm,jt->mit", to_sensor, by_tilt)
-        return np.einsum("rim,mis->srm", self._derivative(h), np.concatenate([by_sensor, by_gravity], 2))
+        return np.einsum("rim,mit->trm", self._derivative(h), np.concatenate([by_sensor, by_gravity], 2))
 
     def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
         """Return the exact residuals and observation matrix."""
@@ -301,14 +303,18 @@ class Inclination(Measurement):
         products = np.einsum("jkm,lm->jkl", to_link, item._axes[2])
         singular = np.linalg.svd(products.swapaxes(0, 1).reshape(3, 9))[0].T
         up = np.concatenate([chain.base[None, :3, 2], singular, -singular])
-        sensor, agreement = np.empty(0), np.empty(0)
+
+        def best_sensors(up: Array) -> Array:
+            return se3.nearest_rotation(np.einsum("jkl,nk->njl", products, up))
+
         for _ in range(_N_STEPS):
-            sensor = se3.nearest_rotation(np.einsum("jkl,nk->njl", products, up))
-            up = np.einsum("jkl,njl->nk", products, sensor)
-            agreement = np.linalg.norm(up, axis=1, keepdims=True)
-            up /= np.maximum(agreement, _MIN_SINE)
-        best = int(np.argmax(agreement > (1 - _ROUNDING) * agreement.max()))
-        points_down, parameters = _parameters(self.link, sensor[best], up[best])
+            up = np.einsum("jkl,njl->nk", products, best_sensors(up))
+            up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), _MIN_SINE)
+        sensors = best_sensors(up)
+        # The first start, the base, unless another one fits clearly better.
+        misfit = len(item.rows) - np.einsum("jkl,nk,njl->n", products, up, sensors)
+        best = int(np.argmax(misfit <= _MAX_MISFIT_RATIO * misfit.min() + _ROUNDING))
+        points_down, parameters = _parameters(self.link, sensors[best], up[best])
         return item.replace(points_down=points_down, instrument_parameters=parameters)
 
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
