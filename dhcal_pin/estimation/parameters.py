@@ -29,6 +29,7 @@ import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -204,14 +205,13 @@ def tool(chain: Chain) -> list[ErrorParameter]:
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
-@dataclass(frozen=True)
-class _Coefficient:
-    """Transmission coefficient of an independent joint or of a link.
+class _Coefficient(NamedTuple):
+    """Transmission coefficient of an independent joint.
 
     Attributes:
         index: Index of the coefficient.
-        owner: Number of the joint or link.
-        name: Name, after that of the joint or link.
+        owner: Number of the joint.
+        name: Name, after that of the joint.
         unit: Unit.
     """
 
@@ -222,7 +222,7 @@ class _Coefficient:
 
 
 def _joint_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]:
-    """Return the coefficients of a family that move joints."""
+    """Return the coefficients of a family that move joints; none for a family of links."""
     linear, harmonics, joint_terms, _ = coefficient_indices(*chain.mimic_matrix.shape)
     n, joints = chain.n_joints, np.flatnonzero(~chain.is_prismatic).tolist()
     if family.name == GAIN:
@@ -241,48 +241,65 @@ def _joint_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]
             for i in joints
             if has_effect[i]
         ]
+    numbers = harmonics.tolist()
     return [
-        _Coefficient(int(harmonics[k - 1, part, i]), i, f"{function}{k}", "rad")
+        _Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad")
         for i in joints
         for k in family.orders
         for part, function in enumerate(("sin", "cos"))
     ]
 
 
-def _link_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]:
-    """Return the coefficients of a family that change lengths of links."""
+def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
+    """Build the parameters of a family of joint errors: transmission coefficients."""
+    coefficients, prior = _joint_coefficients(chain, family), family.prior
+    nominal = [0.0] * len(coefficients)
+    if chain.transmission is not None:
+        nominal = chain.transmission.coefficients[[c.index for c in coefficients]].tolist()
+    # The error acts at the first moving joint that the independent joint drives.
+    moving = (chain.mimic_matrix != 0).argmax(0).tolist()
+    twists = [_joint_twist(chain.axes[j].tolist(), chain.prismatic[j]) for j in moving]
+    frames, names = [link_frame(j + 1) for j in moving], chain.joint_names
+    of_joints = [
+        ErrorParameter(
+            f"{names[c.owner]}.{c.name}",
+            c.unit,
+            value,
+            frames[c.owner],
+            twists[c.owner],
+            prior,
+            c.index,
+            "position",
+        )
+        for c, value in zip(coefficients, nominal, strict=True)
+    ]
+    return of_joints + _link_errors(chain, family)
+
+
+def _link_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
+    """Build the parameters of a family that change lengths of links."""
     term = family.link_term
     if term is None:
         return []
     *_, link_terms = coefficient_indices(*chain.mimic_matrix.shape)
-    indices = link_terms[list(LINK_TERMS).index(family.name)]
-    links = np.flatnonzero(term.has_effect(chain.loads)).tolist()
-    return [_Coefficient(int(indices[j]), j, term.coefficient, term.unit) for j in links]
-
-
-def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
-    """Build the parameters of a family of joint errors: transmission coefficients."""
-    known = chain.transmission
-
-    def parameter(
-        coefficient: _Coefficient, owner: str, frame: int, twist: tuple[float, ...], quantity: str
-    ) -> ErrorParameter:
-        name, index = f"{owner}.{coefficient.name}", coefficient.index
-        nominal = 0.0 if known is None else float(known.coefficients[index])
-        return ErrorParameter(name, coefficient.unit, nominal, frame, twist, family.prior, index, quantity)
-
-    out = []
-    for coefficient in _joint_coefficients(chain, family):
-        # The error acts at the first moving joint that the independent joint drives.
-        joint = int(np.flatnonzero(chain.mimic_matrix[:, coefficient.owner])[0])
-        twist = _joint_twist(chain.axes[joint].tolist(), chain.prismatic[joint])
-        name = chain.joint_names[coefficient.owner]
-        out.append(parameter(coefficient, name, link_frame(joint + 1), twist, "position"))
-    for coefficient in _link_coefficients(chain, family):
-        twist = (*chain.loads.link_vectors[coefficient.owner].tolist(), *_ZERO)
-        name = chain.link_names[coefficient.owner]
-        out.append(parameter(coefficient, name, link_frame(coefficient.owner), twist, "length"))
-    return out
+    indices = link_terms[list(LINK_TERMS).index(family.name)].tolist()
+    nominal = np.zeros(link_terms.shape[1])
+    if chain.transmission is not None:
+        nominal = chain.transmission.coefficients[indices]
+    vectors, names = chain.loads.link_vectors, chain.link_names
+    return [
+        ErrorParameter(
+            f"{names[j]}.{term.coefficient}",
+            term.unit,
+            float(nominal[j]),
+            link_frame(j),
+            (*vectors[j].tolist(), *_ZERO),
+            family.prior,
+            indices[j],
+            "length",
+        )
+        for j in np.flatnonzero(term.has_effect(chain.loads)).tolist()
+    ]
 
 
 @dataclass(frozen=True)

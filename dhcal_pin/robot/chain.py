@@ -341,8 +341,9 @@ class Chain:
         Returns:
             Conditions of m samples.
         """
-        known = q if isinstance(q, Conditions) else Conditions(np.asarray(q, float))
-        return replace(known, q=self.validated_q(known.q))
+        if isinstance(q, Conditions):
+            return replace(q, q=self.validated_q(q.q))
+        return Conditions(self.validated_q(q))
 
     def actual_positions(self, conditions: Conditions) -> tuple[Array, Array | None]:
         """Compute the actual joint positions, which differ from the commanded ones by transmission errors.
@@ -353,11 +354,10 @@ class Chain:
         Returns:
             Actual positions, shape (n, m), and transmission terms, shape (t, n, m), or None for ideal joints.
         """
-        q = np.ascontiguousarray(conditions.q.T)
         if self.transmission is None:
-            return q, None
+            return np.ascontiguousarray(conditions.q.T), None
         terms = self.transmission.terms(conditions)
-        return q + self.transmission.errors(terms), terms
+        return terms[0] + self.transmission.errors(terms), terms
 
     def with_transmission(self, transmission: Transmission) -> Chain:
         """Return a copy with other transmission errors.

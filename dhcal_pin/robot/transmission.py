@@ -194,6 +194,11 @@ class Transmission:
         used = np.flatnonzero(self.harmonics.any((1, 2)))
         return max(self.min_order, int(used[-1]) + 1 if used.size else 0)
 
+    @cached_property
+    def _n_joint_terms(self) -> int:
+        """Number of joint terms up to the last one with a coefficient that is not zero."""
+        return int(np.flatnonzero(self.joint_terms.any(1)).max(initial=-1)) + 1
+
     def terms(self, conditions: Conditions) -> Array:
         """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms."""
         q = np.ascontiguousarray(conditions.q.T)
@@ -207,12 +212,12 @@ class Transmission:
 
     def errors(self, terms: Array) -> Array:
         """Compute the differences between actual and commanded joint positions."""
-        n = len(self.linear)
-        terms = terms[: 2 * self.order + 1 + len(JOINT_TERMS)]
+        n, used = len(self.linear), self.joint_terms[: self._n_joint_terms]
+        terms = terms[: 2 * self.order + 1 + len(used)]
         joints, weights = np.arange(n), np.zeros((len(terms), n, n))
         weights[0] = self.linear
-        of_joints = np.concatenate([self.harmonics[: self.order].reshape(-1, n), self.joint_terms])
-        weights[1:, joints, joints] = of_joints
+        weights[1 : len(terms) - len(used), joints, joints] = self.harmonics[: self.order].reshape(-1, n)
+        weights[len(terms) - len(used) :, joints, joints] = used
         return np.tensordot(weights, terms, ((0, 2), (0, 1)))
 
     def growth(self, terms: Array) -> Array:
