@@ -209,13 +209,13 @@ class _Coefficient(NamedTuple):
     """Transmission coefficient of an independent joint.
 
     Attributes:
-        index: Index of the coefficient.
+        entry: Index of the coefficient.
         owner: Number of the joint.
         name: Name, after that of the joint.
         unit: Unit.
     """
 
-    index: int
+    entry: int
     owner: int
     name: str
     unit: str
@@ -255,10 +255,10 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
     coefficients, prior = _joint_coefficients(chain, family), family.prior
     nominal = [0.0] * len(coefficients)
     if chain.transmission is not None:
-        nominal = chain.transmission.coefficients[[c.index for c in coefficients]].tolist()
+        nominal = chain.transmission.coefficients[[c.entry for c in coefficients]].tolist()
     # The error acts at the first moving joint that the independent joint drives.
     moving = (chain.mimic_matrix != 0).argmax(0).tolist()
-    twists = [_joint_twist(chain.axes[j].tolist(), chain.prismatic[j]) for j in moving]
+    twists = [_joint_twist(chain.axes[j].tolist(), bool(chain.prismatic[j])) for j in moving]
     frames, names = [link_frame(j + 1) for j in moving], chain.joint_names
     of_joints = [
         ErrorParameter(
@@ -268,7 +268,7 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
             frames[c.owner],
             twists[c.owner],
             prior,
-            c.index,
+            c.entry,
             "position",
         )
         for c, value in zip(coefficients, nominal, strict=True)
