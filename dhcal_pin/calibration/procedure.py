@@ -201,10 +201,9 @@ def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> Non
     for name in sets:
         if name in FAMILIES and FAMILIES[name].condition not in known:
             condition = CONDITIONS[FAMILIES[name].condition]
-            column = f"{condition.name}_JOINT" if condition.is_per_joint else condition.name
             raise InvalidArgumentError(
-                f"{name!r} needs the {condition.description}, which no measurement states; expected columns "
-                f"{column!r} in the measurement file"
+                f"{name!r} needs the {condition.description}, which no measurement states; expected "
+                f"{condition.header} in the measurement file"
             )
 
 

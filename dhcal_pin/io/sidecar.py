@@ -82,7 +82,7 @@ from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
-from ..robot.conditions import TEMPERATURE_RANGE
+from ..robot.conditions import MAX_PAYLOAD, TEMPERATURE_RANGE
 from ..robot.error_families import FAMILIES, JOINT_TERMS, LINK_TERMS
 from ..robot.transmission import (
     MAX_CURVE_ORDER,
@@ -99,7 +99,7 @@ from .tabular import MAX_SIDECAR_BYTES
 from .toml_table import Key, TomlTable
 
 # Heaviest payload [kg] and farthest centre [m]; beyond them the unit is wrong.
-MAX_PAYLOAD_KG, MAX_PAYLOAD_DISTANCE_M = 1e5, 1e2
+MAX_PAYLOAD_KG, MAX_PAYLOAD_DISTANCE_M = MAX_PAYLOAD, 1e2
 # Largest coefficient of a joint error, in its unit.
 _MAX_COEFFICIENT = 1e6
 _COEFFICIENT = toml.number(-_MAX_COEFFICIENT, _MAX_COEFFICIENT, description="a finite number", default=0.0)

@@ -563,7 +563,7 @@ def concatenate(items: Sequence[_Kind]) -> _Kind:
             )
     return first.replace(
         **{name: np.concatenate([getattr(item, name) for item in items]) for name in first.sample_fields},
-        recorded=concatenate_conditions([item.recorded or Conditions(item.q) for item in items]),
+        recorded=concatenate_conditions([item.recorded for item in items]),
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from .._kernels.types import JointState
 from .._typing import Array
+from ..units import UNITS
 
 # Plausible temperatures of a robot [°C], and heaviest payload [kg].
 TEMPERATURE_RANGE = -50.0, 150.0
@@ -43,6 +44,12 @@ class Condition:
     low: float
     high: float
     is_per_joint: bool = False
+
+    @property
+    def header(self) -> str:
+        """Header of its column, for messages: `NAME[unit]`, or `NAME_JOINT` for one column per joint."""
+        unit = next(iter(UNITS[self.quantity]), "")
+        return self.name + "_JOINT" * self.is_per_joint + (f"[{unit}]" if unit else "")
 
     def find_problem(self, values: Array) -> tuple[int, str] | None:
         """Return the first sample with a value (m,) that is not possible, and what is wrong with it."""
@@ -123,10 +130,15 @@ class SampleState(JointState):
     conditions: Conditions
 
 
-def concatenate_conditions(parts: Sequence[Conditions]) -> Conditions:
+def concatenate_conditions(parts: Sequence[Conditions | None]) -> Conditions | None:
     """Join the conditions of several sets of samples; a condition has to be known of all of them."""
-    known = frozenset.intersection(*(part.names for part in parts)) | {"q"}
-    return Conditions(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in known})
+    known_parts = [part for part in parts if part is not None]
+    if len(known_parts) < len(parts):
+        return None
+    known = frozenset.intersection(*(part.names for part in known_parts)) | {"q"}
+    return Conditions(
+        **{name: np.concatenate([getattr(part, name) for part in known_parts]) for name in known}
+    )
 
 
 def directions_in_order(q: Array) -> Array:

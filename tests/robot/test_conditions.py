@@ -16,6 +16,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
 from dhcal_pin.io import measurement_text, read_measurements, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Position
+from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.robot import Chain, Conditions
 from dhcal_pin.robot.conditions import directions_in_order
 
@@ -99,6 +100,19 @@ def test_payload_of_a_sample_loads_compliant_joints(arm):
 def test_a_joint_that_does_not_move_keeps_its_direction():
     q = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, -0.2], [0.1 + 1e-6, 0.3]])
     np.testing.assert_array_equal(directions_in_order(q), [[0, 0], [1, 0], [1, -1], [1, 1]])
+
+
+def test_joined_samples_keep_the_conditions_that_all_of_them_have(arm):
+    conditions = drawn(arm, 4, np.random.default_rng(13))
+    positions = arm.poses(conditions.q)[:, :3, 3]
+    plain = Position(conditions.q, positions)
+    assert conditions.temperature is not None
+    warm = plain.with_conditions(temperature=conditions.temperature)
+    both = concatenate([warm, warm.with_conditions(time=np.arange(4))])
+    assert both.recorded is not None
+    assert both.recorded.names == {"temperature"}
+    np.testing.assert_array_equal(both.recorded.temperature, np.tile(conditions.temperature, 2))
+    assert concatenate([warm, plain]).recorded is None
 
 
 # --- selection -------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from ...measurements import KINDS
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
-from ...units import ANGLES, LENGTHS, UNITS
+from ...units import ANGLES, LENGTHS
 from ..tables import Column, DataTable
 from ..tabular import require_usable_names
 
@@ -119,12 +119,7 @@ def condition_columns(chain: Chain) -> dict[str, list[str]]:
 
 def describe_conditions() -> str:
     """Return the columns of all conditions, for messages."""
-    texts = []
-    for condition in CONDITIONS.values():
-        unit = next(iter(UNITS.get(condition.quantity, ())), "")
-        ending = "_JOINT" if condition.is_per_joint else f"[{unit}]"
-        texts.append(condition.name + ending)
-    return ", ".join(texts)
+    return ", ".join(condition.header for condition in CONDITIONS.values())
 
 
 def known_columns(chain: Chain) -> frozenset[str]:
