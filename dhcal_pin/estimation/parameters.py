@@ -29,7 +29,6 @@ import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,7 +36,7 @@ from .. import se3
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
-from ..robot.error_families import COUPLING, FAMILIES, GAIN, JOINT_TERMS, LINK_TERMS, ErrorFamily
+from ..robot.error_families import FAMILIES, ErrorFamily
 from ..robot.transmission import coefficient_indices
 from .error_model import ErrorModel, ErrorParameter
 
@@ -205,100 +204,37 @@ def tool(chain: Chain) -> list[ErrorParameter]:
     return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
-class _Coefficient(NamedTuple):
-    """Transmission coefficient of an independent joint.
-
-    Attributes:
-        entry: Index of the coefficient.
-        owner: Number of the joint.
-        name: Name, after that of the joint.
-        unit: Unit.
-    """
-
-    entry: int
-    owner: int
-    name: str
-    unit: str
-
-
-def _joint_coefficients(chain: Chain, family: ErrorFamily) -> list[_Coefficient]:
-    """Return the coefficients of a family that move joints; none for a family of links."""
-    linear, harmonics, joint_terms, _ = coefficient_indices(*chain.mimic_matrix.shape)
-    n, joints = chain.n_joints, np.flatnonzero(~chain.is_prismatic).tolist()
-    if family.name == GAIN:
-        return [_Coefficient(int(linear[i, i]), i, "gain", "1") for i in range(n)]
-    if family.name == COUPLING:
-        units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in chain.is_prismatic]
-        names = chain.joint_names
-        return [
-            _Coefficient(int(linear[i, j]), i, names[j], units[j]) for i in joints for j in range(n) if i != j
-        ]
-    if family.joint_term:
-        term, row = family.joint_term, list(JOINT_TERMS).index(family.name)
-        has_effect = term.has_effect(chain.loads)
-        return [
-            _Coefficient(int(joint_terms[row, i]), i, term.coefficient, term.unit)
-            for i in joints
-            if has_effect[i]
-        ]
-    numbers = harmonics.tolist()
-    return [
-        _Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad")
-        for i in joints
-        for k in family.orders
-        for part, function in enumerate(("sin", "cos"))
-    ]
-
-
 def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
     """Build the parameters of a family of joint errors: transmission coefficients."""
-    coefficients, prior = _joint_coefficients(chain, family), family.prior
+    coefficients = family.coefficients(chain, coefficient_indices(*chain.mimic_matrix.shape))
+    if term := family.joint_term or family.link_term:
+        has_effect = term.has_effect(chain.loads)
+        coefficients = [c for c in coefficients if has_effect[c.owner]]
     nominal = [0.0] * len(coefficients)
     if chain.transmission is not None:
         nominal = chain.transmission.coefficients[[c.entry for c in coefficients]].tolist()
-    # The error acts at the first moving joint that the independent joint drives.
-    moving = (chain.mimic_matrix != 0).argmax(0).tolist()
-    twists = [_joint_twist(chain.axes[j].tolist(), bool(chain.prismatic[j])) for j in moving]
-    frames, names = [link_frame(j + 1) for j in moving], chain.joint_names
-    of_joints = [
+    if family.link_term:
+        names, scale = chain.link_names, "length"
+        frames = [link_frame(j) for j in range(len(names))]
+        twists = [(*vector, *_ZERO) for vector in chain.loads.link_vectors.tolist()]
+    else:
+        # The error acts at the first moving joint that the independent joint drives.
+        moving = (chain.mimic_matrix != 0).argmax(0).tolist()
+        names, scale = chain.joint_names, "position"
+        frames = [link_frame(j + 1) for j in moving]
+        twists = [_joint_twist(chain.axes[j].tolist(), bool(chain.prismatic[j])) for j in moving]
+    return [
         ErrorParameter(
             f"{names[c.owner]}.{c.name}",
             c.unit,
             value,
             frames[c.owner],
             twists[c.owner],
-            prior,
+            family.prior,
             c.entry,
-            "position",
+            scale,
         )
         for c, value in zip(coefficients, nominal, strict=True)
-    ]
-    return of_joints + _link_errors(chain, family)
-
-
-def _link_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
-    """Build the parameters of a family that change lengths of links."""
-    term = family.link_term
-    if term is None:
-        return []
-    *_, link_terms = coefficient_indices(*chain.mimic_matrix.shape)
-    indices = link_terms[list(LINK_TERMS).index(family.name)].tolist()
-    nominal = np.zeros(link_terms.shape[1])
-    if chain.transmission is not None:
-        nominal = chain.transmission.coefficients[indices]
-    vectors, names = chain.loads.link_vectors, chain.link_names
-    return [
-        ErrorParameter(
-            f"{names[j]}.{term.coefficient}",
-            term.unit,
-            float(nominal[j]),
-            link_frame(j),
-            (*vectors[j].tolist(), *_ZERO),
-            family.prior,
-            indices[j],
-            "length",
-        )
-        for j in np.flatnonzero(term.has_effect(chain.loads)).tolist()
     ]
 
 

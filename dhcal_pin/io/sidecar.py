@@ -83,7 +83,7 @@ from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
 from ..robot.conditions import MAX_PAYLOAD, TEMPERATURE_RANGE
-from ..robot.error_families import FAMILIES, JOINT_TERMS, LINK_TERMS
+from ..robot.error_families import COUPLING, FAMILIES, GAIN, HARMONICS, JOINT_TERMS, LINK_TERMS
 from ..robot.transmission import (
     MAX_CURVE_ORDER,
     Payload,
@@ -121,18 +121,22 @@ _PAYLOAD_KEYS = {
     "centre_m": toml.vector(3, MAX_PAYLOAD_DISTANCE_M, default=(0.0, 0.0, 0.0)),
 }
 _MANIFEST_KEYS = {"urdf_sha256": toml.text(), "joints_sha256": toml.text(default="")}
+# Keys of the families of joint errors.
+_GAIN, _HARMONICS, _COUPLING = (FAMILIES[name].sidecar_key for name in (GAIN, HARMONICS, COUPLING))
+_JOINT_TERM_KEYS = [FAMILIES[name].sidecar_key for name in JOINT_TERMS]
+_LINK_TERM_KEYS = [FAMILIES[name].sidecar_key for name in LINK_TERMS]
 # Temperature at which the links have the lengths of the URDF [°C].
 _REFERENCE = toml.number(*TEMPERATURE_RANGE)
 _THERMAL_KEYS = {
     "reference_degc": _REFERENCE,
-    **{term.sidecar_key: toml.table_by_name(_COEFFICIENT) for term in LINK_TERMS.values()},
+    **{key: toml.table_by_name(_COEFFICIENT) for key in _LINK_TERM_KEYS},
 }
 # A prismatic joint has the first of these keys only.
 _JOINT_KEYS = {
-    "gain": _COEFFICIENT,
-    "harmonics": toml.list_of(_HARMONIC, default=()),
-    **{term.sidecar_key: _COEFFICIENT for term in JOINT_TERMS.values()},
-    "coupling": toml.table_by_name(_COEFFICIENT),
+    _GAIN: _COEFFICIENT,
+    _HARMONICS: toml.list_of(_HARMONIC, default=()),
+    **dict.fromkeys(_JOINT_TERM_KEYS, _COEFFICIENT),
+    _COUPLING: toml.table_by_name(_COEFFICIENT),
 }
 _UNCERTAINTY_KEYS = {
     "joints": _NAMES,
@@ -321,12 +325,12 @@ def _read_links(chain: Chain, table: TomlTable, coefficients: Array) -> None:
     """Read the coefficients of links, by family and name of the link, into those of a transmission (c,)."""
     *_, link_terms = split_coefficients(coefficients, chain.n_joints)
     values = table.values(_THERMAL_KEYS)
-    for row, term in zip(link_terms, LINK_TERMS.values(), strict=True):
-        for name, value in values[term.sidecar_key].items():
+    for row, key in zip(link_terms, _LINK_TERM_KEYS, strict=True):
+        for name, value in values[key].items():
             if name in chain.link_names:
                 row[chain.link_names.index(name)] = value
             elif name not in chain.urdf.links:
-                where = table.table(term.sidecar_key).where
+                where = table.table(key).where
                 raise UnknownNameError(
                     f"{where}: unknown link {name!r}; choose from {', '.join(chain.link_names)}"
                 )
@@ -342,7 +346,7 @@ def _read_joint(chain: Chain, i: int, table: TomlTable, coefficients: Array) -> 
     linear, harmonics, joint_terms, _ = split_coefficients(coefficients, chain.n_joints)
     if chain.is_prismatic[i]:
         table.name += " (prismatic)"
-        linear[i, i] = table.values({"gain": _COEFFICIENT})["gain"]
+        linear[i, i] = table.values({_GAIN: _COEFFICIENT})[_GAIN]
         return
     for key in _FORMER_HARMONIC_KEYS:
         if key in table.keys():
@@ -350,19 +354,19 @@ def _read_joint(chain: Chain, i: int, table: TomlTable, coefficients: Array) -> 
                 f"{table.where}: unknown key {key!r}; write harmonics = [[order, sin_rad, cos_rad], ...]"
             )
     values = table.values(_JOINT_KEYS)
-    linear[i, i] = values["gain"]
-    joint_terms[:, i] = [values[term.sidecar_key] for term in JOINT_TERMS.values()]
+    linear[i, i] = values[_GAIN]
+    joint_terms[:, i] = [values[key] for key in _JOINT_TERM_KEYS]
     others = {name: j for j, name in enumerate(chain.joint_names) if j != i}
-    for name, value in values["coupling"].items():
+    for name, value in values[_COUPLING].items():
         if name in others:
             linear[i, others[name]] = value
         elif name not in _joints_off_path(chain):
             raise UnknownNameError(
-                f"{table.table('coupling').where}: {name!r} is not another joint; choose from "
+                f"{table.table(_COUPLING).where}: {name!r} is not another joint; choose from "
                 f"{', '.join(others)}"
             )
-    orders = [order for order, *_ in values["harmonics"]]
-    for order, *factors in values["harmonics"]:
+    orders = [order for order, *_ in values[_HARMONICS]]
+    for order, *factors in values[_HARMONICS]:
         if orders.count(order) > 1:
             raise FileFormatError(f"{table.where}: harmonics has the order {order} twice; write it once")
         harmonics[order - 1, :, i] = factors
@@ -515,13 +519,13 @@ def _transmission_content(chain: Chain) -> dict[str, Any]:
     for i, name in enumerate(names):
         harmonics = transmission.harmonics[:, :, i]
         joint: dict[str, Any] = {
-            "gain": transmission.linear[i, i].item(),
-            "harmonics": [[k + 1, *harmonics[k].tolist()] for k in np.flatnonzero(harmonics.any(1)).tolist()],
+            _GAIN: transmission.linear[i, i].item(),
+            _HARMONICS: [[k + 1, *harmonics[k].tolist()] for k in np.flatnonzero(harmonics.any(1)).tolist()],
             **{
-                term.sidecar_key: row[i].item()
-                for term, row in zip(JOINT_TERMS.values(), transmission.joint_terms, strict=True)
+                key: row[i].item()
+                for key, row in zip(_JOINT_TERM_KEYS, transmission.joint_terms, strict=True)
             },
-            "coupling": {
+            _COUPLING: {
                 names[j]: transmission.linear[i, j].item()
                 for j in np.flatnonzero(transmission.linear[i])
                 if j != i
@@ -536,12 +540,12 @@ def _thermal_content(chain: Chain) -> dict[str, Any]:
     """Return the table [thermal]; empty if no link grows."""
     if chain.transmission is None or not chain.transmission.link_terms.any():
         return {}
-    rows = zip(LINK_TERMS.values(), chain.transmission.link_terms, strict=True)
+    rows = zip(_LINK_TERM_KEYS, chain.transmission.link_terms, strict=True)
     return {
         "reference_degc": chain.reference_temperature,
         **{
-            term.sidecar_key: {chain.link_names[j]: row[j].item() for j in np.flatnonzero(row).tolist()}
-            for term, row in rows
+            key: {chain.link_names[j]: row[j].item() for j in np.flatnonzero(row).tolist()}
+            for key, row in rows
         },
     }
 

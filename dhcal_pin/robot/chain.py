@@ -49,7 +49,8 @@ from .conditions import Conditions, SampleState
 from .dh import Convention, DHTable
 from .dh_extraction import Extraction, extract_dh
 from .dh_urdf import dh_to_urdf
-from .transmission import GravityLoads, Payload, Transmission, n_coefficients
+from .error_families import FAMILIES, ErrorFamily
+from .transmission import GravityLoads, Payload, Transmission, coefficient_indices, n_coefficients
 from .urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from .urdf_path import (
     axis_frame,
@@ -297,6 +298,19 @@ class Chain:
             self.tip,
             self.payload,
         )
+
+    @property
+    def error_families(self) -> list[ErrorFamily]:
+        """Families of joint errors with a coefficient that is not zero."""
+        if self.transmission is None:
+            return []
+        values = self.transmission.coefficients
+        indices = coefficient_indices(*self.mimic_matrix.shape)
+        return [
+            family
+            for family in FAMILIES.values()
+            if values[[c.entry for c in family.coefficients(self, indices)]].any()
+        ]
 
     def configurations(self, q: ArrayLike) -> Array:
         """Return Pinocchio configurations; joints that are not on the chain stay at neutral.

@@ -8,14 +8,18 @@ conditions of a sample. There are four types of coefficients, see `transmission`
 - joint terms: one function per joint, with one coefficient per joint;
 - link terms: one function of the sample, with one coefficient per link, which changes the length of the link.
 
-To add a family with a joint term or a link term: write a row with its function.
+To add a family with a joint term or a link term: write a row with its function, and the same as a formula in
+JavaScript for the viewer.
+
+Shapes: m samples, n independent joints, k moving joints, K orders of harmonics, f families of joint terms, g
+families of link terms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -54,6 +58,54 @@ class ArmProperties(Protocol):
         ...
 
 
+class JointNames(Protocol):
+    """Names and types of the independent joints of a chain."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        ...
+
+    @property
+    def is_prismatic(self) -> Array:
+        """Whether each joint is prismatic, shape (n,)."""
+        ...
+
+
+class CoefficientParts(NamedTuple):
+    """Vector of coefficients, or of their indices, in its parts.
+
+    Attributes:
+        linear: Gains on the diagonal and couplings beside it, shape (n, n).
+        harmonics: Sine before cosine of each order, shape (K, 2, n).
+        joint_terms: One row per family of `JOINT_TERMS`, shape (f, n).
+        link_terms: One row per family of `LINK_TERMS`, shape (g, k+1).
+    """
+
+    linear: Array
+    harmonics: Array
+    joint_terms: Array
+    link_terms: Array
+
+
+class Coefficient(NamedTuple):
+    """Coefficient of a family.
+
+    Attributes:
+        entry: Index in the vector of coefficients.
+        owner: Number of the joint that it moves, or of the link that it makes longer.
+        name: Name, after that of the joint or link.
+        unit: Unit.
+        formula: Its term in JavaScript; see `Term`.
+    """
+
+    entry: int
+    owner: int
+    name: str
+    unit: str
+    formula: str
+
+
 @dataclass(frozen=True)
 class Term:
     """Function of the conditions of a sample, and the coefficient that scales it.
@@ -61,7 +113,9 @@ class Term:
     Attributes:
         coefficient: Name of the coefficient, after the name of its joint or link.
         unit: Unit of the coefficient.
-        sidecar_key: Key of the coefficient in sidecar files.
+        formula: The function of joint `{i}` in JavaScript, by which the 3-D page draws it: of the positions
+            `q` of all joints and their gravity torques `torques()`. It is "0" if the page does not know the
+            condition. Links are drawn without growth.
         evaluate: Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link
             term, whose value is the same for all links.
         has_effect: Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
@@ -69,7 +123,7 @@ class Term:
 
     coefficient: str
     unit: str
-    sidecar_key: str
+    formula: str
     evaluate: Callable[[Conditions, ArmProperties], Array]
     has_effect: Callable[[ArmProperties], Array]
 
@@ -100,6 +154,8 @@ class ErrorFamily:
         requirement: What a robot must have for the family to have parameters, for error messages.
         rule: When the family is added; there is no family without a rule.
         prior: Standard deviation of its coefficients expected before any measurement, in their unit.
+        sidecar_key: Key of its coefficients in sidecar files.
+        linear: Function that lists its linear coefficients from their indices; None for other families.
         orders: Orders of its harmonics; empty for other families.
         joint_term: Term of each joint; None for other families.
         link_term: Term of the links; None for other families.
@@ -111,6 +167,8 @@ class ErrorFamily:
     requirement: str
     rule: SelectionRule
     prior: float
+    sidecar_key: str
+    linear: Callable[[JointNames, Array], Iterator[Coefficient]] | None = None
     orders: range = range(0)
     joint_term: Term | None = None
     link_term: Term | None = None
@@ -120,6 +178,45 @@ class ErrorFamily:
     def is_curve(self) -> bool:
         """Whether the family consists of correction curves."""
         return self.orders.start >= CURVE_ORDERS.start
+
+    def coefficients(self, arm: JointNames, indices: CoefficientParts) -> list[Coefficient]:
+        """List the coefficients of the family; only gains belong to prismatic joints."""
+        joints = np.flatnonzero(~arm.is_prismatic).tolist()
+        if self.linear:
+            return list(self.linear(arm, indices.linear))
+        if term := self.joint_term:
+            row = indices.joint_terms[list(JOINT_TERMS).index(self.name)].tolist()
+            return [
+                Coefficient(row[i], i, term.coefficient, term.unit, term.formula.format(i=i)) for i in joints
+            ]
+        if term := self.link_term:
+            row = indices.link_terms[list(LINK_TERMS).index(self.name)].tolist()
+            return [
+                Coefficient(entry, j, term.coefficient, term.unit, term.formula)
+                for j, entry in enumerate(row)
+            ]
+        numbers = indices.harmonics.tolist()
+        return [
+            Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad", f"Math.{function}({k} * q[{i}])")
+            for i in joints
+            for k in self.orders
+            for part, function in enumerate(("sin", "cos"))
+        ]
+
+
+def _gains(arm: JointNames, linear: Array) -> Iterator[Coefficient]:
+    """List the gain of each joint."""
+    for i, entry in enumerate(np.diag(linear).tolist()):
+        yield Coefficient(entry, i, "gain", "1", f"q[{i}]")
+
+
+def _couplings(arm: JointNames, linear: Array) -> Iterator[Coefficient]:
+    """List the couplings of each revolute joint to all others."""
+    units = ["rad/m" if is_prismatic else "rad/rad" for is_prismatic in arm.is_prismatic]
+    for i in np.flatnonzero(~arm.is_prismatic).tolist():
+        for j, (entry, name) in enumerate(zip(linear[i].tolist(), arm.joint_names, strict=True)):
+            if i != j:
+                yield Coefficient(entry, i, name, units[j], f"q[{j}]")
 
 
 def _torques(conditions: Conditions, arm: ArmProperties) -> Array:
@@ -177,10 +274,24 @@ _OF_A_CONDITION = SelectionRule(0, 0.02)
 FAMILIES = {
     family.name: family
     for family in (
-        ErrorFamily(GAIN, "gear ratio errors", "a moving joint", _OTHER, 2e-3),
-        ErrorFamily(HARMONICS, "gear eccentricity", "a revolute joint", _UNIVERSAL, 1e-3, HARMONIC_ORDERS),
+        ErrorFamily(GAIN, "gear ratio errors", "a moving joint", _OTHER, 2e-3, "gain", _gains),
         ErrorFamily(
-            CURVES, "joint correction curves", "a revolute joint", SelectionRule(2, 0.02), 1e-4, CURVE_ORDERS
+            HARMONICS,
+            "gear eccentricity",
+            "a revolute joint",
+            _UNIVERSAL,
+            1e-3,
+            "harmonics",
+            orders=HARMONIC_ORDERS,
+        ),
+        ErrorFamily(
+            CURVES,
+            "joint correction curves",
+            "a revolute joint",
+            SelectionRule(2, 0.02),
+            1e-4,
+            "harmonics",
+            orders=CURVE_ORDERS,
         ),
         ErrorFamily(
             FINE_CURVES,
@@ -188,7 +299,8 @@ FAMILIES = {
             "a revolute joint",
             SelectionRule(3, 0.02),
             1e-4,
-            FINE_CURVE_ORDERS,
+            "harmonics",
+            orders=FINE_CURVE_ORDERS,
         ),
         ErrorFamily(
             COMPLIANCE,
@@ -196,16 +308,26 @@ FAMILIES = {
             "a revolute joint that gravity loads, and links with masses in the URDF",
             _UNIVERSAL,
             1e-4,
-            joint_term=Term("compliance", "rad/Nm", "compliance_rad_per_nm", _torques, _is_loaded),
+            "compliance_rad_per_nm",
+            joint_term=Term("compliance", "rad/Nm", "torques()[{i}]", _torques, _is_loaded),
         ),
-        ErrorFamily(COUPLING, "coupling between joints", "a revolute joint and another joint", _OTHER, 2e-3),
+        ErrorFamily(
+            COUPLING,
+            "coupling between joints",
+            "a revolute joint and another joint",
+            _OTHER,
+            2e-3,
+            "coupling",
+            _couplings,
+        ),
         ErrorFamily(
             BACKLASH,
             "backlash of the joints",
             "a revolute joint",
             _OF_A_CONDITION,
             3e-3,
-            joint_term=Term("backlash", "rad", "backlash_rad", _half_direction, _all_joints),
+            "backlash_rad",
+            joint_term=Term("backlash", "rad", "0", _half_direction, _all_joints),
             condition="approach",
         ),
         ErrorFamily(
@@ -214,7 +336,8 @@ FAMILIES = {
             "a link with a length",
             _OF_A_CONDITION,
             2e-5,
-            link_term=Term("thermal", "1/K", "per_kelvin", _temperature_rise, _has_length),
+            "per_kelvin",
+            link_term=Term("thermal", "1/K", "0", _temperature_rise, _has_length),
             condition="temperature",
         ),
     )

@@ -33,7 +33,7 @@ import pinocchio as pin
 
 from .._typing import Array
 from .conditions import Conditions
-from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER
+from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER, CoefficientParts
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
@@ -156,22 +156,22 @@ class Transmission:
     @property
     def linear(self) -> Array:
         """Change of each joint per unit of every joint's position, shape (n, n), as a view."""
-        return self._parts[0]
+        return self._parts.linear
 
     @property
     def harmonics(self) -> Array:
         """Coefficients of sine and cosine of each order, shape (K, 2, n) [rad], as a view."""
-        return self._parts[1]
+        return self._parts.harmonics
 
     @property
     def joint_terms(self) -> Array:
         """Coefficients of the joint terms, one row per family of `JOINT_TERMS`, shape (f, n), as a view."""
-        return self._parts[2]
+        return self._parts.joint_terms
 
     @property
     def link_terms(self) -> Array:
         """Coefficients of the link terms, one row per family of `LINK_TERMS`, shape (g, k+1), as a view."""
-        return self._parts[3]
+        return self._parts.link_terms
 
     @property
     def compliance(self) -> Array:
@@ -184,8 +184,8 @@ class Transmission:
         return bool(self.compliance.any())
 
     @cached_property
-    def _parts(self) -> tuple[Array, Array, Array, Array]:
-        """Views of the coefficients: linear, harmonics, joint terms and link terms."""
+    def _parts(self) -> CoefficientParts:
+        """Views of the coefficients."""
         return split_coefficients(self.coefficients, self.loads.n_joints)
 
     @cached_property
@@ -261,32 +261,18 @@ def n_coefficients(k: int, n: int) -> int:
     return n * (n + 2 * MAX_CURVE_ORDER + len(JOINT_TERMS)) + (k + 1) * len(LINK_TERMS)
 
 
-def coefficient_indices(k: int, n: int) -> tuple[Array, Array, Array, Array]:
-    """Return the indices of the coefficients, in the parts of `split_coefficients`."""
+def coefficient_indices(k: int, n: int) -> CoefficientParts:
+    """Return the indices of the coefficients of a chain of k moving and n independent joints."""
     return split_coefficients(np.arange(n_coefficients(k, n)), n)
 
 
-def split_coefficients(coefficients: Array, n: int) -> tuple[Array, Array, Array, Array]:
-    """Split a vector of coefficients, or of their indices, into its parts.
-
-    Args:
-        coefficients: One value per coefficient, shape (c,).
-        n: Number of independent joints.
-
-    Returns:
-        Views of the linear part, shape (n, n), with gains on the diagonal and couplings beside it; of the
-        harmonics, shape (K, 2, n), sine before cosine; of the joint terms, shape (f, n); and of the link
-        terms, shape (g, k+1).
-    """
+def split_coefficients(coefficients: Array, n: int) -> CoefficientParts:
+    """Return views of the parts of a vector of coefficients (c,), or of their indices, of n joints."""
     n_harmonics, n_rows = 2 * MAX_CURVE_ORDER, n + 2 * MAX_CURVE_ORDER + len(JOINT_TERMS)
     rows, link_terms = coefficients[: n * n_rows].reshape(n_rows, n), coefficients[n * n_rows :]
     harmonics, joint_terms = rows[n : n + n_harmonics], rows[n + n_harmonics :]
-    return (
-        rows[:n],
-        harmonics.reshape(MAX_CURVE_ORDER, 2, n),
-        joint_terms,
-        link_terms.reshape(len(LINK_TERMS), -1),
-    )
+    waves, growth = harmonics.reshape(MAX_CURVE_ORDER, 2, n), link_terms.reshape(len(LINK_TERMS), -1)
+    return CoefficientParts(rows[:n], waves, joint_terms, growth)
 
 
 def harmonic_orders(entries: Array, n: int) -> Array:

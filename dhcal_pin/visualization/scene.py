@@ -8,6 +8,10 @@ its nominal placement in its parent, T, the twist ξ = log(T⁻¹ T_calibrated) 
 the joint that moves it. Errors are magnified by the factor s as T exp(s ξ), so that s = 1 shows the
 calibrated robot itself.
 
+The errors of the joints are functions in JavaScript, put together from the formulas in the rows of
+`robot.error_families`. The page does not know the direction of motion and the temperature. It draws joints
+without backlash, and links as they are at the reference temperature; a note says so.
+
 Everything is drawn in the frame of the calibrated robot's base link. The page states tool positions in the
 measuring frame. A nominal robot without base or tool takes those of the calibrated robot, because they
 describe the set-up of the measurement and not the robot.
@@ -35,8 +39,9 @@ from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
+from ..robot.conditions import CONDITIONS
 from ..robot.sampling import WorkspaceConstraints
-from ..robot.transmission import GravityLoads
+from ..robot.transmission import coefficient_indices
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .rig_lines import rig_lines
@@ -151,7 +156,15 @@ def scene_html(
     arms = (with_shared_frames(nominal, shown), shown)
     measured = measured_samples(arms, measurements, (nominal_known or {}, known or {}), sets)
     drawn = measured.take(drawn_samples(measured, MAX_POINTS, N_LARGEST))
-    notes = [visuals.note]
+    notes = [
+        visuals.note,
+        *(
+            f"Drawn without {family.description}: the page does not know the "
+            f"{CONDITIONS[family.condition].description}."
+            for family in shown.error_families
+            if family.condition
+        ),
+    ]
     if len(drawn) < len(measured):
         notes.append(f"{len(drawn)} of {len(measured)} measured points are drawn.")
     cells = uncertainty_cells(predictor) if predictor else None
@@ -194,6 +207,7 @@ def scene_html(
         "@TITLE@": html.escape(title),
         "/*@MESHCAT@*/": _meshcat(),
         "@SCENE@": data,
+        "/*@JOINT_ERRORS@*/": ",\n  ".join(map(_joint_errors, (nominal, shown))),
     }
     marks = "|".join(map(re.escape, replacements))
     return re.sub(marks, lambda mark: replacements[mark[0]], PAGE.read_text("utf-8"))
@@ -302,7 +316,7 @@ def kinematic_tree(nominal: Chain, calibrated: Chain) -> dict[str, Any]:
     return {
         "bodies": bodies,
         "base_in_measuring_frame": rows(calibrated.base),
-        "transmissions": [_transmission(nominal), _transmission(calibrated)],
+        "gravity_bodies": [_gravity_bodies(nominal), _gravity_bodies(calibrated)],
     }
 
 
@@ -330,27 +344,24 @@ def _joint_input(chain: Chain, j: int) -> dict[str, Any]:
     }
 
 
-def _transmission(chain: Chain) -> dict[str, Any]:
-    """Return the transmission errors of a robot; see the formula in `robot.transmission`."""
-    transmission = chain.transmission
-    if transmission is None:
-        return {}
-    errors: dict[str, Any] = {
-        "linear": transmission.linear.tolist(),
-        "harmonics": [
-            [i, k + 1, *transmission.harmonics[k, :, i].tolist()]
-            for k, i in np.argwhere(transmission.harmonics.any(1)).tolist()
-        ],
-    }
-    if transmission.has_compliance:
-        errors["compliance"] = transmission.compliance.tolist()
-        errors["gravity_bodies"] = _gravity_bodies(chain, transmission.loads)
-    return errors
+def _joint_errors(chain: Chain) -> str:
+    """Return a JavaScript function of the differences between actual and commanded joint positions."""
+    errors = [["0"] for _ in chain.joint_names]
+    indices = coefficient_indices(*chain.mimic_matrix.shape)
+    values = np.zeros(0) if chain.transmission is None else chain.transmission.coefficients
+    for family in chain.error_families:
+        for coefficient in [] if family.link_term else family.coefficients(chain, indices):
+            value = values[coefficient.entry].item()
+            if value and coefficient.formula != "0":
+                errors[coefficient.owner].append(f"{value!r} * {coefficient.formula}")
+    return f"(q, torques) => [{', '.join(map(' + '.join, errors))}]"
 
 
-def _gravity_bodies(chain: Chain, loads: GravityLoads) -> list[dict[str, Any]]:
+def _gravity_bodies(chain: Chain) -> list[dict[str, Any]]:
     """Return the bodies whose weight loads the joints: weight [N], centre of mass and joint of each."""
-    model = loads.model
+    if chain.transmission is None or not chain.transmission.has_compliance:
+        return []
+    model = chain.transmission.loads.model
     moving = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}
     bodies = []
     for i, inertia in enumerate(model.inertias):
