@@ -9,7 +9,7 @@ Shapes: m samples, n independent joints.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from ..units import UNITS
 # Plausible temperatures of a robot [°C], and heaviest payload [kg].
 TEMPERATURE_RANGE = -50.0, 150.0
 MAX_PAYLOAD = 1e5
+# Largest difference of simulated temperatures from the reference temperature [K].
+MAX_RISE = 10.0
 # Smallest motion of a joint between two samples [rad or m]; smaller ones are noise of its encoder.
 MIN_MOTION = 1e-4
 
@@ -36,6 +38,8 @@ class Condition:
         low: Lowest value, in the unit of the quantity.
         high: Highest value.
         is_per_joint: Whether each joint has a column `NAME_JOINT`.
+        draw: Function that draws the values of simulated samples from a random generator, the shape (m, n) of
+            their joint positions and the reference temperature [°C]; None if no joint error depends on it.
     """
 
     name: str
@@ -44,6 +48,7 @@ class Condition:
     low: float
     high: float
     is_per_joint: bool = False
+    draw: Callable[[np.random.Generator, tuple[int, ...], float], Array] | None = None
 
     @property
     def header(self) -> str:
@@ -63,14 +68,36 @@ class Condition:
         return None
 
 
+def _draw_directions(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
+    """Draw directions of the joints."""
+    return rng.choice([-1.0, 1.0], shape)
+
+
+def _draw_temperatures(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
+    """Draw temperatures around the reference temperature."""
+    return reference + rng.uniform(-MAX_RISE, MAX_RISE, shape[0])
+
+
 CONDITIONS = {
     condition.name: condition
     for condition in (
         Condition("time", "time", "time of the measurement", -np.inf, np.inf),
         Condition(
-            "approach", "direction", "direction of the last motion of a joint", -1, 1, is_per_joint=True
+            "approach",
+            "direction",
+            "direction of the last motion of a joint",
+            -1,
+            1,
+            is_per_joint=True,
+            draw=_draw_directions,
         ),
-        Condition("temperature", "temperature", "temperature of the robot", *TEMPERATURE_RANGE),
+        Condition(
+            "temperature",
+            "temperature",
+            "temperature of the robot",
+            *TEMPERATURE_RANGE,
+            draw=_draw_temperatures,
+        ),
         Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD),
     )
 }

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ..._typing import Array, PathLike
     from ...robot import Chain, Conditions
 
-# Largest difference of simulated temperatures from the reference temperature [K].
-MAX_RISE = 10.0
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
 
 
@@ -117,19 +115,19 @@ def run(args: Namespace) -> int:
 
 
 def _conditions(truth: Chain, q: Array, seed: int) -> Conditions:
-    """Return joint positions, with random directions and temperatures if the robot depends on them."""
+    """Return joint positions with random values of the conditions that the robot depends on."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ...robot import Conditions
-    from ...robot.error_families import BACKLASH, JOINT_TERMS
+    from ...robot import CONDITIONS, Conditions
 
-    rng, transmission = np.random.default_rng([seed, 2]), truth.transmission
-    approach = temperature = None
-    if transmission is not None and transmission.joint_terms[list(JOINT_TERMS).index(BACKLASH)].any():
-        approach = rng.choice([-1.0, 1.0], q.shape)
-    if transmission is not None and transmission.link_terms.any():
-        temperature = truth.reference_temperature + rng.uniform(-MAX_RISE, MAX_RISE, len(q))
-    return Conditions(q, approach=approach, temperature=temperature)
+    rng = np.random.default_rng([seed, 2])
+    needed = {family.condition for family in truth.error_families}
+    drawn = {
+        name: condition.draw(rng, q.shape, truth.reference_temperature)
+        for name, condition in CONDITIONS.items()
+        if name in needed and condition.draw
+    }
+    return Conditions(q, **drawn)
 
 
 def _length_of_pixels(noise: str) -> str:
