@@ -4,7 +4,8 @@ A hold-out error is only valid if the held-out samples are independent of the fi
 samples depend on each other and therefore always go to the same part:
 
 - Samples of one configuration, for example several targets, corners or repetitions measured while the robot
-  stands still. They share the same joint values and the same error of the robot.
+  stands still. They share the same joint values and the same error of the robot. This holds for most of the
+  error also where the direction of approach, the temperature or the payload differs.
 - In `blocked_folds`, samples that touch the same unknown point, plane or sphere, or points joined by a known
   distance. A fitted sample would reveal where the held-out one must be.
 

@@ -278,12 +278,9 @@ class Measurement(ABC):
     def sample_groups(self) -> Array:
         """Label of the group of each sample, (m,): samples that are often wrong together.
 
-        These are the samples of one configuration.
+        These are the samples of one stop of the arm.
         """
-        if not len(self.rows):
-            return np.zeros(0, int)
-        parts = np.split(self.configurations(), max(self.configurations_per_row, 1))
-        return np.unique(np.concatenate(parts, 1), axis=0, return_inverse=True)[1].reshape(-1)
+        return label_stops(self)
 
     @property
     def n_images(self) -> int:
@@ -538,6 +535,15 @@ def whitened_jacobian(
     observation = item.observation_matrix(frames, u, residual)
     jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)
     return apply_observation_matrix(jacobian, observation, np.empty((len(bodies), *residual.shape)))
+
+
+def label_stops(item: Measurement) -> Array:
+    """Label samples (m,); those of one stop of the arm have equal configurations and conditions."""
+    if not len(item.rows):
+        return np.zeros(0, int)
+    parts = np.split(item.configurations(), max(item.configurations_per_row, 1))
+    conditions = [] if item.recorded is None else [item.recorded.steps]
+    return np.unique(np.concatenate([*parts, *conditions], 1), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def known_conditions(data: Iterable[Measurement]) -> frozenset[str]:

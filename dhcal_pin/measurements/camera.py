@@ -37,7 +37,7 @@ from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
-from .base import Measurement, Noise, format_sigma
+from .base import Measurement, Noise, format_sigma, label_stops
 from .columns import pixel_columns, remark_column, text_column
 from .groups import ErrorGroup, Group
 from .images.camera_parameters import (
@@ -375,8 +375,8 @@ class CameraCorners(Measurement):
 
     @cached_property
     def image(self) -> Array:
-        """Number of each sample's image, (m,): samples of one configuration and one camera."""
-        keys = np.column_stack([self.q, self.camera])
+        """Number of each sample's image, (m,): samples of one stop of the arm and one camera."""
+        keys = np.column_stack([label_stops(self), self.camera])
         return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
 
     @cached_property
@@ -509,7 +509,7 @@ class CameraCorners(Measurement):
         if not self.jitter.any():
             return out
         whitened = self.jitter.transpose(1, 0, 2) * self._weights[:, :, None]
-        group = np.unique(self.q, axis=0, return_inverse=True)[1].reshape(-1)
+        group = label_stops(self)
         order, counts = np.argsort(group, kind="stable"), np.bincount(group)
         images = np.split(order, np.cumsum(counts)[:-1])
         for count in np.unique(counts):

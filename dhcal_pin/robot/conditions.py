@@ -40,6 +40,8 @@ class Condition:
         is_per_joint: Whether each joint has a column `NAME_JOINT`.
         draw: Function that draws the values of simulated samples from a random generator, the shape (m, n) of
             their joint positions and the reference temperature [°C]; None if no joint error depends on it.
+        resolution: Samples of one configuration are repetitions if they are equal in multiples of this step,
+            in the unit of the quantity; 0 for a condition that no model depends on.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Condition:
     high: float
     is_per_joint: bool = False
     draw: Callable[[np.random.Generator, tuple[int, ...], float], Array] | None = None
+    resolution: float = 0.0
 
     @property
     def header(self) -> str:
@@ -90,6 +93,7 @@ CONDITIONS = {
             1,
             is_per_joint=True,
             draw=_draw_directions,
+            resolution=1,
         ),
         Condition(
             "temperature",
@@ -97,8 +101,9 @@ CONDITIONS = {
             "temperature of the robot",
             *TEMPERATURE_RANGE,
             draw=_draw_temperatures,
+            resolution=1,
         ),
-        Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD),
+        Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD, resolution=0.01),
     )
 }
 
@@ -137,6 +142,16 @@ class Conditions:
     def names(self) -> frozenset[str]:
         """Names of the known conditions besides q."""
         return frozenset(self._known) - {"q"}
+
+    @property
+    def steps(self) -> Array:
+        """Values of the conditions that models depend on besides q, in multiples of their steps, (m, ·)."""
+        columns = [
+            np.rint(self._known[name].reshape(len(self.q), -1) / condition.resolution)
+            for name, condition in CONDITIONS.items()
+            if condition.resolution and name in self._known
+        ]
+        return np.hstack([np.empty((len(self.q), 0)), *columns])
 
     def at(self, q: Array) -> Conditions:
         """Return the same conditions at other joint positions (c·m, n), all samples of each configuration."""

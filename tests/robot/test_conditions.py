@@ -13,6 +13,7 @@ from robots import robot_file
 import dhcal_pin as dh
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.robust import ZERO_WEIGHT, reject_groups, standardized_residuals
 from dhcal_pin.exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
 from dhcal_pin.io import measurement_text, read_measurements, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Position
@@ -100,6 +101,38 @@ def test_payload_of_a_sample_loads_compliant_joints(arm):
 def test_a_joint_that_does_not_move_keeps_its_direction():
     q = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, -0.2], [0.1 + 1e-6, 0.3]])
     np.testing.assert_array_equal(directions_in_order(q), [[0, 0], [1, 0], [1, -1], [1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("condition", "same", "other"),
+    [("temperature", 0.2, 4.0), ("payload", 1e-4, 2.0), ("approach", 0.0, 1.0)],
+)
+def test_samples_of_one_group_have_the_same_conditions(arm, condition, same, other):
+    """Six samples of each configuration: two stops of three."""
+    rng = np.random.default_rng(2)
+    data = Position.simulate(arm, np.repeat(rng.uniform(-2, 2, (9, 6)), 6, 0), Noise(1e-4), rng)
+    configurations = data.sample_groups
+    timed = data.with_conditions(time=np.arange(54.0))
+    np.testing.assert_array_equal(timed.sample_groups, configurations)
+    stop = np.arange(54) // 3
+    values = 20 * (condition == "temperature") + other * (stop % 2) + same * (np.arange(54) % 2)
+    if condition == "approach":
+        values = np.repeat(values[:, None], 6, 1)
+    groups = timed.with_conditions(**{condition: values}).sample_groups
+    np.testing.assert_array_equal(groups, 2 * configurations + stop % 2)
+
+
+def test_a_wrong_stop_is_rejected_without_the_other_samples_of_its_configuration(arm):
+    """Of 40 configurations with two directions of approach, five samples each, one stop is wrong."""
+    rng = np.random.default_rng(0)
+    q = np.repeat(rng.uniform(-3, 3, (40, 6)), 10, axis=0)
+    approach = np.tile(np.repeat([1.0, -1.0], 5)[:, None], (40, 6))
+    data = Position.simulate(arm, q, Noise(1e-4), rng).with_conditions(approach=approach)
+    residual = rng.normal(size=(3, 400))
+    residual[:, :5] += 3.0
+    weights = np.where(np.arange(400) < 3, ZERO_WEIGHT, 1.0)
+    rejected = np.flatnonzero(reject_groups(weights, standardized_residuals(residual), data) <= ZERO_WEIGHT)
+    np.testing.assert_array_equal(rejected, range(5))
 
 
 def test_joined_samples_keep_the_conditions_that_all_of_them_have(arm):

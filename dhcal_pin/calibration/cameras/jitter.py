@@ -24,7 +24,7 @@ import numpy as np
 
 from ..._typing import Array
 from ...estimation.problem import Problem
-from ...measurements.base import Measurement
+from ...measurements.base import Measurement, label_stops
 from ...measurements.camera import CameraCorners
 
 # First standard deviations of the displacement [m], [rad], and smallest ones.
@@ -81,7 +81,7 @@ def estimate_jitter(
         u = problem.instrument_values_of(plain, x)
         residual = plain.residual(frames, u)
         derivative = plain.displacement_derivative(frames, u) / plain.sigma[:, :, None]
-        label = np.unique(plain.q, axis=0, return_inverse=True)[1].reshape(-1)
+        label = label_stops(plain)
         is_stated = is_stated and item.has_stated_sigma
         for number in range(label.max() + 1):
             samples = label == number
