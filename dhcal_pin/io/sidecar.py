@@ -83,7 +83,15 @@ from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
 from ..robot.conditions import MAX_PAYLOAD, TEMPERATURE_RANGE
-from ..robot.error_families import COUPLING, FAMILIES, GAIN, HARMONICS, JOINT_TERMS, LINK_TERMS
+from ..robot.error_families import (
+    COUPLING,
+    FAMILIES,
+    GAIN,
+    HARMONICS,
+    JOINT_TERMS,
+    LINK_TERMS,
+    THERMAL,
+)
 from ..robot.transmission import (
     MAX_CURVE_ORDER,
     Payload,
@@ -124,12 +132,15 @@ _MANIFEST_KEYS = {"urdf_sha256": toml.text(), "joints_sha256": toml.text(default
 # Keys of the families of joint errors.
 _GAIN, _HARMONICS, _COUPLING = (FAMILIES[name].sidecar_key for name in (GAIN, HARMONICS, COUPLING))
 _JOINT_TERM_KEYS = [FAMILIES[name].sidecar_key for name in JOINT_TERMS]
-_LINK_TERM_KEYS = [FAMILIES[name].sidecar_key for name in LINK_TERMS]
 # Temperature at which the links have the lengths of the URDF [°C].
 _REFERENCE = toml.number(*TEMPERATURE_RANGE)
-_THERMAL_KEYS = {
-    "reference_degc": _REFERENCE,
-    **{key: toml.table_by_name(_COEFFICIENT) for key in _LINK_TERM_KEYS},
+# Tables of the families of links, by their names.
+_LINK_KEYS = {
+    name: {
+        **({"reference_degc": _REFERENCE} if name == THERMAL else {}),
+        FAMILIES[name].sidecar_key: toml.table_by_name(_COEFFICIENT),
+    }
+    for name in LINK_TERMS
 }
 # A prismatic joint has the first of these keys only.
 _JOINT_KEYS = {
@@ -167,7 +178,7 @@ _FRAME_KEYS = {
 SIDECAR_KEYS = {
     **_FRAME_KEYS,
     "joint": toml.table_by_name(toml.table_of(_JOINT_KEYS)),
-    "thermal": toml.table_of(_THERMAL_KEYS),
+    **{name: toml.table_of(keys) for name, keys in _LINK_KEYS.items()},
     "instrument": toml.table_by_name(toml.number()),
     "uncertainty": toml.table_of(_UNCERTAINTY_KEYS),
     "measured": toml.table_of(_MEASURED_KEYS),
@@ -234,7 +245,7 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
         )
     frames = {key: toml.pose_of(read[key]) for key in ("base", "tool") if read[key] is not None}
     joints = table.table("joint") if "joint" in table else None
-    thermal = table.table("thermal") if "thermal" in table else None
+    links = {name: table.table(name) for name in LINK_TERMS if name in table}
     if read["manifest"] is not None:
         _check_manifest(read["manifest"], table.path, chain.urdf, tip)
     # `read_instrument`, `read_uncertainty` and `read_measured_region` read the other tables; those of cameras
@@ -252,10 +263,10 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
             )
         payload = read["payload"]
         chain = chain.with_payload(Payload(payload["mass_kg"], tuple(payload["centre_m"])))
-    if thermal is not None:
-        chain = replace(chain, reference_temperature=_REFERENCE.read(thermal, "reference_degc"))
-    if joints is not None or thermal is not None:
-        chain = chain.with_transmission(_read_transmission(chain, joints, thermal))
+    if THERMAL in links:
+        chain = replace(chain, reference_temperature=_REFERENCE.read(links[THERMAL], "reference_degc"))
+    if joints is not None or links:
+        chain = chain.with_transmission(_read_transmission(chain, joints, links))
     return chain
 
 
@@ -299,13 +310,14 @@ def _joints_digest(urdf: Urdf, tip: str) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _read_transmission(chain: Chain, joints: TomlTable | None, thermal: TomlTable | None) -> Transmission:
-    """Read the tables [joint.NAME] and [thermal]; joints and links that are not on the chain are ignored."""
+def _read_transmission(
+    chain: Chain, joints: TomlTable | None, links: Mapping[str, TomlTable]
+) -> Transmission:
+    """Read the tables [joint.NAME] and those of links; joints and links not on the chain are ignored."""
     coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
     if joints is not None:
         _read_joints(chain, joints, coefficients)
-    if thermal is not None:
-        _read_links(chain, thermal, coefficients)
+    _read_links(chain, links, coefficients)
     return Transmission(coefficients, chain.loads)
 
 
@@ -321,18 +333,20 @@ def _read_joints(chain: Chain, table: TomlTable, coefficients: Array) -> None:
             )
 
 
-def _read_links(chain: Chain, table: TomlTable, coefficients: Array) -> None:
-    """Read the coefficients of links, by family and name of the link, into those of a transmission (c,)."""
+def _read_links(chain: Chain, tables: Mapping[str, TomlTable], coefficients: Array) -> None:
+    """Read the tables of links, by family, into the coefficients of a transmission, shape (c,)."""
     *_, link_terms = split_coefficients(coefficients, chain.n_joints)
-    values = table.values(_THERMAL_KEYS)
-    for row, key in zip(link_terms, _LINK_TERM_KEYS, strict=True):
-        for name, value in values[key].items():
+    for row, family in zip(link_terms, LINK_TERMS, strict=True):
+        if family not in tables:
+            continue
+        key, table = FAMILIES[family].sidecar_key, tables[family]
+        for name, value in table.values(_LINK_KEYS[family])[key].items():
             if name in chain.link_names:
                 row[chain.link_names.index(name)] = value
             elif name not in chain.urdf.links:
-                where = table.table(key).where
                 raise UnknownNameError(
-                    f"{where}: unknown link {name!r}; choose from {', '.join(chain.link_names)}"
+                    f"{table.table(key).where}: unknown link {name!r}; choose from "
+                    f"{', '.join(chain.link_names)}"
                 )
 
 
@@ -468,7 +482,7 @@ def sidecar_text(
     tables = {
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),
-        "thermal": _thermal_content(chain),
+        **_link_content(chain),
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
         "uncertainty": _uncertainty_content(uncertainty),
         "measured": _measured_content(chain, measured_region),
@@ -480,7 +494,7 @@ def sidecar_text(
         return None
     header = _HEADER
     header += _JOINT_HEADER if "joint" in tables else ""
-    header += _THERMAL_HEADER if "thermal" in tables else ""
+    header += _THERMAL_HEADER if THERMAL in tables else ""
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
     header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
@@ -536,18 +550,18 @@ def _transmission_content(chain: Chain) -> dict[str, Any]:
     return content
 
 
-def _thermal_content(chain: Chain) -> dict[str, Any]:
-    """Return the table [thermal]; empty if no link grows."""
-    if chain.transmission is None or not chain.transmission.link_terms.any():
+def _link_content(chain: Chain) -> dict[str, Any]:
+    """Return the tables of the families of links that have a coefficient that is not zero."""
+    if chain.transmission is None:
         return {}
-    rows = zip(_LINK_TERM_KEYS, chain.transmission.link_terms, strict=True)
-    return {
-        "reference_degc": chain.reference_temperature,
-        **{
-            key: {chain.link_names[j]: row[j].item() for j in np.flatnonzero(row).tolist()}
-            for key, row in rows
-        },
-    }
+    content: dict[str, Any] = {}
+    for family, row in zip(LINK_TERMS, chain.transmission.link_terms, strict=True):
+        if not row.any():
+            continue
+        reference = {"reference_degc": chain.reference_temperature} if family == THERMAL else {}
+        values = {chain.link_names[j]: row[j].item() for j in np.flatnonzero(row).tolist()}
+        content[family] = {**reference, FAMILIES[family].sidecar_key: values}
+    return content
 
 
 def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from dhcal_pin.estimation.batch import ChainBatch
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import FAMILIES, Chain, Conditions, Payload, parse_urdf
+from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload, parse_urdf
 from dhcal_pin.robot.transmission import MAX_CURVE_ORDER, Transmission, fill_harmonics, n_coefficients
 
 
@@ -34,12 +34,14 @@ def drawn(chain: Chain, sets: str, rng: np.random.Generator):
 
 
 def random_conditions(arm: Chain, m: int, rng: np.random.Generator) -> Conditions:
-    """Random joint positions, directions of approach and temperatures around the reference."""
-    return Conditions(
-        rng.uniform(-2.5, 2.5, (m, arm.n_joints)),
-        approach=rng.choice([-1.0, 1.0], (m, arm.n_joints)),
-        temperature=arm.reference_temperature + rng.uniform(-10, 10, m),
-    )
+    """Random joint positions and all conditions that joint errors depend on."""
+    q = rng.uniform(-2.5, 2.5, (m, arm.n_joints))
+    drawn = {
+        name: condition.draw(rng, q.shape, arm.reference_temperature)
+        for name, condition in CONDITIONS.items()
+        if condition.draw
+    }
+    return Conditions(q, **drawn)
 
 
 def test_actual_positions_follow_the_formula():
@@ -85,8 +87,7 @@ def test_every_coefficient_is_a_parameter_of_one_set():
     sets = {name: PARAMETER_SETS[name](ur10()) for name in FAMILIES}
     indices = [p.coefficient_index for parameters in sets.values() for p in parameters]
     assert len(set(indices)) == len(indices)
-    counts = {name: len(parameters) for name, parameters in sets.items() if name != "compliance"}
-    assert counts == {
+    counts = {
         "gain": 6,
         "harmonics": 6 * 2 * 2,
         "curves": 6 * 2 * 30,
@@ -95,6 +96,7 @@ def test_every_coefficient_is_a_parameter_of_one_set():
         "backlash": 6,
         "thermal": 7,
     }
+    assert {name: len(sets[name]) for name in counts} == counts
     assert set(indices) < set(range(n_coefficients(6, 6)))
     assert n_coefficients(6, 6) == len(indices) + 6 - len(sets["compliance"])
 
