@@ -20,6 +20,7 @@ from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 from .job_outputs import (
+    ROBOT_FORMATS,
     Calibrated,
     certificate_content,
     curves_content,
@@ -82,7 +83,8 @@ class Job:
             "flags": ("-o", "--output"),
             "metavar": "OUT.urdf",
             "required": True,
-            "help": "corrected URDF; with a manifest, a summary of all robots (.csv)",
+            "help": "; ".join(item.help for item in ROBOT_FORMATS.values())
+            + "; with a manifest, a summary of all robots (.csv)",
             "output": None,
         }
     )

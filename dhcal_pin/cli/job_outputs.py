@@ -1,18 +1,22 @@
 """Contents of the output files of a calibration job.
 
-A field of `Job` that names an output file holds its `Output`; `ROBOT_FORMATS` in `run_job` lists the files of
-the robot itself. Functions import what they need when they are called, because help pages load no NumPy.
+A field of `Job` that names an output file holds its `Output`; `ROBOT_FORMATS` lists the files of the robot
+itself. Functions import what they need when they are called, because help pages load no NumPy.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..exceptions import InvalidArgumentError
 
 if TYPE_CHECKING:
     from .._typing import PathLike
     from ..calibration.result import Result
+    from ..io.camera_files import CameraFrame
     from ..report.provenance import Provenance
 
 
@@ -82,3 +86,95 @@ def certificate_content(done: Calibrated, path: str) -> str:
     from ..report import certificate  # lazy import: only for certificates
 
     return certificate.certificate_page(done.fit, certificate.parse_meta(done.meta), done.source)
+
+
+# --- files of the robot ----------------------------------------------------------------------------
+
+
+class RobotOutput(NamedTuple):
+    """Format of the calibrated robot.
+
+    Attributes:
+        help: What the file is, for the help of --output.
+        files: Function that makes the files of the robot by path, from the value of --output and all options
+            of the job by name. A format refuses the options that it cannot follow.
+    """
+
+    help: str
+    files: Callable[[Result, str, Mapping[str, Any]], dict[PathLike, str | bytes]]
+
+
+def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..io.camera_files import camera_files
+    from ..io.robot import urdf_files
+    from ..robot import urdf_edit
+
+    chain, has_world, camera_frame = fit.chain, options["world_joint"], options["camera_frame"]
+    # A base in the URDF must not be applied a second time by the sidecar.
+    written = replace(chain, base=np.eye(4)) if has_world else chain
+    if has_world and chain.transmission is not None and chain.transmission.has_compliance:
+        raise InvalidArgumentError(
+            "--world-joint: not available with errors that depend on gravity, whose torques assume that "
+            "z of the robot's root link points up; omit it"
+        )
+
+    def frames(data: bytes) -> list[CameraFrame]:
+        return _camera_frames(fit, output, data, has_world, camera_frame)
+
+    def edit(data: bytes) -> bytes:
+        if has_world:
+            data = urdf_edit.with_world(data, chain.base)
+        if options["tool_frame"]:
+            data = urdf_edit.with_tool_frame(data, chain.tip, options["tool_frame"], chain.tool)
+        for frame in frames(data) if camera_frame else ():
+            data = urdf_edit.with_fixed_frame(data, frame.parent, frame.name, frame.pose, "--camera-frame")
+        return data
+
+    contents = urdf_files(
+        written,
+        output,
+        fit.transferable_instruments,
+        fit.uncertainty,
+        fit.measured_region,
+        edit,
+        fit.rig,
+    )
+    if options["camera_files"]:
+        data = contents[output]
+        assert isinstance(data, bytes)
+        for frame in frames(data):
+            contents |= camera_files(frame, f"{options['camera_files']}_{frame.camera.name}")
+    return contents
+
+
+def _camera_frames(
+    fit: Result, output: str, urdf: bytes, has_world: bool, camera_frame: str | None
+) -> list[CameraFrame]:
+    """Return the frames of the cameras in the calibrated URDF, with the measuring frame in it on request."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ..io.camera_files import camera_frames
+    from ..io.origins_file import joint_origins
+    from ..robot.chain import Chain
+    from ..robot.urdf import parse_urdf
+
+    assert fit.rig is not None
+    root, base = ("world", np.eye(4)) if has_world else (fit.chain.root, fit.chain.base)
+    written = Chain.from_urdf(parse_urdf(urdf, output), fit.chain.tip, root)
+    _, tool = joint_origins(fit.chain)
+    return camera_frames(fit.rig, replace(written, base=base, tool=tool), camera_frame)
+
+
+# Formats of the calibrated robot by the ending of --output.
+ROBOT_FORMATS = {".urdf": RobotOutput("corrected URDF", urdf_with_sidecar)}
+
+
+def robot_ending(path: str) -> str:
+    """Return the ending of --output that selects its format."""
+    for ending in ROBOT_FORMATS:
+        if path.lower().endswith(ending):
+            return ending
+    raise InvalidArgumentError(f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}")

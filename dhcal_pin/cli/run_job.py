@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,11 +32,9 @@ from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
-from ..io.camera_files import CameraFrame, camera_files, camera_frames
 from ..io.measurement_files import MeasurementFile, read_measurement_file
-from ..io.origins_file import joint_origins
 from ..io.rig_file import read_rig
-from ..io.robot import read_robot, urdf_files
+from ..io.robot import read_robot
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, sidecar_path
 from ..measurements.base import Measurement
@@ -47,12 +45,10 @@ from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.hypotheses import mend
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
-from ..robot import urdf_edit
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections
-from ..robot.urdf import parse_urdf
 from .job import REGION, Job
-from .job_outputs import Calibrated
+from .job_outputs import ROBOT_FORMATS, Calibrated, robot_ending
 from .options import split_commas
 from .output_table import file_contents, numbered, paths_by_name, require_endings
 from .outputs import (
@@ -194,7 +190,7 @@ def _checked_inputs(job: Job) -> list[str]:
     settings = [job.priors] if job.priors not in (None, "default", "none") else []
     settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
-    _robot_ending(job.output)
+    robot_ending(job.output)
     require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
     require_writable_outputs([*job.output_paths, sidecar_path(job.output)], protected)
@@ -400,10 +396,11 @@ def _write_job(
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
     is_kept = _is_kept(job, fit)
-    contents = ROBOT_FORMATS[_robot_ending(job.output)](fit, job) if is_kept else {}
+    ending = robot_ending(job.output)
+    contents = ROBOT_FORMATS[ending].files(fit, job.output, vars(job)) if is_kept else {}
     source = _provenance(job, sets, data, inputs, contents, hint)
     robot_paths = list(map(str, contents))
-    files = dict(zip((_robot_ending(job.output)[1:], "sidecar"), robot_paths, strict=False))
+    files = dict(zip((ending[1:], "sidecar"), robot_paths, strict=False))
     files |= numbered("camera_file", robot_paths[len(files) :])
     done = Calibrated(fit, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
@@ -430,64 +427,6 @@ def _write_job(
         notes=data.notes,
         hint=hint,
     )
-
-
-def _robot_files(fit: Result, job: Job) -> dict[PathLike, str | bytes]:
-    """Return the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
-    chain = fit.chain
-    # A base in the URDF must not be applied a second time by the sidecar.
-    written = replace(chain, base=np.eye(4)) if job.world_joint else chain
-    if job.world_joint and chain.transmission is not None and chain.transmission.has_compliance:
-        raise InvalidArgumentError(
-            "--world-joint: not available with errors that depend on gravity, whose torques assume that "
-            "z of the robot's root link points up; omit it"
-        )
-
-    def edit(data: bytes) -> bytes:
-        if job.world_joint:
-            data = urdf_edit.with_world(data, chain.base)
-        if job.tool_frame:
-            data = urdf_edit.with_tool_frame(data, chain.tip, job.tool_frame, chain.tool)
-        for frame in _camera_frames(fit, job, data) if job.camera_frame else ():
-            data = urdf_edit.with_fixed_frame(data, frame.parent, frame.name, frame.pose, "--camera-frame")
-        return data
-
-    contents = urdf_files(
-        written,
-        job.output,
-        fit.transferable_instruments,
-        fit.uncertainty,
-        fit.measured_region,
-        edit,
-        fit.rig,
-    )
-    if job.camera_files:
-        data = contents[job.output]
-        assert isinstance(data, bytes)
-        for frame in _camera_frames(fit, job, data):
-            contents |= camera_files(frame, f"{job.camera_files}_{frame.camera.name}")
-    return contents
-
-
-# Functions that make the files of a calibrated robot, by the ending of --output.
-ROBOT_FORMATS: dict[str, Callable[[Result, Job], dict[PathLike, str | bytes]]] = {".urdf": _robot_files}
-
-
-def _robot_ending(path: str) -> str:
-    """Return the ending of --output that selects its format."""
-    for ending in ROBOT_FORMATS:
-        if path.lower().endswith(ending):
-            return ending
-    raise InvalidArgumentError(f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}")
-
-
-def _camera_frames(fit: Result, job: Job, urdf: bytes) -> list[CameraFrame]:
-    """Return the frames of the cameras in the calibrated URDF, with the measuring frame in it on request."""
-    assert fit.rig is not None
-    root, base = ("world", np.eye(4)) if job.world_joint else (fit.chain.root, fit.chain.base)
-    written = Chain.from_urdf(parse_urdf(urdf, job.output), fit.chain.tip, root)
-    _, tool = joint_origins(fit.chain)
-    return camera_frames(fit.rig, replace(written, base=base, tool=tool), job.camera_frame)
 
 
 def _provenance(
