@@ -17,13 +17,13 @@ from ..identifiability import explanations
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group
-from ..result_plots import ResultPlots
 from . import summary
 from .cameras.diagnosis import largest_position_std
 from .cross_validation import refit
 from .estimates import Estimate, make_estimates
 from .evaluation import Accuracy, accuracy, compute_errors
 from .evidence import Evidence
+from .presentation import ResultPlots
 from .residual_table import ResidualTable, residual_table
 from .reweighting import Fit
 from .verdict import Verdict, judge

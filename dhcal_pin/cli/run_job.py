@@ -25,8 +25,8 @@ from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import default_sets, has_images, has_joint_values
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
+from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
-from ..diagnostics.curves import find_lattices
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..estimation.parameters import select_parameters

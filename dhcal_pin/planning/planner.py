@@ -28,6 +28,7 @@ from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise
+from ..plots import plot_plan_curve
 from ..robot.chain import Chain
 from ..robot.collision import CollisionChecker
 from ..robot.error_families import CURVES, FINE_CURVES
@@ -146,8 +147,6 @@ class Plan:
         Returns:
             The axes.
         """
-        from ..visualization.plots import plot_plan_curve  # lazy import: matplotlib is slow to load
-
         return plot_plan_curve(
             (self.sizes, self.errors),
             (self.random_sizes, self.random_errors),

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..calibration.evaluation import Comparison
+from ..calibration.presentation.curves import JointCurve, joint_curves
+from ..calibration.presentation.workspace import WorkspacePrediction, predict_workspace
 from ..calibration.result import Result
-from ..diagnostics.curves import JointCurve, joint_curves
 from ..diagnostics.residuals import JointProfile, Outlier, find_outliers, joint_offset_profiles
-from ..diagnostics.workspace import WorkspacePrediction, predict_workspace
 from .provenance import Provenance, measurement_names
 from .samples import Samples, result_samples
 

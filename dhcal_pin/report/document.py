@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..formatting import Table
-from ..visualization.plots import PANEL
+from ..plots import PANEL
 
 
 @dataclass(frozen=True)

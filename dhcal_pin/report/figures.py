@@ -1,4 +1,4 @@
-"""Figures of sections: which plots of `visualization.plots` a section shows.
+"""Figures of sections: which plots of `plots` a section shows.
 
 A function gets the `ReportContext`, or samples, and returns groups of figures in their order on the page.
 """
@@ -15,16 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import se3
+from .. import plots, se3
 from .._typing import Array
 from ..calibration.evaluation import compute_errors, error_norms
-from ..diagnostics.workspace import WorkspacePrediction
+from ..calibration.presentation.workspace import WorkspacePrediction
 from ..estimation import qr
 from ..formatting import Quantity, capitalized
 from ..measurements.groups import ERROR_GROUPS, in_order
+from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..robot.chain import Chain
-from ..visualization import plots, scene
-from ..visualization.plots import SQUARE_PANEL, WIDE_PANEL
+from ..visualization import scene
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel
 from .samples import ROLES, Samples, is_prismatic_joint

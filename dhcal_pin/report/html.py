@@ -11,7 +11,7 @@ import os
 from .. import formatting
 from .._typing import PathLike
 from ..exceptions import InvalidArgumentError
-from ..visualization.plots import svg_panels
+from ..plots import svg_panels
 from .document import Document, Panel
 
 

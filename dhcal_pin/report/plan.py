@@ -8,12 +8,11 @@ from functools import partial
 
 import numpy as np
 
-from .. import se3
+from .. import plots, se3
 from ..planning.planner import Plan
 from ..planning.views import views_table
 from ..robot.chain import Chain
 from ..robot.coverage import joint_coverage
-from ..visualization import plots
 from . import figures
 from .document import BarTable, Document, FigureGroup, Panel, Section
 from .html import html_page

@@ -22,7 +22,7 @@ from ..io.tabular import csv_text
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..robot.chain import Chain
-from ..visualization.subsampling import evenly_spaced_indices
+from ..subsampling import evenly_spaced_indices
 from .document import Section
 from .json_document import parameter_rows
 

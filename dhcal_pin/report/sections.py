@@ -19,9 +19,9 @@ from ..calibration import summary
 from ..calibration.cross_validation import Generalization
 from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
-from ..diagnostics.curves import JointCurve, find_lattices, fitted_coverage
+from ..calibration.presentation.curves import JointCurve, find_lattices, fitted_coverage
+from ..calibration.presentation.workspace import RELATIVE_TEXT
 from ..diagnostics.residuals import median_sigmas
-from ..diagnostics.workspace import RELATIVE_TEXT
 from ..estimation import robust
 from ..formatting import Quantity, Table, capitalized, format_fixed
 from ..identifiability import EXPECTED

@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import se3
 from ..calibration.evaluation import position_errors
-from ..diagnostics.workspace import RELATIVE_TEXT, WorkspaceMap, predict_workspace, workspace_map
+from ..calibration.presentation.workspace import RELATIVE_TEXT, WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text

@@ -149,7 +149,7 @@ def plot_study(
     Example:
         `plot_study(study, list(run(study))).figure.savefig("study.png")`
     """
-    from ..visualization import plots  # lazy import: slow to load
+    from .. import plots  # lazy import: slow to load
 
     header, rows = result_table(study, blocks)
     ax = plots.plot_study(header, rows, len(fields(Setting)), column, ax)

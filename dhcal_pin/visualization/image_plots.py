@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import plots
 from .._typing import Array
-from . import plots
-from .plots import COLORS, DOT_SIZES
+from ..plots import COLORS, DOT_SIZES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,7 +16,7 @@ from .._typing import Array
 from ..calibration.result import Result
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .subsampling import evenly_spaced_indices
+from ..subsampling import evenly_spaced_indices
 
 # Names of the sets of samples; `MeasuredSamples.sets` contains their indices.
 SETS = ("fitted", "held out", "outliers")

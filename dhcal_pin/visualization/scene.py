@@ -42,10 +42,10 @@ from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.transmission import coefficient_indices
+from ..subsampling import evenly_spaced_indices
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .rig_lines import rig_lines
-from .subsampling import evenly_spaced_indices
 from .uncertainty_cells import UncertaintyCells, uncertainty_cells
 
 # Largest number of measured points and of configurations to play; more would make the page slow.

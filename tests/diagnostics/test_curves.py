@@ -9,8 +9,8 @@ import pytest
 from robots import paper
 
 from dhcal_pin.calibration import Result, calibrate
+from dhcal_pin.calibration.presentation.curves import CURVE_VALUES
 from dhcal_pin.diagnostics import find_lattices, fitted_coverage, joint_curves
-from dhcal_pin.diagnostics.curves import CURVE_VALUES
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain, Conditions

@@ -10,7 +10,8 @@ import pytest
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.diagnostics import predict_workspace, workspace, workspace_map
+from dhcal_pin.calibration.presentation import workspace
+from dhcal_pin.diagnostics import predict_workspace, workspace_map
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints

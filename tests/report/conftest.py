@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dhcal_pin.calibration import Result, calibrate, split
-from dhcal_pin.diagnostics import workspace
+from dhcal_pin.calibration.presentation import workspace
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import dhcal_pin
-from dhcal_pin.visualization import plots
-from dhcal_pin.visualization.plots import COLORS, svg_panels
+from dhcal_pin import plots
+from dhcal_pin.plots import COLORS, svg_panels
 
 # An import of matplotlib; the type of axes is imported for annotations only.
 MATPLOTLIB = r"^\s*(from|import) matplotlib(?!\.axes import Axes$)"
@@ -217,4 +217,4 @@ def test_only_the_modules_of_plots_import_matplotlib():
         for path in package.rglob("*.py")
         if re.search(MATPLOTLIB, path.read_text(encoding="utf-8"), re.MULTILINE)
     }
-    assert importing == {"visualization/plots.py", "visualization/fit_plots.py"}
+    assert importing == {"plots.py", "calibration/presentation/fit_plots.py"}

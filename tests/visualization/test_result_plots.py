@@ -13,8 +13,8 @@ import dhcal_pin as dh
 from dhcal_pin.estimation import qr
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
 from dhcal_pin.planning import plan
+from dhcal_pin.plots import COLORS
 from dhcal_pin.studies import plot_study, read_study, run
-from dhcal_pin.visualization.plots import COLORS
 
 PLOTS = ("accuracy", "residuals", "parameters", "singular_values", "correlation", "workspace")
 

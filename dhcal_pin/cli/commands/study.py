@@ -83,7 +83,7 @@ def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace) -> 
 
     from ... import studies
     from ...io.tabular import csv_text
-    from ...visualization.plots import study_svg
+    from ...plots import study_svg
     from ..outputs import write_outputs
     from ..screens import console
     from ..screens.result_screens import study_screen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._typing import Array
+from ._typing import Array
 
 
 def evenly_spaced_indices(count: int, limit: int) -> Array:

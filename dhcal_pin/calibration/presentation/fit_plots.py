@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._typing import Array
-from ..calibration.evaluation import Comparison
-from ..estimation import qr
-from ..exceptions import UnknownNameError
-from ..measurements.groups import ERROR_GROUPS, in_order
-from . import plots
-from .plots import COLORS, DOT_SIZES, MAX_DOTS, new_axes
-from .subsampling import evenly_spaced_indices
+from ... import plots
+from ..._typing import Array
+from ...estimation import qr
+from ...exceptions import UnknownNameError
+from ...measurements.groups import ERROR_GROUPS, in_order
+from ...plots import COLORS, DOT_SIZES, MAX_DOTS, new_axes
+from ...subsampling import evenly_spaced_indices
+from ..evaluation import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
 
-    from ..calibration.evaluation import ErrorStatistics
-    from ..calibration.evidence import Evidence
+    from ..evaluation import ErrorStatistics
+    from ..evidence import Evidence
 
 # Largest number of rows of a plot of parameters, and of names beside a matrix.
 MAX_PARAMETERS, _MAX_NAMES = 40, 60

@@ -1,22 +1,22 @@
-"""Plots and tables that a result makes of itself.
-
-The drawing code is in `visualization`, above this package. It is imported when a method is called.
-"""
+"""Plots and tables that a result makes of itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from . import formatting
-from ._typing import Array
-from .calibration.summary import generalization_lines, headline, largest_corrections
-from .exceptions import InvalidArgumentError
+from ... import formatting, plots
+from ..._typing import Array
+from ...exceptions import InvalidArgumentError
+from ..summary import generalization_lines, headline, largest_corrections
+from . import fit_plots
+from .curves import joint_curves
+from .workspace import predict_workspace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from .calibration.evidence import Evidence
+    from ..evidence import Evidence
 
 
 class ResultPlots:
@@ -47,8 +47,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
-
         return fit_plots.plot_accuracy(self._result, ax, group=group)
 
     def plot_residuals(
@@ -68,8 +66,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
-
         return fit_plots.plot_residuals(self._result, ax, over=over, group=group)
 
     def plot_joint_corrections(self, ax: Sequence[Axes] | None = None) -> list[Axes]:
@@ -87,9 +83,6 @@ class ResultPlots:
         Raises:
             InvalidArgumentError: No joint has a correction curve, or the number of axes is another one.
         """
-        from .diagnostics.curves import joint_curves  # lazy import, as the following
-        from .visualization import plots
-
         curves = joint_curves(self._result)
         if not curves:
             raise InvalidArgumentError(
@@ -123,8 +116,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
-
         return fit_plots.plot_parameters(self._result, ax, count=count)
 
     def plot_singular_values(self, ax: Axes | None = None) -> Axes:
@@ -139,8 +130,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
-
         return fit_plots.plot_singular_values(self._result, ax)
 
     def plot_correlation(self, ax: Axes | None = None) -> Axes:
@@ -155,8 +144,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .visualization import fit_plots  # lazy import: matplotlib is slow to load
-
         return fit_plots.plot_correlation(self._result, ax)
 
     def plot_workspace(self, ax: Axes | None = None, *, plane: str = "xz") -> Axes:
@@ -172,9 +159,6 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        from .diagnostics.workspace import predict_workspace  # lazy import, as the following
-        from .visualization import fit_plots
-
         workspace = predict_workspace(self._result, self._result.inliers)
         return fit_plots.plot_workspace(workspace.points, workspace.std, workspace.measured, ax, plane=plane)
 

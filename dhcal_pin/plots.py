@@ -6,8 +6,9 @@ Every plot function draws into the axes `ax`, or into a new figure if `ax` is No
     ax.figure.savefig("errors.png")
 
 Arguments are in SI units; the axes show mm, mrad and degrees. No function uses `matplotlib.pyplot`, so plots
-do not depend on a display or on figures of the caller. Only this module and `fit_plots` import matplotlib.
-The imports are inside functions, because they take about 0.4 s and most commands draw nothing.
+do not depend on a display or on figures of the caller. Only this module and
+`calibration.presentation.fit_plots` import matplotlib. The imports are inside functions, because they take
+about 0.4 s and most commands draw nothing.
 
 `svg_panels` draws plots for a web page. The SVG is the same for the same data on every machine: identifiers
 are hashed with a fixed salt, no date is written, and the layout is computed with the font that is part of
@@ -28,9 +29,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from .._typing import Array
-from ..estimation.qr import RANK_RTOL
-from ..formatting import SMALL_UNITS, UNITS
+from ._typing import Array
+from .estimation.qr import RANK_RTOL
+from .formatting import SMALL_UNITS, UNITS
 from .subsampling import evenly_spaced_indices
 
 if TYPE_CHECKING:

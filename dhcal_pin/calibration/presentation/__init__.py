@@ -1,0 +1,9 @@
+"""Presentation of results: plots, joint correction curves and predicted accuracy.
+
+`ResultPlots` has the methods of `Result` that draw or tabulate it. What they draw is computed in `curves` and
+`workspace`, and drawn in `fit_plots` with the functions of `dhcal_pin.plots`.
+"""
+
+from .result_plots import ResultPlots
+
+__all__ = ["ResultPlots"]

@@ -1,0 +1,161 @@
+"""Predicted accuracy of a calibrated robot over its workspace, beside measured errors.
+
+The covariance of the estimated parameters predicts the standard deviation of the tool position in any
+configuration. `predict_workspace` returns it for single configurations, `workspace_map` by cells of the
+workspace:
+
+    std = √(mean of std_i² over the configurations i whose tool point lies in the cell)
+
+Where the measurements leave the pose of base or tool free, as images do, positions are relative to the base
+and tool poses that fit the measured configurations best, see `estimation.frame_gauge`.
+
+A position is reached in many configurations, and not equally well in all of them. Errors that the model lacks
+come on top of the prediction; the measured errors of a cell contain them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array
+from ...estimation.uncertainty import Predictor
+from ...measurements.base import Measurement
+from ...robot.sampling import ConfigurationSampler, WorkspaceConstraints, joint_range
+from ..evaluation import position_errors
+
+# Configurations of a prediction by configurations, and of a map by cells.
+N_PREDICTED_CONFIGURATIONS, N_MAP_CONFIGURATIONS = 16_000, 20_000
+# Added to texts on predictions where the measurements leave the pose of base or tool free.
+RELATIVE_TEXT = (
+    "The measurements leave the pose of the base or of the tool free, at least in part: unknown poses of "
+    "cameras, boards or instruments take its place. The prediction is therefore that of positions relative "
+    "to the base and tool poses that fit the measured samples best."
+)
+# Predictions that are computed at once; more need more memory and are not faster.
+CHUNK_SIZE = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class WorkspacePrediction:
+    """Predicted accuracy in single configurations.
+
+    Attributes:
+        points: Tool points in the base frame of s configurations all over the joint ranges, (s, 3) [m].
+        std: Predicted standard deviations of their positions, (s,) [m]; infinite if not determined.
+        measured: Tool points of the measured samples in the base frame, (m, 3) [m].
+        measured_std: Predicted standard deviations of their positions, (m,) [m].
+    """
+
+    points: Array
+    std: Array
+    measured: Array
+    measured_std: Array
+
+
+def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
+    """Predict the accuracy in configurations all over the joint ranges, and in the measured ones."""
+    n = model.chain.n_joints
+    drawn = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_PREDICTED_CONFIGURATIONS, n))
+    measured = [item.configurations() for item in data if item.configurations_per_row > 0]
+    base_from_measuring, relative = se3.inverse(model.chain.base), model.relative
+
+    def predict(q: Array) -> tuple[Array, Array]:
+        if not len(q):
+            return np.empty((0, 3)), np.empty(0)
+        predictions = [relative.predict(part) for part in np.array_split(q, -(-len(q) // CHUNK_SIZE))]
+        points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
+        points = points @ base_from_measuring[:3, :3].T + base_from_measuring[:3, 3]
+        return points, np.concatenate([one.position_std for one in predictions])
+
+    return WorkspacePrediction(
+        *predict(drawn), *predict(np.concatenate(measured) if measured else np.empty((0, n)))
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class WorkspaceMap:
+    """Predicted and measured accuracy by cells of the workspace.
+
+    Attributes:
+        centre: Centres of the c cells that the tool reaches, in the measuring frame, (c, 3) [m].
+        size: Side of the cells [m].
+        std: Predicted RMS distance between tool and model over the configurations that reach the cell, (c,)
+            [m]; infinite if it is not determined.
+        worst: Largest predicted distance of these configurations, (c,) [m].
+        count: Number of configurations, (c,).
+        readings: Number of measured positions, (c,).
+        measured: RMS distance between measured and modelled positions, (c,) [m]; NaN without measurements.
+        expected: Predicted RMS distance in the measured configurations, without the noise of the instrument,
+            (c,) [m]; NaN without measurements.
+    """
+
+    centre: Array
+    size: float
+    std: Array
+    worst: Array
+    count: Array
+    readings: Array
+    measured: Array
+    expected: Array
+
+
+def workspace_map(
+    model: Predictor,
+    data: Sequence[Measurement] = (),
+    known: Mapping[str, float] | None = None,
+    cell: float = 0.1,
+    samples: int = N_MAP_CONFIGURATIONS,
+    seed: int = 0,
+) -> WorkspaceMap:
+    """Predict the position uncertainty of a calibrated robot by cells of its workspace.
+
+    Args:
+        model: Calibration, or what its sidecar file contains of it.
+        data: Measurements to compare with; kinds without positions are ignored.
+        known: Values of their instrument parameters by name; others are fitted to the data.
+        cell: Side of a cell [m].
+        samples: Number of configurations, drawn evenly from the joint ranges.
+        seed: Seed of the draw.
+
+    Returns:
+        The cells that the tool reaches.
+    """
+    sampler = ConfigurationSampler.from_chain(model.chain, WorkspaceConstraints(), 0.0, 0.0)
+    points, variances = _predict_positions(model, sampler.draw(samples, np.random.default_rng(seed)))
+    q, errors = position_errors(model.chain, data, known)
+    measured_points, measured_variances = _predict_positions(model, q)
+    keys = np.floor(np.concatenate([points, measured_points]) / cell).astype(int)
+    cells, index = np.unique(keys, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    measured_index = index[len(points) :]
+    all_variances = np.concatenate([variances, measured_variances])
+    worst = np.zeros(len(cells))
+    np.maximum.at(worst, index, np.sqrt(all_variances))
+    return WorkspaceMap(
+        centre=(cells + 0.5) * cell,
+        size=cell,
+        std=_root_mean(index, all_variances, len(cells)),
+        worst=worst,
+        count=np.bincount(index),
+        readings=np.bincount(measured_index, minlength=len(cells)),
+        measured=_root_mean(measured_index, errors**2, len(cells)),
+        expected=_root_mean(measured_index, measured_variances, len(cells)),
+    )
+
+
+def _predict_positions(model: Predictor, q: Array) -> tuple[Array, Array]:
+    """Return tool points (m, 3) [m] and the variances (m,) [m²] of their positions."""
+    relative = model.relative
+    predictions = [relative.predict(part) for part in np.array_split(q, len(q) // CHUNK_SIZE + 1)]
+    points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
+    return points, np.concatenate([one.position_std for one in predictions]) ** 2
+
+
+def _root_mean(index: Array, squares: Array, count: int) -> Array:
+    """Return the root of the mean of squares (m,) by cell, (count,); NaN for cells without any."""
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.bincount(index, squares, count) / np.bincount(index, minlength=count))
