@@ -359,7 +359,7 @@ def _joint_errors(chain: Chain) -> str:
 
 def _gravity_bodies(chain: Chain) -> list[dict[str, Any]]:
     """Return the bodies whose weight loads the joints: weight [N], centre of mass and joint of each."""
-    if chain.transmission is None or not chain.transmission.has_compliance:
+    if chain.transmission is None:
         return []
     model = chain.transmission.loads.model
     moving = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}

@@ -37,8 +37,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--truth",
         metavar="T.urdf",
         type=ROBOT["type"],
-        help="robot with errors (default: ROBOT); if its sidecar has backlash or thermal growth, directions "
-        "of approach or temperatures are drawn and written",
+        help="robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
+        "directions of approach or temperatures, are drawn and written",
     )
     parser.add_argument(
         "--errors",
