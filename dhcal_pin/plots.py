@@ -268,18 +268,9 @@ def plot_joint_offsets(
     is_prismatic: bool = False,
     limit: float | None = None,
 ) -> Axes:
-    """Plot the residual joint-angle error over the joint angle, with two standard errors.
+    """Plot the joint-angle error over the joint angle "before" and "after", with two standard errors.
 
-    Args:
-        centres: Middle of each part of the joint's range, shape (b,) [rad or m].
-        offsets: Joint error (b,) and its standard error (b,) [rad or m] of the states "before" and "after".
-        ax: Axes to draw into; a new figure if None.
-        joint: Name of the joint.
-        is_prismatic: Whether the joint positions are lengths.
-        limit: Largest error that the vertical axis shows on both sides [rad or m]; from the data if None.
-
-    Returns:
-        The axes.
+    `limit` is the largest error that the vertical axis shows on both sides [rad or m]; from the data if None.
     """
     ax = _axes(ax)
     scale, angle = shown_joint_unit(is_prismatic)
@@ -318,17 +309,7 @@ def plot_joint_corrections(
 ) -> Axes:
     """Plot the correction of a joint over its position, with its 95 % band and the gaps between measurements.
 
-    Args:
-        values: Joint values in ascending order, shape (v,) [rad].
-        correction: Angle to add to each of them, shape (v,) [rad].
-        std: Standard deviation of the correction, shape (v,) [rad].
-        ax: Axes to draw into; a new figure if None.
-        gaps: Ranges of joint values that were not measured, which are shaded [rad].
-        joint: Name of the joint.
-        limit: Largest correction that the vertical axis shows on both sides [rad]; from the data if None.
-
-    Returns:
-        The axes.
+    `limit` is the largest correction that the vertical axis shows on both sides [rad]; from the data if None.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -382,15 +363,8 @@ def plot_plan_curve(
 ) -> Axes:
     """Plot the predicted error over the number of poses.
 
-    Args:
-        planned: Numbers of planned poses (c,) and predicted RMS position error of each (c,) [m].
-        random: Numbers of random poses (d,) and predicted error of each (d,) [m].
-        chosen: Number of poses of the plan and their predicted error [m].
-        recommended_size: Number of poses with diminishing returns, if any.
-        ax: Axes to draw into; a new figure if None.
-
-    Returns:
-        The axes.
+    `planned`, `random` and `chosen` are numbers of poses with their predicted RMS position errors [m]. The
+    recommended size is that with diminishing returns.
     """
     ax = _axes(ax)
     ax.plot(
@@ -429,20 +403,9 @@ def plot_position_std_map(
     """Plot a map of the predicted standard deviation of the tool position, or of measured errors.
 
     A cell shows the RMS along the line of sight of the points in it and in its eight neighbours, so that a
-    few points do not look like speckles.
-
-    Args:
-        points: Tool positions in the base frame, shape (s, 3) [m].
-        std: Standard deviation of each position, shape (s,) [m]; infinite if it cannot be predicted.
-        ax: Axes to draw into; a new figure if None.
-        plane: Horizontal and vertical coordinate: "xy", "xz" or "yz".
-        measured: Measured tool positions in the base frame, shape (m, 3) [m].
-        levels: Edges between the colours [m], so that several maps share a scale; from `std` if None, see
-            `std_levels`.
-        region: Positions that the axes contain, shape (r, 3) [m], `points` among them; `points` if None.
-
-    Returns:
-        The axes.
+    few points do not look like speckles. The standard deviations [m] are infinite where they cannot be
+    predicted. The plane is "xy", "xz" or "yz". With the edges between the colours in `levels`, several maps
+    share a scale. The axes contain `region`, which contains the points.
     """
     ax = _axes(ax)
     columns = ["xyz".index(name) for name in plane]

@@ -36,15 +36,7 @@ def skew(w: ArrayLike) -> Array:
 
 
 def transform(rotation: ArrayLike, position: ArrayLike) -> Array:
-    """Combine rotations and positions to homogeneous matrices.
-
-    Args:
-        rotation: Rotation matrices, shape (..., 3, 3).
-        position: Positions, shape (..., 3) [m].
-
-    Returns:
-        Homogeneous matrices, shape (..., 4, 4).
-    """
+    """Combine rotations (..., 3, 3) and positions (..., 3) to homogeneous matrices."""
     rotation, position = np.asarray(rotation, float), np.asarray(position, float)
     shape = np.broadcast_shapes(rotation.shape[:-2], position.shape[:-1])
     out = np.zeros((*shape, 4, 4))
@@ -214,17 +206,10 @@ def to_xyz_rpy(origin: Array) -> list[float]:
 
 
 def nearest_rpy(rotation: Array, near: ArrayLike) -> Array:
-    """Compute the roll, pitch and yaw of a rotation that are nearest to given angles.
+    """Compute roll, pitch and yaw of a rotation Rz(yaw)·Ry(pitch)·Rx(roll) nearest to given angles [rad].
 
     A rotation has two triples of angles, (r, p, y) and (r + π, π - p, y + π), each up to whole turns. At a
     pitch of a quarter turn only the sum or the difference of roll and yaw is determined.
-
-    Args:
-        rotation: Rotation matrix Rz(yaw)·Ry(pitch)·Rx(roll), shape (3, 3).
-        near: Roll, pitch and yaw that the result shall be near to, shape (3,) [rad].
-
-    Returns:
-        Roll, pitch and yaw, shape (3,) [rad].
     """
     near = np.asarray(near, float)
     angles = pin.rpy.matrixToRpy(rotation)

@@ -46,13 +46,9 @@ def propagate_frames(
 ) -> None:
     """Compute the frames along a chain, from the base to the tool.
 
-    Args:
-        link_transforms: Constant transforms L between the joint motions, shape (k+1, 4, 4). The last one
-            leads to the tool.
-        prismatic: Whether each joint is prismatic, shape (k,).
-        joint_state: Positions of the moving joints.
-        frames: Columns x, y, z, p of each frame and three columns of work memory, shape (k+2, 7, 3, m).
-            Frame 0 is given; the others are filled.
+    `frames`, shape (k+2, 7, 3, m), has columns x, y, z, p of each frame and three columns of work memory.
+    Frame 0 is given; the others are filled. The last of the constant transforms, shape (k+1, 4, 4), leads to
+    the tool.
     """
     # The columns of F·L are linear combinations of the columns of F: one small matrix product for all
     # samples. A rotation by q about z maps x to cos q·x + sin q·y and y to cos q·y - sin q·x.
@@ -79,13 +75,8 @@ def propagate_frames(
 def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, out: Array) -> None:
     """Compute the Jacobian of a point by unit twists of bodies, in the axes of the measuring frame.
 
-    Args:
-        frames: Columns x, y, z, p of each body frame and three columns that are overwritten, shape (b, 7, 3,
-            m).
-        point: Point in the measuring frame, shape (3, m) [m].
-        bodies: Body of each twist, ascending, shape (p,).
-        twists: Twists in the body frames, shape (p, 6).
-        out: Velocities [v', ω'] to fill, shape (p, 6, m).
+    The frames have columns x, y, z, p and three that are overwritten, shape (b, 7, 3, m); the point has shape
+    (3, m) [m]. The body numbers, shape (p,), ascend. `out` receives velocities [v', ω'], shape (p, 6, m).
     """
     # A velocity is a linear combination of the body's axes and of the velocities that rotations about them
     # cause: one small matrix product for all samples and components.
@@ -110,14 +101,8 @@ def batch_point_jacobian(
     """Compute the Jacobian of a point by unit twists of bodies, for a batch of chains.
 
     The samples are ordered by configuration of the sample (first or second), then by member of the batch.
-
-    Args:
-        frames: Columns x, y, z, p of each body frame, shape (j, 7, 3, ends·b·m).
-        point: Point in the measuring frame, shape (3, ends·b·m) [m].
-        bodies: Body of each twist, ascending, shape (p,).
-        twists: Twists of each member in its body frames, shape (b, p, 6).
-        ends: Configurations per sample, 1 or 2.
-        out: Velocities [v', ω'] to fill, shape (p, 6, ends·b·m).
+    Frames have shape (j, 7, 3, ends·b·m), the point (3, ends·b·m) [m], the twists of the members (b, p, 6)
+    and the velocities in `out` (p, 6, ends·b·m). The body numbers ascend.
     """
     shape = ends, len(twists), point.shape[1] // max(ends * len(twists), 1)
     starts = np.searchsorted(bodies, np.arange(len(frames) + 1)).tolist()
@@ -136,16 +121,7 @@ def batch_point_jacobian(
 
 
 def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, out: Array) -> Array:
-    """Multiply an observation matrix by a Jacobian of the tool.
-
-    Args:
-        jacobian: Tool velocities by p errors, shape (p, 6, c·m), with c configurations per sample.
-        observation: Observation matrix of m samples.
-        out: Product to fill, shape (p, r, m).
-
-    Returns:
-        `out`.
-    """
+    """Multiply an observation matrix by tool velocities (p, 6, c·m); `out` has shape (p, r, m)."""
     out[:] = 0.0
     p, _, m = out.shape
     ends = jacobian.reshape(p, 6, jacobian.shape[2] // max(m, 1), m)
@@ -157,16 +133,10 @@ def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, ou
 
 
 def error_frame_poses(body_from_urdf: Array, origins: Array, tool: Array, displacements: Array) -> Array:
-    """Compute the pose of each error frame in its body, before its own displacement.
+    """Compute the pose of each error frame in its body, before its own displacement, shape (2b+2, 4, 4).
 
-    Args:
-        body_from_urdf: URDF link frame of each body in its body frame, shape (b, 4, 4).
-        origins: Origins of the joints and of the tip without joint motions, shape (b, 4, 4).
-        tool: Tool in the tip frame, shape (4, 4).
-        displacements: Displacements of the error frames, shape (2b+2, 4, 4).
-
-    Returns:
-        Poses of the error frames, shape (2b+2, 4, 4).
+    The URDF link frames in their bodies and the origins without joint motions have shape (b, 4, 4), the
+    displacements of the error frames (2b+2, 4, 4).
     """
     frames = np.empty(displacements.shape)
     # The frame of body 0 lies behind the displacement of the base.
@@ -184,18 +154,9 @@ def perturb_frames(
 
     The displacement of error frame s is the product of exp(x_i·ξ_i) over the errors i at s, in their order.
     The derivative of the chain by x_i is the twist Ad(F·E)·ξ_i of the frame's body, where F is the pose of
-    the error frame in the body and E the product over the preceding errors at s.
-
-    Args:
-        body_from_urdf: URDF link frame of each body in its body frame, shape (b, 4, 4).
-        origins: Origins of the joints and of the tip without joint motions, shape (b, 4, 4).
-        tool: Tool in the tip frame, shape (4, 4).
-        error_frames: Error frame of each error, ascending, shape (p,).
-        twists: Twists in the error frames, shape (p, 6).
-        x: Values of the errors, shape (p,).
-
-    Returns:
-        Displacements of all error frames, shape (2b+2, 4, 4), and twists in body frames, shape (p, 6).
+    the error frame in the body and E the product over the preceding errors at s. The error frames, shape
+    (p,), ascend. The result is all displacements, shape (2b+2, 4, 4), and the twists in body frames, shape
+    (p, 6).
     """
     displacements, preceding = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty((len(x), 4, 4))
     displacements[:] = _IDENTITY

@@ -31,15 +31,7 @@ def propagate_frames(
 
 
 def point_jacobian(frames: Array, point: Array, bodies: Array, twists: Array, out: Array) -> None:
-    """Compute the Jacobian of a point by body twists; see `kinematics.point_jacobian`.
-
-    Args:
-        frames: Body frames, shape (b, 7, 3, m).
-        point: Point in the measuring frame, shape (3, m) [m].
-        bodies: Body of each twist, ascending, shape (p,).
-        twists: Twists in body frames, shape (p, 6).
-        out: Jacobian to fill, shape (p, 6, m).
-    """
+    """Compute the Jacobian of a point by body twists; see `kinematics.point_jacobian`."""
     _native.point_jacobian(frames, point, bodies, twists, out)
 
 
@@ -52,19 +44,7 @@ def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, ou
 def perturb_frames(
     body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
-    """Displace the error frames of a chain; see `kinematics.perturb_frames`.
-
-    Args:
-        body_from_urdf: URDF link frames in body frames, shape (b, 4, 4).
-        origins: Origins of the joints and of the tip, shape (b, 4, 4).
-        tool: Tool in the tip frame, shape (4, 4).
-        error_frames: Error frame of each error, ascending, shape (p,).
-        twists: Twists in the error frames, shape (p, 6).
-        x: Values of the errors, shape (p,).
-
-    Returns:
-        Displacements of all error frames, shape (2b+2, 4, 4), and twists in body frames, shape (p, 6).
-    """
+    """Displace the error frames of a chain; see `kinematics.perturb_frames`."""
     displacements = np.empty((2 * len(body_from_urdf) + 2, 4, 4))
     body_twists = np.empty(twists.shape)
     _native.perturb_frames(body_from_urdf, origins, tool, error_frames, twists, x, displacements, body_twists)
@@ -87,26 +67,12 @@ def right_jacobian_inverse_batch(rotvecs: Array) -> Array:
 
 
 def r_factor(rows: Array) -> Array:
-    """Compute the R factor of a matrix; see `qr.r_factor`.
-
-    Args:
-        rows: Matrix of k·m rows, shape (c, k, m).
-
-    Returns:
-        Upper triangular factor, shape (c, c).
-    """
+    """Compute the R factor of a matrix; see `qr.r_factor`."""
     return r_factors(rows[None])[0]
 
 
 def r_factors(rows: Array) -> Array:
-    """Compute the R factors of a batch of matrices; see `qr.r_factors`.
-
-    Args:
-        rows: Matrices of k·m rows, shape (b, c, k, m).
-
-    Returns:
-        Upper triangular factors, shape (b, c, c).
-    """
+    """Compute the R factors of a batch of matrices; see `qr.r_factors`."""
     b, c, k, _ = rows.shape
     out = np.empty((b, c, c))
     _native.r_factors(rows, _work_array(c, k, 0), out)

@@ -29,14 +29,7 @@ MIN_TALL_ROWS = 2000
 
 
 def r_factor(rows: Array) -> Array:
-    """Compute the R factor of a matrix.
-
-    Args:
-        rows: Matrix of k·m rows, shape (c, k, m); it may be overwritten.
-
-    Returns:
-        Upper triangular factor, shape (c, c).
-    """
+    """Compute the R factor (c, c) of a matrix of k·m rows, shape (c, k, m), which may be overwritten."""
     columns, residuals, samples = rows.shape
     if residuals == 1 or residuals * samples < MIN_TALL_ROWS:
         return _qr(np.ascontiguousarray(rows).reshape(columns, -1))
@@ -45,14 +38,7 @@ def r_factor(rows: Array) -> Array:
 
 
 def r_factors(rows: Array) -> Array:
-    """Compute the R factors of a batch of matrices.
-
-    Args:
-        rows: Matrices of k·m rows, shape (b, c, k, m).
-
-    Returns:
-        Upper triangular factors, shape (b, c, c).
-    """
+    """Compute the R factors (b, c, c) of a batch of matrices of k·m rows, shape (b, c, k, m)."""
     b, c = rows.shape[:2]
     stacked = rows.reshape(b, c, -1)
     n_missing = c - stacked.shape[2]
@@ -65,22 +51,12 @@ def r_factors(rows: Array) -> Array:
 def factor_jacobian(
     frames: Array, point: Array, bodies: Array, twists: Array, observation: ObservationMatrix, given: Array
 ) -> Array:
-    """Compute R factors of whitened Jacobians, one per member of a batch.
+    """Compute R factors (b, p+s, p+s) of whitened Jacobians, one per member of a batch.
 
-    The first p columns are the Jacobian of the residuals by p errors, the other s columns are given. The
-    samples are ordered by configuration of the sample (first or second), then by member of the batch.
-
-    Args:
-        frames: Columns x, y, z, p of each body frame and three columns that are overwritten, shape
-            (j, 7, 3, c·b·m), with c configurations per sample.
-        point: Tool point in the measuring frame, shape (3, c·b·m) [m].
-        bodies: Body of each error, ascending, shape (p,).
-        twists: Twists of each member's errors in body frames, shape (b, p, 6).
-        observation: Observation matrix of r rows at b·m samples.
-        given: Further columns, shape (s, r, b·m); they may be overwritten.
-
-    Returns:
-        Upper triangular factors, shape (b, p+s, p+s).
+    The first p columns are the Jacobian of the residuals by p errors; the other s columns are given, shape
+    (s, r, b·m), and may be overwritten. The samples are ordered by configuration of the sample (first or
+    second), then by member of the batch. Frames, bodies and twists are those of
+    `kinematics.batch_point_jacobian`.
     """
     (s, k, n), (b, p, _) = given.shape, twists.shape
     block = work_array("rows", k, p + s, n).swapaxes(0, 1)
@@ -99,13 +75,7 @@ def factor_jacobian(
 def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
     """Compute the R factor of [R | z] with rows diag(diagonal)·δ = target below it.
 
-    Args:
-        r: R factor with the right-hand side z in its last column, shape (p+1, p+1).
-        diagonal: Diagonal of the appended block, for example prior weights, shape (p,).
-        target: Right-hand side of the appended rows, shape (p,).
-
-    Returns:
-        Upper triangular factor, shape (p+1, p+1).
+    R has the right-hand side z in its last column, shape (p+1, p+1), like the result.
     """
     p = len(diagonal)
     stacked = np.zeros((p + 1, 2 * p + 1))

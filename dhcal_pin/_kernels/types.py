@@ -57,11 +57,7 @@ class FrameBatch:
         return self.columns[:, :4]
 
     def poses(self) -> Array:
-        """Compute the tool poses in the measuring frame.
-
-        Returns:
-            Homogeneous matrices, shape (m, 4, 4).
-        """
+        """Compute the tool poses in the measuring frame, shape (m, 4, 4)."""
         out = np.zeros((self.tool.shape[-1], 4, 4))
         out[:, :3, :] = self.tool.transpose(2, 1, 0)
         out[:, 3, 3] = 1.0

@@ -38,15 +38,7 @@ _REPORT, _SCENE, _RESULT, _RESIDUALS = "report.html", "scene.html", "result.json
 
 
 async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
-    """Say what the measurement files contain.
-
-    Args:
-        upload: Files and options.
-        folder: Folder that contains the files.
-
-    Yields:
-        Messages; see the module.
-    """
+    """Yield messages about what the measurement files in a folder contain."""
     kept = [word for word in upload.options if word.startswith(("--tip=", "--columns="))]
     robot = [f"--robot={upload.robot}", *kept] if upload.robot else []
     run = _Run(folder)
@@ -57,15 +49,7 @@ async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any]
 
 
 async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
-    """Calibrate the robot.
-
-    Args:
-        upload: Files and options.
-        folder: Folder that contains the files.
-
-    Yields:
-        Messages; see the module.
-    """
+    """Calibrate the robot with the files in a folder, and yield messages about it."""
     if not upload.robot:
         yield {"error": "no robot file; add a URDF or a DH table"}
         return
@@ -122,14 +106,7 @@ class _Run:
         self.status: int | None = None
 
     async def lines(self, *words: str) -> AsyncGenerator[str, None]:
-        """Run a command and yield the lines that it prints on stderr; stop it if the caller stops.
-
-        Args:
-            *words: Words of the command line.
-
-        Yields:
-            Lines without their end.
-        """
+        """Run a command and yield the lines that it prints on stderr; stop it if the caller stops."""
         async with _started(words, self._folder) as process:
             assert process.stderr is not None
             async for data in process.stderr:

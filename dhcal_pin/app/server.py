@@ -60,13 +60,8 @@ Operation = Callable[[Upload, Path], AsyncGenerator[dict[str, Any], None]]
 async def serve(show_address: Callable[[str], object], *, port: int = 0, limit: int = DEFAULT_LIMIT) -> None:
     """Serve the page until this process is interrupted or terminated.
 
-    Args:
-        show_address: Called with the address of the page when the server is ready.
-        port: Port of the loopback address; 0 for any free one.
-        limit: Largest size of all files of a request [bytes].
-
-    Raises:
-        InvalidArgumentError: The port is in use or not allowed.
+    `show_address` gets the address when the server is ready. Port 0 means any free one. `limit` is the
+    largest size of all files of a request [bytes].
     """
     if not 0 <= port <= MAX_PORT:
         raise InvalidArgumentError(f"--port {port}: expected a number from 0 to {MAX_PORT}")

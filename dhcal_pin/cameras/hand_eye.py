@@ -39,18 +39,10 @@ _N_SAMPLES, _SAMPLE_SIZE, _N_CHOICES = 300, 4, 5
 
 
 def solve_hand_eye(link_poses: Array, board_poses: Array, where: str) -> tuple[Array, Array]:
-    """Solve A_i·B = C·P_i for the poses of camera and board in their links.
+    """Solve A_i·B = C·P_i for the pose C of the camera and the pose B of the board in their links.
 
-    Args:
-        link_poses: Pose A_i of the board's link in the camera's link, shape (i, 4, 4) [m].
-        board_poses: Pose P_i of the board in the camera, shape (i, 4, 4) [m].
-        where: Names of camera and board, for messages.
-
-    Returns:
-        Pose C of the camera in its link and pose B of the board in its link, each of shape (4, 4) [m].
-
-    Raises:
-        NotObservableError: There are too few images, or the links turn about one axis only.
+    A_i is the pose of the board's link in the camera's link, P_i that of the board in the camera, shape (i,
+    4, 4) [m] each. Too few images, or links that turn about one axis only, raise `NotObservableError`.
     """
     if len(link_poses) < MIN_IMAGES:
         images = "usable image" if len(link_poses) == 1 else "usable images"

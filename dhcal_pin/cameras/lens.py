@@ -65,15 +65,10 @@ class Lens:
         return FOCAL_AND_CENTRE + self.coefficients
 
     def project(self, points: Array, values: Array) -> tuple[Array, Array, Array]:
-        """Project points to pixels.
+        """Project points (3, m) in the camera frame [m] to pixels (2, m) by the values of the lens.
 
-        Args:
-            points: Points in the camera frame, shape (3, m) [m].
-            values: Values of the lens, shape (s,) [px and 1].
-
-        Returns:
-            Pixels, shape (2, m), their derivatives by the points, shape (2, 3, m) [px/m], and by the values,
-            shape (2, s, m).
+        The derivatives of the pixels by the points, shape (2, 3, m) [px/m], and by the values, shape (2, s,
+        m), follow.
         """
         depth = np.maximum(points[2], MIN_DEPTH)
         plane = points[:2] / depth
@@ -92,14 +87,9 @@ class Lens:
         return pixels, by_points, by_values
 
     def normalize(self, pixels: Array, values: Array) -> Array:
-        """Compute undistorted image coordinates X/Z, Y/Z of pixels by Newton's method.
+        """Compute undistorted image coordinates X/Z, Y/Z of pixels by Newton's method, shape (2, m).
 
-        Args:
-            pixels: Pixels, shape (2, m).
-            values: Values of the lens, shape (s,) [px and 1].
-
-        Returns:
-            Coordinates, shape (2, m); those of the undistorted lens where the distortion has no inverse.
+        They are those of the undistorted lens where the distortion has no inverse.
         """
         distorted = (pixels - values[2:4, None]) / values[:2, None]
         plane = distorted.copy()

@@ -98,15 +98,9 @@ def fit_lens(
 ) -> LensFit:
     """Fit the lens of a camera and the poses of boards to its images.
 
-    Args:
-        views: Points of a board, shape (m, 3) [m], and their pixels, shape (m, 2), of each view.
-        lens: Lens model.
-        values: First values of the lens, shape (s,) [px and 1].
-        std: Their standard deviations, shape (s,); 0 for values that are held.
-        repeats_errors: Whether points are wrong, and so in every view. All views then count as one.
-
-    Returns:
-        The fit.
+    Each view has the points of a board, shape (m, 3) [m], and their pixels, shape (m, 2). Standard deviations
+    are 0 for values of the lens that are held. All views count as one if `repeats_errors`: points are wrong,
+    and so in every view.
     """
     poses = _find_poses(views, lens, values, [None] * len(views))
     usable = [(i, found[0]) for i, found in enumerate(poses) if found and np.isfinite(found[0][1])]

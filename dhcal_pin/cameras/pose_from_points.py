@@ -94,13 +94,7 @@ def _line_distances(points: Array, first: int, second: int) -> Array:
 def agreeing_points(points: Array, image: Array) -> Array:
     """Find the image points that agree with a projective map of most points (least quantile of squares).
 
-    Args:
-        points: Points in their own frame, shape (m, 3) [m].
-        image: Image points in any unit, shape (m, 2).
-
-    Returns:
-        Whether each point agrees, shape (m,); all of them if one map fits them all, or if the points that
-        determine a map are half of them or more.
+    All agree if one map fits them all, or if the points that determine a map are half of them or more.
     """
     everything = np.ones(len(points), bool)
     if len(points) <= 2 * MIN_POINTS:
@@ -135,15 +129,10 @@ def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:
 
 
 def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
-    """Estimate the pose of points from one image.
+    """Estimate the pose of points (m, 3) [m] from undistorted image coordinates X/Z, Y/Z (m, 2) of one image.
 
-    Args:
-        points: Points in their own frame, shape (m, 3) [m].
-        image: Undistorted image coordinates X/Z, Y/Z, shape (m, 2).
-
-    Returns:
-        Pose of their frame in the camera, shape (4, 4) [m], and the RMS distance in the image; None if there
-        are too few points.
+    The result is the pose of their frame in the camera, shape (4, 4) [m], and the RMS distance in the image;
+    None if there are too few points.
     """
     found = estimate_poses([(points, image)])[0]
     return found[0] if found else None
@@ -154,15 +143,10 @@ def estimate_poses(
 ) -> list[list[tuple[Array, float]]]:
     """Estimate the poses of points that explain each of several images.
 
-    Args:
-        views: Points in their own frame, shape (m, 3) [m], and their undistorted image coordinates X/Z, Y/Z,
-            shape (m, 2), in each image.
-        known: Pose near that of each image, shape (4, 4) [m] each, which is tried with its mirror image
-            instead of closed forms; None where there is none.
-
-    Returns:
-        For each image the poses of the points in the camera, shape (4, 4) [m], with the RMS distance in the
-        image, the smallest first; none where there are too few points.
+    Each view has the points, shape (m, 3) [m], and their undistorted image coordinates X/Z, Y/Z, shape (m,
+    2). A known pose near that of the image is tried with its mirror image instead of closed forms. The poses
+    in the camera come with their RMS distances in the image, the smallest first; none where there are too few
+    points.
     """
     candidates = [
         _first_poses(*view) if pose is None else [pose, *_mirror(pose, view[0])]

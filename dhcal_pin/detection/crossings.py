@@ -34,17 +34,11 @@ _MIN_CORRELATION = 0.8
 
 
 def refine_crossings(image: Array, points: Array, pixels: Array, width: float) -> tuple[Array, Array]:
-    """Improve the corners of a board, and judge whether they are visible.
+    """Improve the corners of a board, and judge whether each is visible.
 
-    Args:
-        image: Grey values, shape (height, width).
-        points: Corners on the board, in squares, shape (c, 2).
-        pixels: Their image coordinates, shape (c, 2) [px].
-        width: Distance from the edges within which there is nothing but the four squares, in squares.
-
-    Returns:
-        Image coordinates, shape (c, 2) [px], and whether each corner is visible, shape (c,). Fewer than four
-        corners are returned as they are.
+    The points are corners in squares, the pixels their image coordinates, shape (c, 2) each. Within `width`
+    squares from the edges there is nothing but the four squares. Fewer than four corners are returned as they
+    are.
     """
     if len(points) < 4:
         return pixels, np.ones(len(points), bool)

@@ -168,13 +168,9 @@ class ErrorModel:
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
         """Compute the chain at x and its derivative by each error.
 
-        Args:
-            x: Errors of shape (p,), each in the unit of its parameter.
-
-        Returns:
-            Chain at x, and for each error the body that it moves, shape (p,), and the twist of that body in
-            its own frame, shape (p, 6), as `Chain.tool_jacobian` takes them. Transmission coefficients have
-            numbers above those of the bodies.
+        The derivative consists of the body that each error moves, shape (p,), and the twist of that body in
+        its own frame, shape (p, 6), as `Chain.tool_jacobian` takes them. Transmission coefficients have
+        numbers above those of the bodies.
         """
         x = np.ascontiguousarray(x, float)
         displacements, twists = self._perturb_frames(x)

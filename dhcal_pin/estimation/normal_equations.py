@@ -94,15 +94,7 @@ class NormalEquations(TriangularSystem):
         return TriangularSystem(rows)
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
-        """Compute the best step with priors.
-
-        Args:
-            weights: Reciprocal prior standard deviations of shape (p,), all positive.
-            x: Current values of shape (p,), or 0 [m and rad].
-
-        Returns:
-            Step δ of shape (p,) [m and rad], and the cost of rows and priors after it.
-        """
+        """Compute the best step with priors, and the cost after it; see `qr.TriangularSystem.solve`."""
         root, scale = self._decompose(weights)
         z, min_cost = self._right_side(weights, x)
         return lapack.dtrtrs(root, z)[0] / scale, min_cost
@@ -114,14 +106,9 @@ class NormalEquations(TriangularSystem):
         return z, max(self.cost + float(np.sum((weights * x) ** 2)) - float(z @ z), 0.0)
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
-        """Compute a square root of the covariance of data and priors together.
+        """Compute a square root of the covariance of data and priors together; see `qr.TriangularSystem`.
 
-        Args:
-            weights: Reciprocal prior standard deviations of shape (p,), all positive.
-
-        Returns:
-            Square root, upper triangular, shape (p, p), and the directions that neither determines: none,
-            shape (p, 0).
+        The weights are positive, so there are no undetermined directions.
         """
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):

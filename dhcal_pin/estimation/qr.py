@@ -158,14 +158,10 @@ class TriangularSystem:
         return append_rows(self, weights, -(weights * x))
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
-        """Compute the best step with priors.
+        """Compute the best step δ from x with priors, and the cost of rows and priors after it.
 
-        Args:
-            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
-            x: Current values of shape (p,), or 0 [m and rad].
-
-        Returns:
-            Step δ of shape (p,) [m and rad], and the cost of rows and priors after it.
+        The weights are reciprocal prior standard deviations 1/σ, zero without a prior. x is the current value
+        of shape (p,), or 0 [m and rad].
         """
         posterior = self.with_priors(weights, x)
         return pseudo_inverse(posterior.r, posterior.z), posterior.min_cost
@@ -176,14 +172,8 @@ class TriangularSystem:
         The covariance is C = S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights), on the directions that data or priors
         determine. Where [R; W] is ill-conditioned, parameter space is split by the rank of R: in the
         observable directions data and priors count, in the others the priors alone. Exact data with tiny
-        standard deviations would otherwise hide the information of the priors.
-
-        Args:
-            weights: Reciprocal prior standard deviations 1/σ of shape (p,); zero without a prior.
-
-        Returns:
-            Square root S of the covariance, shape (p, r), and an orthonormal basis of the directions that
-            neither data nor priors determine, shape (p, p-r).
+        standard deviations would otherwise hide the information of the priors. S has shape (p, r). An
+        orthonormal basis of the directions that neither data nor priors determine follows, shape (p, p-r).
         """
         if not len(weights):
             return np.empty((0, 0)), np.empty((0, 0))
@@ -273,16 +263,9 @@ def _is_well_conditioned(r: Array) -> bool:
 
 
 def pseudo_inverse(r: Array, z: Array) -> Array:
-    """Compute the minimum-norm least-squares solution R⁺·z.
+    """Compute the minimum-norm least-squares solution R⁺·z, shape (p,).
 
     Singular values below RANK_RTOL times the largest count as zero.
-
-    Args:
-        r: Triangular factor of shape (p, p).
-        z: Right-hand side of shape (p,).
-
-    Returns:
-        Solution of shape (p,).
     """
     # Back substitution takes a hundredth of the time of the singular value decomposition.
     if _is_well_conditioned(r):

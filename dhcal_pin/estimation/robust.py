@@ -146,16 +146,10 @@ LOSSES: dict[str, Loss] = {
 def standardized_residuals(
     residual: Array, covariances: Array | None = None, is_good: Array | None = None
 ) -> Array:
-    """Compute the standardized residual t of each sample of one measurement.
+    """Compute the residual t of each sample of one measurement, standard normal for good samples.
 
-    Args:
-        residual: Whitened residuals of shape (k, m).
-        covariances: Covariance of each sample's whitened residual up to a common factor, shape (m, k, k); the
-            identity if None.
-        is_good: Whether each sample counts for the scale, shape (m,); all if None.
-
-    Returns:
-        Standardized residuals of shape (m,), standard normal for good samples.
+    The whitened residuals have shape (k, m), their covariances up to a common factor (m, k, k); None is the
+    identity. `is_good` marks the samples that count for the scale, all if None.
     """
     k = len(residual)
     if covariances is None:
@@ -169,15 +163,9 @@ def standardized_residuals(
 
 
 def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None = None) -> Array:
-    """Transform mean squares of residuals to standardized residuals t (Wilson & Hilferty).
+    """Transform mean squares of k residuals each to standardized residuals t (Wilson & Hilferty).
 
-    Args:
-        mean_squares: Mean square of the k residuals of each sample, shape (m,).
-        k: Number of residuals per sample.
-        is_good: Whether each sample counts for the median, shape (m,); all if None.
-
-    Returns:
-        Standardized residuals of shape (m,); zero if the median is zero.
+    `is_good` marks the samples that count for the median, all if None. t is zero if the median is zero.
     """
     mean = 1 - 2 / (9 * k)
     # The median of χ²_k/k is mean³.
@@ -219,17 +207,9 @@ def sample_weights(t: Array, stage: str) -> Array:
 def reject_groups(weights: Array, t: Array, item: Measurement) -> Array:
     """Reject all samples of each group that is wrong as a whole, such as an image of another configuration.
 
-    Some of its samples are rejected then, and the residuals of the others are larger than in other groups.
+    Some of its samples are rejected then, and the residuals t of the others are larger than in other groups.
     Good groups differ, too, where their samples share an error of the arm. The spread of all groups is
-    therefore estimated by the median absolute deviation.
-
-    Args:
-        weights: Weights of the samples of a measurement, shape (m,).
-        t: Their standardized residuals, shape (m,).
-        item: The measurement.
-
-    Returns:
-        Weights of shape (m,), ZERO_WEIGHT in all samples of wrong groups.
+    therefore estimated by the median absolute deviation. Samples of wrong groups get ZERO_WEIGHT.
     """
     is_kept = weights > ZERO_WEIGHT
     if is_kept.all():

@@ -68,15 +68,9 @@ class ScaleGauge:
         return _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
 
     def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
-        """Compute the rates of growth and rotation per unit of each error.
+        """Compute growth rate and mean angular velocity in the measuring frame per unit of e errors, (e, 4).
 
-        Args:
-            chain: Chain at the current errors.
-            bodies: Body that each of e errors moves, shape (e,); see `Chain.tool_jacobian`.
-            twists: Twists of those bodies, shape (e, 6).
-
-        Returns:
-            Growth rate and mean angular velocity in the measuring frame, shape (e, 4).
+        Bodies and twists are those of `Chain.tool_jacobian`.
         """
         rates = np.zeros((len(bodies), 4))
         if self.nominal:

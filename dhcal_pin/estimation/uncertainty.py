@@ -152,20 +152,7 @@ class Uncertainty:
         temperature: float = 1.0,
         model_std: tuple[float, float] = (0.0, 0.0),
     ) -> Uncertainty:
-        """Transform the covariance of identified parameters.
-
-        Args:
-            errors: Error model of p parameters.
-            x: Identified values of shape (p,).
-            chain: Calibrated chain.
-            sqrt_covariance: Square root of the parameters' covariance, shape (p, r).
-            unbounded_directions: Undetermined directions of the parameters, shape (p, h).
-            temperature: Factor on the variance of correlated residuals that the covariance contains.
-            model_std: Standard deviations of errors that the model lacks [m, rad].
-
-        Returns:
-            Uncertainty of the calibrated chain.
-        """
+        """Transform the covariance of identified parameters x to that of the calibrated chain."""
         _, bodies, twists = errors.derivative(x)
         n_bodies = len(chain.moving_joints) + 1
         entries = bodies[bodies >= n_bodies] - n_bodies

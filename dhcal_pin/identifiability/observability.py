@@ -83,16 +83,8 @@ def weakly_observable(r: Array, prior_std: Array, noise: float) -> tuple[Array, 
     The columns of R are scaled by the prior standard deviations, which makes metres and radians comparable.
     For a direction with singular value s of the scaled factor, measurements with this noise reduce the
     standard deviation to the fraction 1/√(1 + (s/noise)²) of the prior one. Directions with
-    `MAX_KNOWN_STD_RATIO` or more are weakly observable. Directions in the null space are not included.
-
-    Args:
-        r: R factor of the whitened Jacobian, shape (p, p).
-        prior_std: Prior standard deviations, shape (p,) [m or rad].
-        noise: Standard deviation of the whitened residuals.
-
-    Returns:
-        Weakly observable directions, each one prior standard deviation long, shape (p, w), and their ratios
-        of posterior to prior standard deviation, shape (w,).
+    `MAX_KNOWN_STD_RATIO` or more are weakly observable. They are one prior standard deviation long, shape (p,
+    w), and come with these ratios. Directions in the null space are not included.
     """
     _, s, vt = np.linalg.svd(r * prior_std)
     s = s[: rank(r)]

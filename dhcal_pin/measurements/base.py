@@ -519,17 +519,10 @@ class Measurement(ABC):
 def whitened_jacobian(
     item: Measurement, model: tuple[Chain, Array, Array], frames: FrameBatch, u: Array, residual: Array
 ) -> Array:
-    """Compute the Jacobian of the whitened model with respect to the error parameters.
+    """Compute the Jacobian (p, k, m) of the whitened model with respect to the error parameters.
 
-    Args:
-        item: Measurements.
-        model: Chain, bodies (p,) and twists (p, 6) of the p error parameters; see `Chain.tool_jacobian`.
-        frames: Frames of the chain at `item.configurations()`.
-        u: Values of the instrument parameters, (s,).
-        residual: Whitened residuals at these frames and values, (k, m).
-
-    Returns:
-        Shape (p, k, m).
+    The model is the chain with bodies and twists of the errors; see `Chain.tool_jacobian`. The residual (k,
+    m) is whitened and holds at the given frames and instrument parameters u.
     """
     chain, bodies, twists = model
     observation = item.observation_matrix(frames, u, residual)

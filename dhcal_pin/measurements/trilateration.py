@@ -30,35 +30,15 @@ N_STEPS = 20
 
 
 def device_anchors(a: float, b: float, c: float) -> Array:
-    """Return the anchors P1 (0, 0, a), P2 (0, b, c) and P3 (0, -b, c) of the paper's device (40).
-
-    Args:
-        a: Coordinate z of P1 [m].
-        b: Coordinate y of P2 [m].
-        c: Coordinate z of P2 and P3 [m].
-
-    Returns:
-        Shape (3, 3) [m].
-    """
+    """Return the anchors P1 (0, 0, a), P2 (0, b, c) and P3 (0, -b, c) of the paper's device (40) [m]."""
     return np.array([[0, 0, a], [0, b, c], [0, -b, c]], float)
 
 
 def trilaterate_three_wires(lengths: ArrayLike, a: float, b: float, c: float, side: int = 1) -> Array:
-    """Compute positions from the lengths of the paper's device in closed form (41).
+    """Compute positions (m, 3) [m] from the lengths L1, L2, L3 of the paper's device in closed form (41).
 
-    Args:
-        lengths: L1, L2, L3 of each sample, (m, 3) [m].
-        a: Coordinate z of anchor P1, which is (0, 0, a) [m].
-        b: Coordinate y of anchor P2; P2 and P3 are (0, ±b, c) [m].
-        c: Coordinate z of anchors P2 and P3 [m].
-        side: Sign of x, as the plane of the anchors is a mirror.
-
-    Returns:
-        Positions in the frame of the device, (m, 3) [m].
-
-    Raises:
-        InvalidArgumentError: The anchors are collinear (a = c or b = 0), or the lengths of a sample do not
-            meet.
+    The anchors are those of `device_anchors`. Their plane is a mirror; `side` is the sign of x. Collinear
+    anchors (a = c or b = 0) and lengths that do not meet raise `InvalidArgumentError`.
     """
     l1, l2, l3 = np.asarray(lengths, float).T
     scale = max(abs(a), abs(b), abs(c))
@@ -74,23 +54,12 @@ def trilaterate_three_wires(lengths: ArrayLike, a: float, b: float, c: float, si
 
 
 def trilaterate(lengths: ArrayLike, anchors: ArrayLike, side: int = 1) -> Array:
-    """Compute positions from the lengths of wires to three or more anchors.
+    """Compute positions (m, 3) [m] from the lengths (m, w) of wires to three or more anchors (w, 3).
 
     The linear differences of the equations give an initial position. If the anchors lie in a plane, the
-    height above it follows from the mean equation. For more than three anchors Gauss-Newton steps minimize
-    the errors of the lengths.
-
-    Args:
-        lengths: Lengths, (m, w) [m].
-        anchors: Anchors, (w, 3), w ≥ 3 [m].
-        side: Sign along the normal (P2 - P1) × (P3 - P1) of anchors that lie in a plane, which is a mirror.
-
-    Returns:
-        Positions, (m, 3) [m].
-
-    Raises:
-        InvalidArgumentError: There are fewer than three anchors, they are collinear, or the lengths of a
-            sample do not meet.
+    height above it follows from the mean equation. The plane is a mirror; `side` is the sign along the normal
+    (P2 - P1) × (P3 - P1). For more than three anchors Gauss-Newton steps minimize the errors of the lengths.
+    Collinear anchors and lengths that do not meet raise `InvalidArgumentError`.
     """
     lengths, anchors = np.asarray(lengths, float), np.asarray(anchors, float)
     centre = anchors.mean(0)
@@ -131,15 +100,7 @@ def _require_meeting(squares: Array, where: str, name: str) -> None:
 
 
 def position_dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
-    """Compute how much the noise of the lengths is amplified along x, y and z.
-
-    Args:
-        points: Positions, (m, 3) [m].
-        anchors: Anchors, (w, 3) [m].
-
-    Returns:
-        Standard deviations of the positions divided by that of the lengths, (m, 3).
-    """
+    """Compute how much the noise of the lengths is amplified along x, y and z, shape (m, 3)."""
     vectors = np.asarray(points, float)[:, None] - np.asarray(anchors, float)
     rows = vectors / np.linalg.norm(vectors, axis=2, keepdims=True)
     return np.sqrt(np.diagonal(np.linalg.pinv(rows.swapaxes(1, 2) @ rows), axis1=1, axis2=2))

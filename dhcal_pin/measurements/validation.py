@@ -68,16 +68,10 @@ def validated_array(
 
 
 def validated_sigma(value: Any, shape: tuple[int, int], where: str) -> Array:
-    """Return standard deviations as an array of a given shape.
+    """Return positive, finite standard deviations as an array of a given shape (m, k).
 
-    Args:
-        value: One number, one number per column, or an array of the given shape; for a single column also
-            one number per sample, (m,).
-        shape: Expected shape, (m, k).
-        where: Start of error messages, such as "Pose: sigma".
-
-    Raises:
-        InvalidArgumentError: The value does not broadcast to the shape, or is not positive and finite.
+    The value is one number, one number per column, or an array of that shape; for a single column also one
+    number per sample, shape (m,).
     """
     expected = f"one number or shape {shape}"
     out = _as_numbers(value, where, expected)

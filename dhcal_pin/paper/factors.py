@@ -102,70 +102,48 @@ def _dot_lever_arms(u: Array, k: Array) -> Array:
 
 
 def thf(u: Array, k1: Array, k2: Array) -> Array:
-    """Return THF1 … THF6, the motion of the tool per Δθ.
+    """Return THF1 … THF6, the motion of the tool per Δθ, shape (..., 6) [m/rad, rad/rad].
 
         THF1 = n·k1 + (p×n)·k2   (22)        THF4 = n·k2   (25)
         THF2 = o·k1 + (p×o)·k2   (23)        THF5 = o·k2   (26)
         THF3 = a·k1 + (p×a)·k2   (24)        THF6 = a·k2   (27)
 
-    Args:
-        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
-        k1: Vectors of (15), shape (..., 3) [m].
-        k2: Vectors of (15), shape (..., 3).
-
-    Returns:
-        Twists, shape (..., 6) [m/rad, rad/rad].
+    u is the tail matrix U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4); k1 [m] and k2 are vectors of (15).
     """
     return np.concatenate([_dot_axes(u, k1) + _dot_lever_arms(u, k2), _dot_axes(u, k2)], -1)
 
 
 def ldf(u: Array, k2: Array) -> Array:
-    """Return LDF1 … LDF6, the motion of the tool per Δd.
+    """Return LDF1 … LDF6, the motion of the tool per Δd, shape (..., 6) [m/m, rad/m].
 
         LDF1 = n·k2 (22),  LDF2 = o·k2 (23),  LDF3 = a·k2 (24),  LDF4 = LDF5 = LDF6 = 0 (28)
 
-    Args:
-        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
-        k2: Vectors of (15), shape (..., 3).
-
-    Returns:
-        Twists, shape (..., 6) [m/m, rad/m].
+    u and k2 are those of `thf`.
     """
     linear = _dot_axes(u, k2)
     return np.concatenate([linear, np.zeros_like(linear)], -1)
 
 
 def laf(u: Array, k3: Array) -> Array:
-    """Return LAF1 … LAF6, the motion of the tool per Δa.
+    """Return LAF1 … LAF6, the motion of the tool per Δa, shape (..., 6) [m/m, rad/m].
 
         LAF1 = n·k3 (22),  LAF2 = o·k3 (23),  LAF3 = a·k3 (24),  LAF4 = LAF5 = LAF6 = 0 (28)
 
-    Args:
-        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
-        k3: Vectors of (15), shape (..., 3).
-
-    Returns:
-        Twists, shape (..., 6) [m/m, rad/m].
+    u and k3 are those of `alpf`.
     """
     linear = _dot_axes(u, k3)
     return np.concatenate([linear, np.zeros_like(linear)], -1)
 
 
 def alpf(u: Array, k3: Array) -> Array:
-    """Return ALPF1 … ALPF6, the motion of the tool per Δα.
+    """Return ALPF1 … ALPF6, the motion of the tool per Δα, shape (..., 6) [m/rad, rad/rad].
 
         ALPF1 = (p×n)·k3   (22)        ALPF4 = n·k3   (25)
         ALPF2 = (p×o)·k3   (23)        ALPF5 = o·k3   (26)
         ALPF3 = (p×a)·k3   (24)        ALPF6 = a·k3   (27)
 
-    Erratum, probably of the transcription: (24) lacks the term of Δα.
-
-    Args:
-        u: Tail matrices U_{i+1} = [n o a p; 0 0 0 1], shape (..., 4, 4).
-        k3: Vectors of (15), shape (..., 3).
-
-    Returns:
-        Twists, shape (..., 6) [m/rad, rad/rad].
+    u is that of `thf`, k3 a vector of (15). Erratum, probably of the transcription: (24) lacks the term
+    of Δα.
     """
     return np.concatenate([_dot_lever_arms(u, k3), _dot_axes(u, k3)], -1)
 
@@ -195,7 +173,7 @@ def error_factors(table: DHTable, q: Array) -> Array:
 
 
 def differential_motion(change: Array, pose: Array) -> Array:
-    """Compute the differential of the tool pose, equations (30) to (34).
+    """Compute dn, do, da, dp of the tool pose, shape (..., 3, 4), from DX: equations (30) to (34).
 
         dT_N = T_N·δT_N = [dn do da dp; 0 0 0 0]     (30)
         dn   =  o·δz - a·δy                          (31)
@@ -204,13 +182,6 @@ def differential_motion(change: Array, pose: Array) -> Array:
         dp   =  n·dx + o·dy + a·dz                   (34)
 
     Erratum, probably of the transcription: (31) prints a·δz in place of o·δz.
-
-    Args:
-        change: DX, shape (..., 6) [m, rad].
-        pose: Tool poses T_N = [n o a p; 0 0 0 1], shape (..., 4, 4).
-
-    Returns:
-        dn, do, da, dp as columns, shape (..., 3, 4).
     """
     n, o, a = pose[..., :3, 0], pose[..., :3, 1], pose[..., :3, 2]
     dx, dy, dz, rx, ry, rz = (change[..., i, None] for i in range(6))
@@ -218,7 +189,7 @@ def differential_motion(change: Array, pose: Array) -> Array:
 
 
 def tool_error(measured: Array, model: Array) -> Array:
-    """Compute the tool error DX of measured poses, equations (35) and (36).
+    """Compute DX of measured poses in the tool frame of the model, shape (..., 6) [m, rad]: (35) and (36).
 
         [dx dy dz] = Rᵀ·dp                                        (35)
         [δx δy δz] = (NORᵀ·NOR)⁻¹ NORᵀ·[dn; do; da]               (36)
@@ -227,13 +198,6 @@ def tool_error(measured: Array, model: Array) -> Array:
     measured rotation. That is sin(φ)·u for an error of angle φ about the axis u: accurate for small angles,
     and ambiguous beyond 90°. Errata: (35) multiplies dp as a point, but it is a direction; (36) lacks the
     factor [dn; do; da].
-
-    Args:
-        measured: Measured poses, shape (..., 4, 4).
-        model: Poses of the model, shape (..., 4, 4).
-
-    Returns:
-        DX in the tool frame of the model, shape (..., 6) [m, rad].
     """
     rotation = model[..., :3, :3]
     difference = measured[..., :3, :] - model[..., :3, :]
@@ -249,18 +213,12 @@ def tool_error(measured: Array, model: Array) -> Array:
 
 
 def pseudo_inverse_step(factors: Array, error: Array) -> Array:
-    """Compute the parameter correction ΔPAR, equations (37) and (38).
+    """Compute the parameter correction ΔPAR, shape (p,) [rad, m]: equations (37) and (38).
 
-    (37) stacks DX_i = R_i·ΔPAR over all configurations to D = ReL·ΔPAR. Erratum: (38) inverts ReLᵀ·ReL, which
-    is singular for nominally parallel axes, however many configurations there are. The pseudo-inverse by
-    singular values takes its place; those below `RTOL` of the largest one count as zero.
-
-    Args:
-        factors: R of each configuration, shape (m, k, p).
-        error: DX of each configuration, shape (m, k) [m, rad].
-
-    Returns:
-        ΔPAR, shape (p,) [rad, m].
+    (37) stacks DX_i = R_i·ΔPAR over all configurations to D = ReL·ΔPAR; the factors R_i have shape (m, k, p).
+    Erratum: (38) inverts ReLᵀ·ReL, which is singular for nominally parallel axes, however many configurations
+    there are. The pseudo-inverse by singular values takes its place; those below `RTOL` of the largest one
+    count as zero.
     """
     stacked = factors.reshape(-1, factors.shape[-1])
     return np.linalg.lstsq(stacked, error.reshape(-1), rcond=RTOL)[0]

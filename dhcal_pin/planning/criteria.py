@@ -45,15 +45,7 @@ class Criterion(Protocol):
         ...
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
-        """Rate candidates by the improvement that each would bring alone.
-
-        Args:
-            rows: Whitened rows of m candidates, shape (p, k, m).
-            sqrt_covariance: Square root of the covariance before, shape (p, p).
-
-        Returns:
-            Gains, larger is better, shape (m,).
-        """
+        """Rate m candidates with whitened rows (p, k, m) by the improvement that each would bring alone."""
         ...
 
 

@@ -76,15 +76,10 @@ class Instrument(Protocol):
         ...
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute displacements of the measured points.
+        """Compute derivatives of d coordinates of the measured points by errors and instrument parameters.
 
-        Args:
-            model: Robot and instrument.
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Derivatives of d coordinates by the errors, shape (p, d, m), and by the instrument parameters,
-            shape (s, d, m) [m]. The sum of their squares is the mean square over the measured points.
+        Their shapes are (p, d, m) and (s, d, m) [m]. The sum of their squares is the mean square over the
+        measured points.
         """
         ...
 

@@ -67,16 +67,8 @@ def find_tour(
 ) -> Tour:
     """Find a short order of poses with free moves between them.
 
-    Args:
-        q: Joint positions, shape (n, dof) [rad or m].
-        checker: Collision checks; without geometry all moves count as free.
-        low: Lowest joint positions, shape (dof,) [rad or m].
-        high: Highest joint positions, shape (dof,) [rad or m].
-        can_turn: Joints whose positions may change by a whole turn if that makes a move free, shape (dof,).
-        rng: Random generator of the way points.
-
-    Returns:
-        Tour through all poses.
+    Without geometry all moves count as free. The positions of joints that `can_turn` may change by a whole
+    turn if that makes a move free.
     """
     order, is_direct = _order_with_fewest_collisions(q, checker)
     q = q[order]

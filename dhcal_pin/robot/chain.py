@@ -779,17 +779,9 @@ def bodies_of_frames(chain: Chain, error_frames: ArrayLike) -> Array:
 def twists_in_bodies(
     chain: Chain, error_frames: Array, twists: ArrayLike, frame_transforms: Array | None = None
 ) -> tuple[Array, Array]:
-    """Transform twists at error frames into the frames of the bodies that they move.
+    """Transform twists at error frames to body numbers (p,) and twists in the frames of those bodies (p, 6).
 
-    Args:
-        chain: Kinematic chain.
-        error_frames: Indices of error frames, shape (p,).
-        twists: Twists [v, ω] at the error frames, shape (p, 6).
-        frame_transforms: Frames in which the twists are given, relative to the error frames, shape (p, 4, 4).
-            By default these are the error frames themselves.
-
-    Returns:
-        Body numbers, shape (p,), and twists in the frames of those bodies, shape (p, 6).
+    The twists may be given in frames relative to the error frames, shape (p, 4, 4).
     """
     unperturbed = np.tile(np.eye(4), (chain.tool_frame_index + 1, 1, 1))
     frames = error_frame_poses(chain.body_from_urdf, chain.origins, chain.tool, unperturbed)[error_frames]

@@ -147,16 +147,9 @@ class CollisionChecker:
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
         """Return whether robot and obstacles leave the line between two points free.
 
-        The links behind the last moving joint are ignored, because the measured point is on them. The floor
-        is ignored, because it may end before the instrument.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-            eye: Position of the instrument in the frame of the first link of the chain, shape (3,) [m].
-            point: Position of the measured point in that frame, shape (3,) [m].
-
-        Returns:
-            Whether the line is free; True if there is nothing to check.
+        The points are in the frame of the first link of the chain. The links behind the last moving joint are
+        ignored, because the measured point is on them. The floor is ignored, because it may end before the
+        instrument.
         """
         return self.shapes_on_line(q, eye, point) <= self.shapes_on_end(True)
 
@@ -175,34 +168,17 @@ class CollisionChecker:
         )
 
     def shapes_on_line(self, q: Array, start: Array, end: Array) -> frozenset[int]:
-        """Return the shapes of robot and obstacles that touch the line between two points.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-            start: First point in the frame of the first link of the chain, shape (3,) [m].
-            end: Second point, shape (3,) [m].
-
-        Returns:
-            Numbers of the shapes.
-        """
+        """Return the shapes on the line between two points in the frame of the first link of the chain."""
         length = float(np.linalg.norm(end - start))
         rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), (end - start) / length).matrix()
         line = coal.Capsule(SIGHT_DIAMETER / 2, length)
         return self._touched(q, line, se3.transform(rotation, (start + end) / 2))
 
     def is_view_free(self, q: Array, eye: Array, points: Array, ignored: frozenset[int]) -> bool:
-        """Return whether robot and obstacles leave the view from a point to others free.
+        """Return whether nothing but ignored shapes blocks the view from a point to others.
 
-        The view is the convex hull of all points. The floor is ignored, because a board may lie on it.
-
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-            eye: Centre of the camera in the frame of the first link of the chain, shape (3,) [m].
-            points: Points that are seen from it, shape (c, 3) [m].
-            ignored: Numbers of shapes that are ignored.
-
-        Returns:
-            Whether the view is free; True if there is nothing to check.
+        The points are in the frame of the first link of the chain. The view is the convex hull of all points.
+        The floor is ignored, because a board may lie on it.
         """
         if self.geometry is None:
             return True

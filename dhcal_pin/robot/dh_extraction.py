@@ -135,21 +135,8 @@ def extract_dh(
     negates a, α and β; of these two forms of a row, the one with the smaller residual rotation is chosen. The
     origins of a table with identity base and tool therefore give that table back.
 
-    Args:
-        origins: Pose of joint 1 in the base, of joint i+1 in the moving frame of joint i, and of the tool in
-            the moving frame of joint n, shape (n+1, 4, 4) [m].
-        names: Names of the n joints.
-        prismatic: True for prismatic joints, shape (n,).
-        lower: Lower joint limits, shape (n,) [rad or m].
-        upper: Upper joint limits, shape (n,) [rad or m].
-        convention: "standard" or "modified".
-        hayati: Whether to use β up to 5° of tilt instead of 1°.
-
-    Returns:
-        Table, frames of its x axes, and notes about nearly parallel axes.
-
-    Raises:
-        InvalidArgumentError: A shape does not fit, a number is not finite, or the convention is unknown.
+    The origins are the pose of joint 1 in the base, of joint i+1 in the moving frame of joint i, and of the
+    tool in the moving frame of joint n, shape (n+1, 4, 4) [m].
     """
     origins = np.asarray(origins, float)
     n = len(names)

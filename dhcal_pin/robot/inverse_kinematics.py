@@ -94,19 +94,11 @@ def solve_ik(
     samples: Array | None = None,
     min_damping: float = _MIN_DAMPING,
 ) -> tuple[Array, Array]:
-    """Minimize task errors within the joint limits, starting from given joint positions.
+    """Minimize task errors within the joint limits, starting from joint positions (m, n).
 
-    Args:
-        chain: Kinematic chain with base and tool.
-        task_error: Task errors of the samples.
-        start: Initial joint positions, shape (m, n) [rad or m].
-        steps: Maximum number of steps.
-        samples: Numbers by which `task_error` identifies the rows of `start`, shape (m,); 0 to m-1 by
-            default.
-        min_damping: Damping λ_min near singularities [m²].
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m], and norms of the task errors, shape (m,) [m].
+    `samples` are the numbers by which `task_error` identifies the rows of `start`, by default 0 to m-1.
+    `min_damping` is the damping λ_min near singularities [m²]. Norms of the task errors [m] are returned,
+    too.
     """
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.validated_q(start), chain.lower, chain.upper)
@@ -193,17 +185,9 @@ def pose_task(targets: Array, length: float) -> TaskError:
 
 
 def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple[Array, Array]:
-    """Remove whole turns from joint positions, so that they are within the limits if possible.
+    """Remove whole turns from joint positions to get them within the limits; return whether they are.
 
-    Args:
-        chain: Kinematic chain.
-        q: Joint positions, shape (..., n) [rad or m].
-        near: Positions that revolute joints come within half a turn of, if their limits allow it, shape (...,
-            n).
-
-    Returns:
-        Joint positions of the same tool poses, shape (..., n), and whether they are within the limits, shape
-        (...,).
+    Revolute joints come within half a turn of `near`, if their limits allow it.
     """
     # A whole turn of an independent joint must be whole turns of its mimics.
     is_periodic = ~chain.is_prismatic & np.all(chain.mimic_matrix % 1 == 0, 0)
@@ -218,15 +202,8 @@ def reach_within_limits(
 ) -> tuple[Array, Array]:
     """Find joint positions that bring every task error as near to zero as the arm can, from several starts.
 
-    Args:
-        chain: Kinematic chain with base and tool.
-        task_error: Task errors of the samples, which are the rows of `start`.
-        start: Initial joint positions, shape (m, n) [rad or m].
-        rng: Random generator for further starts of samples that are not solved within the limits.
-
-    Returns:
-        Joint positions, shape (m, n) [rad or m], within the limits if possible, and norms of the task errors,
-        shape (m,) [m].
+    Further starts of samples that are not solved within the limits are random. Norms of the task errors [m]
+    are returned, too.
     """
     unlimited = without_rotary_limits(chain)
     out, least, within_limits = start.copy(), np.full(len(start), np.inf), np.zeros(len(start), bool)

@@ -88,13 +88,7 @@ class WorkspaceConstraints:
 def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
     """Return the range of joint positions within the limits and within half a turn or half a metre each way.
 
-    Args:
-        chain: Kinematic chain.
-        angle: Margin to the limits of revolute joints [rad].
-        length: Margin to the limits of prismatic joints [m].
-
-    Returns:
-        Lowest and highest joint positions, each of shape (n,) [rad or m].
+    The margins to the limits are an angle [rad] for revolute and a length [m] for prismatic joints.
     """
     low, high = limits_with_margin(chain, angle, length)
     span = np.where(_is_prismatic(chain), _MAX_STROKE, _MAX_ANGLE)

@@ -17,18 +17,12 @@ _PYRAMID_DEPTH = 0.12
 
 
 def rig_lines(rig: MountedRig, base: Array, size: float) -> dict[str, Any]:
-    """Describe the cameras and boards of a rig for the page of a scene.
+    """Describe the cameras and boards of a rig for the page of a scene of the given size [m].
 
-    Args:
-        rig: Cameras and boards whose poses are known.
-        base: Pose of the base link in the measuring frame, shape (4, 4) [m].
-        size: Size of the scene, such as the reach of the robot [m].
-
-    Returns:
-        `parts`: cameras and boards, each with `name`, `moves` (whether with the tool) and `segments`, pairs
-        of points in the frame of the base link or of the tool [m]; `rays`: pairs of a camera and a board
-        that a joint moves against each other, each with the numbers of both parts, the `centre` of the
-        camera and the outer `corners` of the board.
+    `parts` are cameras and boards, each with `name`, `moves` (whether with the tool) and `segments`, pairs of
+    points in the frame of the base link or of the tool [m]. `rays` are pairs of a camera and a board that a
+    joint moves against each other, each with the numbers of both parts, the `centre` of the camera and the
+    outer `corners` of the board.
     """
     cameras = [
         (

@@ -76,15 +76,9 @@ def estimate_corner_variances(
 ) -> tuple[float, float]:
     """Estimate the variances of corners in the image and at the board from the residuals of a fit.
 
-    Args:
-        squares: Squared residuals of k image coordinates, (k,) [px²].
-        in_image: Their stated or placeholder variances s², (k,) [px²].
-        at_board: Their squared derivatives |b|², (k,) [px²/m²].
-        n_determined: Number of parameters that the data determine.
-        is_stated: Whether the variances in the image are stated.
-
-    Returns:
-        Factor to the variances s², and variance a² along each axis at the board [m²].
+    The squared residuals and the stated or placeholder variances s² [px²] have shape (k,), as have the
+    squared derivatives |b|² [px²/m²]. The result is a factor to s², and the variance a² along each axis at
+    the board [m²].
     """
     from scipy.optimize import minimize_scalar  # lazy import: slow, and few calibrations need it
 

@@ -317,21 +317,7 @@ def plot_correlation(fit: Evidence, ax: Axes | None = None) -> Axes:
 def plot_workspace(
     points: Array, std: Array, measured: Array, ax: Axes | None = None, *, plane: str = "xz"
 ) -> Axes:
-    """Plot a map of the predicted standard deviation of the tool position, with a scale.
-
-    Args:
-        points: Tool positions in the base frame, shape (s, 3) [m].
-        std: Standard deviation of each position, shape (s,) [m]; infinite if it cannot be predicted.
-        measured: Measured tool positions in the base frame, shape (m, 3) [m].
-        ax: Axes to draw into; a new figure if None.
-        plane: Horizontal and vertical coordinate in the base frame: "xy", "xz" or "yz".
-
-    Returns:
-        The axes.
-
-    Raises:
-        UnknownNameError: There is no such plane.
-    """
+    """Plot a map of the predicted standard deviation of the tool position, with a scale; see `plots`."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
 

@@ -33,12 +33,7 @@ def _print(console: Console, lines: Iterable[Line]) -> None:
 
 
 def show(screen: Screen, verbosity: Verbosity) -> None:
-    """Print the result of a command.
-
-    Args:
-        screen: Result.
-        verbosity: What is shown. Everything is as wide as the terminal, and not folded in files and pipes.
-    """
+    """Print the result of a command, as wide as the terminal, and not folded in files and pipes."""
     console = _console()
     width = console.width if console.is_terminal else None
     _print(console, screen.lines(verbosity, width))

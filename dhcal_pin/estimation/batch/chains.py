@@ -153,15 +153,7 @@ class ChainBatch:
         return self._propagate(x)[0]
 
     def derivative(self, x: Array) -> tuple[ChainBatch, Array, Array]:
-        """Compute the chains at x and their derivatives by each error, as `ErrorModel.derivative`.
-
-        Args:
-            x: Errors of shape (b, p) [m and rad].
-
-        Returns:
-            Chains at x, the body that each error moves, shape (p,), and the twist of that body in its own
-            frame, shape (p, b, 6).
-        """
+        """Compute the chains at x (b, p), and bodies (p,) and twists (p, b, 6) of their derivatives."""
         chains, frames = self._propagate(x)
         error_frames = np.array([parameter.error_frame for parameter in self.model.parameters], int)
         twists = self.twists.swapaxes(0, 1)[..., None]

@@ -94,15 +94,7 @@ class LinearizedRows:
         return len(self.prior_right) - float(np.trace(self.information))
 
     def solve(self, weights: Array, scales: Array) -> Array:
-        """Fit weighted samples.
-
-        Args:
-            weights: Weights of the samples in each fit, shape (a, m).
-            scales: Noise scales of the classes in each fit, shape (a, c).
-
-        Returns:
-            Solutions, shape (a, u).
-        """
+        """Fit samples with weights (a, m) and noise scales of the classes (a, c); return solutions (a, u)."""
         information = self.total_information(weights, scales)
         right = (weights[:, self.sample] / scales[:, self.noise_class] ** 2) @ self.right + self.prior_right
         try:
@@ -144,15 +136,7 @@ class LinearizedRows:
         return scales
 
     def distances(self, squares: Array, scales: Array) -> Array:
-        """Compute the sum of squared residuals of each sample relative to the noise.
-
-        Args:
-            squares: Sums of squared residuals of the blocks, shape (a, b).
-            scales: Noise scales of the classes, shape (a, c).
-
-        Returns:
-            Sums, shape (a, m).
-        """
+        """Compute the sum of squared residuals of each sample relative to the noise, shape (a, m)."""
         scaled = squares / scales[:, self.noise_class] ** 2
         order = np.argsort(self.sample, kind="stable")
         first = np.searchsorted(self.sample[order], np.arange(self.n_samples))
@@ -247,16 +231,10 @@ def _noise_class_name(index: int, item: Measurement, group: str, n_rows: int, u:
 
 
 def search_majorities(rows: LinearizedRows, groups: Array, n_determined: int) -> list[tuple[Array, Array]]:
-    """Search fits of least trimmed squares.
+    """Search fits of least trimmed squares; return the best ones in their order.
 
-    Args:
-        rows: Linearized rows.
-        groups: Label of each sample's configuration, shape (m,).
-        n_determined: Number of directions that all samples determine.
-
-    Returns:
-        The best fits in their order: whether each sample is in the majority that agrees best, shape (m,), and
-        noise scales of the classes, shape (c,).
+    The groups are labels of the samples' configurations. A fit consists of whether each sample is in the
+    majority that agrees best, and the noise scales of the classes.
     """
     weights = _random_subsets(rows, groups, n_determined)
     scales = np.ones((len(weights), len(rows.is_estimated)))
