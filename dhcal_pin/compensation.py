@@ -195,19 +195,12 @@ def _mid_range(chain: Chain) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Search for joint positions that bring the tool of a chain to targets.
+    """Search for joint positions that bring the tool of a chain to targets."""
 
-    Attributes:
-        chain: Chain with base and tool.
-        q: Random configurations within the limits.
-        tree: Nearest-neighbour search of their tool poses.
-        with_rotations: Whether targets are poses.
-    """
-
-    chain: Chain
-    q: Array
-    tree: cKDTree
-    with_rotations: bool
+    chain: Chain  # Chain with base and tool
+    q: Array  # Random configurations within the limits
+    tree: cKDTree  # Nearest-neighbour search of their tool poses
+    with_rotations: bool  # Whether targets are poses
 
     @classmethod
     def from_chain(cls, chain: Chain, with_rotations: bool) -> _Search:

@@ -78,21 +78,13 @@ def format_quantity(value: float, unit: str, std: float = math.nan, small: bool 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Value with its unit; its text is rounded according to its standard deviation.
+    """Value with its unit; its text is rounded according to its standard deviation."""
 
-    Attributes:
-        value: Value in its unit.
-        unit: SI unit, such as "m".
-        std: Standard deviation of the value.
-        is_small: Whether it is a change or an error; angles are then shown in mrad.
-        has_unit: Whether the unit is shown; the title of a column may have it.
-    """
-
-    value: float
-    unit: str
-    std: float = math.nan
-    is_small: bool = False
-    has_unit: bool = True
+    value: float  # Value in its unit
+    unit: str  # SI unit, such as "m"
+    std: float = math.nan  # Standard deviation of the value
+    is_small: bool = False  # Whether it is a change or an error; angles are then shown in mrad
+    has_unit: bool = True  # Whether the unit is shown; the title of a column may have it
 
     @classmethod
     def error(cls, value: float, unit: str) -> Quantity:
@@ -107,19 +99,12 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Table:
-    """Table of texts and quantities; it can be rendered as HTML, Markdown or console text.
+    """Table of texts and quantities; it can be rendered as HTML, Markdown or console text."""
 
-    Attributes:
-        header: Column titles.
-        rows: Cells, one sequence per row.
-        n_text_columns: Number of leading columns with text; the other columns contain numbers.
-        caption: Title of the table.
-    """
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str | Quantity]]
-    n_text_columns: int = 1
-    caption: str = ""
+    header: Sequence[str]  # Column titles
+    rows: Sequence[Sequence[str | Quantity]]  # Cells, one sequence per row
+    n_text_columns: int = 1  # Number of leading columns with text; the other columns contain numbers
+    caption: str = ""  # Title of the table
 
     @property
     def texts(self) -> list[list[str]]:

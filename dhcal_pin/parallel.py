@@ -31,15 +31,11 @@ _CONNECT_TIMEOUT_S = 3
 
 @dataclass(frozen=True)
 class TaskExecutor:
-    """Ordered, memory-bounded `map` on a `concurrent.futures` executor or in the calling thread.
+    """Ordered, memory-bounded `map` on a `concurrent.futures` executor or in the calling thread."""
 
-    Attributes:
-        executor: Executor of processes, threads or a cluster; None runs the tasks in the calling thread.
-        max_in_flight: Largest number of submitted tasks whose results have not been consumed.
-    """
-
+    # Executor of processes, threads or a cluster; None runs the tasks in the calling thread.
     executor: Executor | None = None
-    max_in_flight: int = 8
+    max_in_flight: int = 8  # Largest number of submitted tasks whose results have not been consumed
 
     def map(self, function: Callable[[_Task], _Output], tasks: Iterable[_Task]) -> Iterator[_Output]:
         """Apply a function to each task, with at most `max_in_flight` tasks in memory."""

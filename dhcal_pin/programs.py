@@ -40,38 +40,24 @@ _N_UR_JOINTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """Configuration at which the arm rests, and the way to it.
+    """Configuration at which the arm rests, and the way to it."""
 
-    Attributes:
-        name: Name in comments, such as "pose 3".
-        q: Joint positions, shape (n,) [rad or m].
-        pose: Pose of the tool that the controller shows there, shape (4, 4) [m].
-        way: Joint positions to pass on the way from the stop before, shape (w, n) [rad or m].
-        is_way_free: Whether the way has no collision as far as that was checked.
-    """
-
-    name: str
-    q: Array
-    pose: Array
+    name: str  # Name in comments, such as "pose 3"
+    q: Array  # Joint positions, shape (n,) [rad or m]
+    pose: Array  # Pose of the tool that the controller shows there, shape (4, 4) [m]
+    # Joint positions to pass on the way from the stop before, shape (w, n) [rad or m].
     way: Sequence[Array] = ()
-    is_way_free: bool = True
+    is_way_free: bool = True  # Whether the way has no collision as far as that was checked
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """Sequence of stops.
-
-    Attributes:
-        chain: Robot.
-        title: One line for a comment.
-        warning: What the operator must know before the arm moves.
-        stops: Stops in their order.
-    """
+    """Sequence of stops."""
 
     chain: Chain
-    title: str
-    warning: str
-    stops: Sequence[Stop]
+    title: str  # One line for a comment
+    warning: str  # What the operator must know before the arm moves
+    stops: Sequence[Stop]  # Stops in their order
 
 
 def program_text(program: Program, path: PathLike) -> str:

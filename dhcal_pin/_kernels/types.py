@@ -20,36 +20,24 @@ class JointState:
 
     Kinematic errors of links and frames do not change it. A fit therefore computes it once, unless it
     estimates transmission errors.
-
-    Attributes:
-        positions: Positions of the moving joints, shape (k, m) [rad or m].
-        cos: Cosines of `positions`, shape (k, m).
-        sin: Sines of `positions`, shape (k, m).
     """
 
-    positions: Array
-    cos: Array
-    sin: Array
+    positions: Array  # Positions of the moving joints, shape (k, m) [rad or m]
+    cos: Array  # Cosines of `positions`, shape (k, m)
+    sin: Array  # Sines of `positions`, shape (k, m)
 
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """Frames of a chain at m samples.
+    """Frames of a chain at m samples."""
 
-    Attributes:
-        columns: Columns x, y, z, p of the body frames in the measuring frame, then three columns of work
-            memory for `point_jacobian`, shape (k+1, 7, 3, m) [1, m]. The z axis of body frame j is the axis
-            of joint j.
-        tool: Columns x, y, z, p of the tool frame, shape (4, 3, m) [1, m].
-        terms: Transmission terms of the independent joints, shape (t, n, m); None if the chain has no
-            transmission.
-        conditions: Conditions of the samples that the terms were evaluated at; None without terms.
-    """
-
+    # Columns x, y, z, p of the body frames in the measuring frame, then three columns of work memory for
+    # `point_jacobian`, shape (k+1, 7, 3, m) [1, m]. The z axis of body frame j is the axis of joint j.
     columns: Array
-    tool: Array
+    tool: Array  # Columns x, y, z, p of the tool frame, shape (4, 3, m) [1, m]
+    # Transmission terms of the independent joints, shape (t, n, m); None if the chain has no transmission.
     terms: Array | None = None
-    conditions: Any = None
+    conditions: Any = None  # Conditions of the samples that the terms were evaluated at; None without terms
 
     @property
     def bodies(self) -> Array:
@@ -74,19 +62,13 @@ class ObservationMatrix:
     With the tool velocity y = [vx, vy, vz, ωx, ωy, ωz] of the first configuration, followed by that of the
     second one for relative measurements, row i of sample t is the sum of coefficients[j, t]·y[components[j]]
     over the terms j with rows[j] = i. This is the Jacobian of the whitened residual by the tool pose.
-
-    Attributes:
-        rows: Row of each term, ascending, shape (j,).
-        components: Velocity component of each term, 0 to 5 in the first and 6 to 11 in the second
-            configuration, shape (j,).
-        coefficients: Coefficients of the terms, shape (j, m).
-        body: Number of the observed body, 1 to k; None for the tool.
     """
 
-    rows: Array
+    rows: Array  # Row of each term, ascending, shape (j,)
+    # Velocity component of each term (j,): 0 to 5 in the first, 6 to 11 in the second configuration.
     components: Array
-    coefficients: Array
-    body: int | None = None
+    coefficients: Array  # Coefficients of the terms, shape (j, m)
+    body: int | None = None  # Number of the observed body, 1 to k; None for the tool
 
 
 def twists_before(body: int | None, bodies: Array, twists: Array) -> Array:

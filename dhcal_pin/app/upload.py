@@ -29,19 +29,12 @@ _LIST_OPTIONS = ("mend",)
 
 @dataclass(frozen=True)
 class Upload:
-    """Files and options of one request.
+    """Files and options of one request."""
 
-    Attributes:
-        files: Content of each file, by name.
-        robot: Name of the robot file; empty if there is none.
-        data: Names of the measurement files.
-        options: Words of the command line.
-    """
-
-    files: Mapping[str, bytes]
-    robot: str
-    data: tuple[str, ...]
-    options: tuple[str, ...]
+    files: Mapping[str, bytes]  # Content of each file, by name
+    robot: str  # Name of the robot file; empty if there is none
+    data: tuple[str, ...]  # Names of the measurement files
+    options: tuple[str, ...]  # Words of the command line
 
     @classmethod
     def from_form(cls, content_type: str, body: bytes) -> Upload:

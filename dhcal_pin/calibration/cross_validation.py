@@ -50,17 +50,12 @@ _MIN_SPREAD_RATIO = 0.1
 
 @dataclass(frozen=True, eq=False)
 class FoldErrors:
-    """Errors of the held-out samples of a fold.
+    """Errors of the held-out samples of a fold."""
 
-    Attributes:
-        errors: Errors of each measurement with held-out samples, as from `compute_errors`.
-        rms: RMS of the held-out rows in standard deviations.
-        prediction_std: RMS of these rows that the uncertainty of the fold's fit causes.
-    """
-
+    # Errors of each measurement with held-out samples, as from `compute_errors`.
     errors: list[dict[str, Array]]
-    rms: float
-    prediction_std: float
+    rms: float  # RMS of the held-out rows in standard deviations
+    prediction_std: float  # RMS of these rows that the uncertainty of the fold's fit causes
 
 
 def cross_validate_folds(
@@ -156,18 +151,12 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
 
 @dataclass(frozen=True, eq=False)
 class FoldComparison:
-    """Accuracy of the held-out samples of folds before and after a calibration.
-
-    Attributes:
-        comparison: The accuracy.
-        prediction_std: Largest RMS of the held-out rows of a fold that the uncertainty of its fit causes, in
-            standard deviations.
-        paired: Squared errors of each held-out configuration before and after.
-    """
+    """Accuracy of the held-out samples of folds before and after a calibration."""
 
     comparison: Comparison
+    # Largest RMS of the held-out rows of a fold that the uncertainty of its fit causes [σ].
     prediction_std: float
-    paired: PairedErrors
+    paired: PairedErrors  # Squared errors of each held-out configuration before and after
 
     @property
     def is_determined(self) -> bool:

@@ -250,17 +250,11 @@ def remove_outliers(errors: Sequence[Mapping[str, Array]]) -> tuple[list[dict[st
 
 @dataclass(frozen=True, eq=False)
 class PairedErrors:
-    """Mean squared errors of the same configurations before and after a calibration.
+    """Mean squared errors of the same configurations before and after a calibration."""
 
-    Attributes:
-        before: Of each of u configurations, shape (u,) [m² or rad²].
-        after: The same after the calibration.
-        n_components: Number of components of an error.
-    """
-
-    before: Array
-    after: Array
-    n_components: int
+    before: Array  # Of each of u configurations, shape (u,) [m² or rad²]
+    after: Array  # The same after the calibration
+    n_components: int  # Number of components of an error
 
     @classmethod
     def from_errors(

@@ -80,16 +80,12 @@ MAX_EXTENSIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class GoodSamples:
-    """Result of the search for good samples.
+    """Result of the search for good samples."""
 
-    Attributes:
-        weights: Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for
-            others.
-        stage: Robust stage that judges the samples with the nonlinear model: "reject" if outliers were
-            found that are set apart from the other samples, otherwise "reject_far".
-    """
-
+    # Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
     weights: list[Array]
+    # Robust stage that judges the samples with the nonlinear model: "reject" if outliers were found that are
+    # set apart from the other samples, otherwise "reject_far".
     stage: str
 
 
@@ -178,19 +174,12 @@ def _draw_samples(m: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Core:
-    """Fit of the samples that agree with each other.
+    """Fit of the samples that agree with each other."""
 
-    Attributes:
-        y: Solution, shape (u,).
-        scales: Noise scales of the classes, shape (c,).
-        t: Standardized residuals of all samples, shape (m,).
-        log_likelihood: Negative logarithm of the likelihood, see the module docstring.
-    """
-
-    y: Array
-    scales: Array
-    t: Array
-    log_likelihood: float
+    y: Array  # Solution, shape (u,)
+    scales: Array  # Noise scales of the classes, shape (c,)
+    t: Array  # Standardized residuals of all samples, shape (m,)
+    log_likelihood: float  # Negative logarithm of the likelihood, see the module docstring
 
 
 def _best_core(rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], redundancy: float) -> _Core | None:

@@ -65,23 +65,14 @@ CountDetermined = Callable[[Problem, SolverResult], float]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Solved least-squares problem with the sample weights that it was solved with.
+    """Solved least-squares problem with the sample weights that it was solved with."""
 
-    Attributes:
-        data: Measurements with their own standard deviations, without robust weights.
-        problem: Problem as it was solved, with scaled standard deviations and robust weights.
-        solution: Solution of `problem`.
-        weights: Robust weight of each sample, one array of shape (m,) per measurement.
-        previous_iterations: Number of iterations of the solutions before this one.
-        stage: Robust stage that the weights are from, see `robust.LOSSES`.
-    """
-
-    data: tuple[Measurement, ...]
-    problem: Problem
-    solution: SolverResult
-    weights: tuple[Array, ...]
-    previous_iterations: int = 0
-    stage: str = robust.KEPT
+    data: tuple[Measurement, ...]  # Measurements with their own standard deviations, without robust weights
+    problem: Problem  # Problem as it was solved, with scaled standard deviations and robust weights
+    solution: SolverResult  # Solution of `problem`
+    weights: tuple[Array, ...]  # Robust weight of each sample, one array of shape (m,) per measurement
+    previous_iterations: int = 0  # Number of iterations of the solutions before this one
+    stage: str = robust.KEPT  # Robust stage that the weights are from, see `robust.LOSSES`
 
     @property
     def iterations(self) -> int:
@@ -112,25 +103,16 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class ReweightState:
-    """State between two rounds of `reweight`.
-
-    Attributes:
-        fit: Current fit.
-        scales: Scale of the standard deviation of each residual group, shape (g,).
-        stages: Robust stages that are left, the current one first; see `robust.LOSSES`.
-        weight_change: Change of the robust weights in the last round.
-        n_searches: Number of searches for the good samples.
-        is_final: Whether the last solution was iterated to full convergence.
-        is_done: Whether all numbers have settled.
-    """
+    """State between two rounds of `reweight`."""
 
     fit: Fit
-    scales: Array
-    stages: tuple[str, ...]
+    scales: Array  # Scale of the standard deviation of each residual group, shape (g,)
+    stages: tuple[str, ...]  # Robust stages that are left, the current one first; see `robust.LOSSES`
+    # Change of the robust weights in the last round.
     weight_change: WeightChange = field(default_factory=WeightChange)
-    n_searches: int = 0
-    is_final: bool = False
-    is_done: bool = False
+    n_searches: int = 0  # Number of searches for the good samples
+    is_final: bool = False  # Whether the last solution was iterated to full convergence
+    is_done: bool = False  # Whether all numbers have settled
 
 
 def observable_directions(problem: Problem, solution: SolverResult) -> float:

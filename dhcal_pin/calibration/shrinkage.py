@@ -127,19 +127,12 @@ def _displacements(problem: Problem, x: Array, robot: Array, dependence: Array) 
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Gaussian model of the measurements y and the effect a, with f groups of errors of unknown width.
+    """Gaussian model of the measurements y and the effect a, with f groups of errors of unknown width."""
 
-    Attributes:
-        covariances: Covariance of y by each group at width 1, (f, r, r).
-        cross_covariances: Covariance of y and a by each group at width 1, (f, r).
-        effect_variances: Variance of a by each group at width 1, (f,).
-        measured: Measurements y, (r,).
-    """
-
-    covariances: Array
-    cross_covariances: Array
-    effect_variances: Array
-    measured: Array
+    covariances: Array  # Covariance of y by each group at width 1, (f, r, r)
+    cross_covariances: Array  # Covariance of y and a by each group at width 1, (f, r)
+    effect_variances: Array  # Variance of a by each group at width 1, (f,)
+    measured: Array  # Measurements y, (r,)
 
     def at(self, widths: Array) -> tuple[Array, Array, Array]:
         """Compute log evidence, mean and standard deviation of a, (w,) each, for widths (w, f)."""

@@ -39,14 +39,11 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True, eq=False)
 class StreamProblem(Problem):
-    """Least-squares problem whose samples are read again, part by part, whenever they are needed.
+    """Least-squares problem whose samples are read again, part by part, whenever they are needed."""
 
-    Attributes:
-        parts: Function that returns all parts in order; `data` is the first one.
-        scales: Factors to the standard deviations of each residual group by name; None for 1.
-    """
-
+    # Function that returns all parts in order; `data` is the first one.
     parts: Callable[[], Iterable[Part]] = tuple
+    # Factors to the standard deviations of each residual group by name; None for 1.
     scales: Mapping[str, float] | None = None
 
     def map_chunks(self, function: Callable[[Chunk], _Value]) -> Iterator[_Value]:

@@ -56,21 +56,14 @@ Pose = tuple[Array, float]
 
 @dataclass(frozen=True, eq=False)
 class LensFit:
-    """Lens of a camera with the poses of boards in its images.
+    """Lens of a camera with the poses of boards in its images."""
 
-    Attributes:
-        values: Values of the lens, shape (s,) [px and 1].
-        poses: Poses of the board in the camera that explain each view, shape (4, 4) [m], with the RMS
-            distance of its corners in the image, X/Z and Y/Z, the smallest first; none where the corners do
-            not determine a pose.
-        cost: Cost of the views that the lens was fitted to; NaN if it is held.
-        std: Standard deviations of the values after the fit, shape (s,); 0 if they are held.
-    """
-
-    values: Array
+    values: Array  # Values of the lens, shape (s,) [px and 1]
+    # Poses of the board in the camera that explain each view, shape (4, 4) [m], with the RMS distance of its
+    # corners in the image, X/Z and Y/Z, the smallest first; none where the corners do not determine a pose.
     poses: list[list[Pose]]
-    cost: float
-    std: Array
+    cost: float  # Cost of the views that the lens was fitted to; NaN if it is held
+    std: Array  # Standard deviations of the values after the fit, shape (s,); 0 if they are held
 
 
 def fit_camera(views: Sequence[View], camera: Camera, *, repeats_errors: bool = False) -> LensFit:
@@ -148,21 +141,13 @@ def _find_poses(
 
 @dataclass(frozen=True, eq=False)
 class _LensProblem:
-    """Problem in the f free values of a lens, with the poses of v views of boards with m corners in all.
-
-    Attributes:
-        views: Views of boards.
-        lens: Lens model.
-        first: Values of the rig, (s,).
-        std: Their standard deviations, (s,); 0 for values that are held.
-        n_repeats: Number of views that count as one.
-    """
+    """Problem in the f free values of a lens, with the poses of v views of boards with m corners in all."""
 
     views: Sequence[View]
     lens: Lens
-    first: Array
-    std: Array
-    n_repeats: int
+    first: Array  # Values of the rig, (s,)
+    std: Array  # Their standard deviations, (s,); 0 for values that are held
+    n_repeats: int  # Number of views that count as one
 
     def minimize(self, poses: list[Pose]) -> tuple[Array, list[Pose], float, Array]:
         """Return values of the lens (s,), the poses with it, the cost, and standard deviations (s,)."""

@@ -50,29 +50,19 @@ OK, CAUTION, REFUSED, FAILED = "ok", "caution", "refused", "failed"
 
 @dataclass(frozen=True)
 class FleetJob:
-    """One job of a manifest.
+    """One job of a manifest."""
 
-    Attributes:
-        name: Name shown for the robot.
-        job: Its options, with paths relative to the manifest.
-    """
-
-    name: str
-    job: Job
+    name: str  # Name shown for the robot
+    job: Job  # Its options, with paths relative to the manifest
 
 
 @dataclass(frozen=True)
 class FleetJobOutcome:
-    """Outcome of one job of a manifest.
+    """Outcome of one job of a manifest."""
 
-    Attributes:
-        status: "failed", or the verdict on the calibration: "ok", "caution" or "refused".
-        message: Reason of the failure, or reasons of the verdict and warnings about the input.
-        document: JSON document as of `dhcal calibrate`; empty if the job failed.
-    """
-
-    status: str
-    message: str = ""
+    status: str  # "failed", or the verdict on the calibration: "ok", "caution" or "refused"
+    message: str = ""  # Reason of the failure, or reasons of the verdict and warnings about the input
+    # JSON document as of `dhcal calibrate`; empty if the job failed.
     document: Mapping[str, Any] = field(default_factory=dict)
 
 

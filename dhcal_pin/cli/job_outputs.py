@@ -22,21 +22,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Result of a job, from which its output files are made.
+    """Result of a job, from which its output files are made."""
 
-    Attributes:
-        fit: Result of the calibration.
-        source: Files, command and settings.
-        robot: Path of the nominal robot.
-        reports: Paths of all reports.
-        meta: Facts for the certificate, `KEY=VALUE` each.
-    """
-
-    fit: Result
-    source: Provenance
-    robot: str
-    reports: tuple[str, ...]
-    meta: tuple[str, ...]
+    fit: Result  # Result of the calibration
+    source: Provenance  # Files, command and settings
+    robot: str  # Path of the nominal robot
+    reports: tuple[str, ...]  # Paths of all reports
+    meta: tuple[str, ...]  # Facts for the certificate, `KEY=VALUE` each
 
     @cached_property
     def report_contents(self) -> dict[PathLike, str | bytes]:

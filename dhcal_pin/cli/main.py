@@ -15,17 +15,11 @@ from .options import CommandParser, HelpFormatter, add_verbosity_options
 
 
 class Command(NamedTuple):
-    """One command of `dhcal`.
+    """One command of `dhcal`."""
 
-    Attributes:
-        name: Word on the command line.
-        module: Module of `commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`.
-        help: One line for `dhcal --help`.
-    """
-
-    name: str
-    module: str
-    help: str
+    name: str  # Word on the command line
+    module: str  # Module of `commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`
+    help: str  # One line for `dhcal --help`
 
 
 COMMANDS = (

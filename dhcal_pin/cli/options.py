@@ -63,13 +63,9 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 class IntegerType(NamedTuple):
-    """Type of an integer option, for argparse and manifests.
+    """Type of an integer option, for argparse and manifests."""
 
-    Attributes:
-        minimum: Smallest value.
-    """
-
-    minimum: int
+    minimum: int  # Smallest value
 
     @property
     def description(self) -> str:

@@ -22,36 +22,23 @@ Done = TypeVar("Done")
 
 @dataclass(frozen=True)
 class Output(Generic[Done]):
-    """Output file of a command.
+    """Output file of a command."""
 
-    Attributes:
-        content: Function that makes the content for a path; None for the JSON document, which is made last.
-        noun: What the file is, in the message on an unknown ending.
-        endings: Endings of its name; any if there are none.
-        other_endings: Endings that are accepted, too.
-        is_written_if_refused: Whether the file is written for a refused calibration, too.
-    """
-
+    # Function that makes the content for a path; None for the JSON document, which is made last.
     content: Callable[[Done, str], str | bytes] | None
-    noun: str = ""
-    endings: tuple[str, ...] = ()
-    other_endings: tuple[str, ...] = ()
-    is_written_if_refused: bool = False
+    noun: str = ""  # What the file is, in the message on an unknown ending
+    endings: tuple[str, ...] = ()  # Endings of its name; any if there are none
+    other_endings: tuple[str, ...] = ()  # Endings that are accepted, too
+    is_written_if_refused: bool = False  # Whether the file is written for a refused calibration, too
 
 
 @dataclass(frozen=True)
 class OutputFile(Generic[Done]):
-    """File that an option names.
-
-    Attributes:
-        option: Name of the option.
-        output: Its row of the table.
-        path: Path of the file; `STDOUT` for a JSON document that is printed.
-    """
+    """File that an option names."""
 
     option: str
-    output: Output[Done]
-    path: str
+    output: Output[Done]  # Its row of the table
+    path: str  # Path of the file; `STDOUT` for a JSON document that is printed
 
 
 def chosen_files(options: Mapping[str, Any], table: Mapping[str, Output[Done]]) -> list[OutputFile[Done]]:

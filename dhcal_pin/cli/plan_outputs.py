@@ -27,23 +27,14 @@ _DEGREE_DECIMALS = 4
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """Plan of a command, from which its output files are made.
-
-    Attributes:
-        plan: Plan.
-        chain: Robot.
-        given: Keyword arguments of `plan`.
-        rows: Row of each given candidate in its file, from 0, shape (m,).
-        args: Options of the command.
-        digests: SHA-256 of each input file by path.
-    """
+    """Plan of a command, from which its output files are made."""
 
     plan: Plan
     chain: Chain
-    given: Mapping[str, Any]
-    rows: Array
+    given: Mapping[str, Any]  # Keyword arguments of `plan`
+    rows: Array  # Row of each given candidate in its file, from 0, shape (m,)
     args: Namespace
-    digests: Mapping[str, str]
+    digests: Mapping[str, str]  # SHA-256 of each input file by path
 
     @cached_property
     def moves(self) -> list[str]:

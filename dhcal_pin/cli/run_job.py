@@ -73,35 +73,21 @@ EXACT_FIT_RATIO = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class CalibrationOutcome:
-    """Result of a calibration job whose files are written.
-
-    Attributes:
-        fit: Result of the calibration.
-        document: The same as a JSON document.
-        files: Paths of the files written, by what they are.
-        n_rows: Number of rows that were read, by measurement file.
-        fitted: Measurements that were fitted, by file.
-        held_out: Measurements that were held out, each with its file.
-        unreachable: Rows that the robot cannot reach, by measurement file; excluded from everything.
-        outliers: Lines of outliers, by measurement file.
-        rejected: Lines with zero weight in the fit, by measurement file.
-        warnings: Warnings about the input, by file.
-        notes: What of the input is not used, by file.
-        hint: Suggestion to use --extend; empty if there is none.
-    """
+    """Result of a calibration job whose files are written."""
 
     fit: Result
-    document: dict[str, Any]
-    files: dict[str, str]
-    n_rows: dict[str, int]
-    fitted: dict[str, Measurement]
-    held_out: list[tuple[str, Measurement]]
+    document: dict[str, Any]  # Result as a JSON document
+    files: dict[str, str]  # Paths of the files written, by what they are
+    n_rows: dict[str, int]  # Number of rows that were read, by measurement file
+    fitted: dict[str, Measurement]  # Measurements that were fitted, by file
+    held_out: list[tuple[str, Measurement]]  # Measurements that were held out, each with its file
+    # Rows that the robot cannot reach, by measurement file; excluded from everything.
     unreachable: dict[str, list[UnreachableRow]]
-    outliers: dict[str, list[int]]
-    rejected: dict[str, list[int]]
-    warnings: dict[str, list[str]]
-    notes: dict[str, list[str]]
-    hint: str
+    outliers: dict[str, list[int]]  # Lines of outliers, by measurement file
+    rejected: dict[str, list[int]]  # Lines with zero weight in the fit, by measurement file
+    warnings: dict[str, list[str]]  # Warnings about the input, by file
+    notes: dict[str, list[str]]  # What of the input is not used, by file
+    hint: str  # Suggestion to use --extend; empty if there is none
 
 
 def run_job(
@@ -153,23 +139,15 @@ def run_job(
 
 @dataclass(frozen=True)
 class _JobData:
-    """Measurements of a job, and what was found when they were read.
+    """Measurements of a job, and what was found when they were read."""
 
-    Attributes:
-        fit: Measurements to fit, by file.
-        holdout: Hold-out measurements with their file.
-        n_rows: Number of rows that were read, by file.
-        unreachable: Rows that the robot cannot reach, by file; in neither of the two.
-        warnings: Warnings about the input, by file.
-        notes: What of the input is not used, by file.
-    """
-
-    fit: dict[str, Measurement]
-    holdout: list[tuple[str, Measurement]]
-    n_rows: dict[str, int]
+    fit: dict[str, Measurement]  # Measurements to fit, by file
+    holdout: list[tuple[str, Measurement]]  # Hold-out measurements with their file
+    n_rows: dict[str, int]  # Number of rows that were read, by file
+    # Rows that the robot cannot reach, by file; in neither of the two.
     unreachable: dict[str, list[UnreachableRow]]
-    warnings: dict[str, list[str]]
-    notes: dict[str, list[str]]
+    warnings: dict[str, list[str]]  # Warnings about the input, by file
+    notes: dict[str, list[str]]  # What of the input is not used, by file
 
 
 def _holdout_file(job: Job) -> str | None:

@@ -41,15 +41,10 @@ MAX_WHITE, WHITE = 0.5, 254
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout in which a board was printed.
+    """Layout in which a board was printed."""
 
-    Attributes:
-        is_exchanged: Whether rows and columns are exchanged.
-        is_legacy: Whether a ChArUco board has the legacy pattern.
-    """
-
-    is_exchanged: bool = False
-    is_legacy: bool = False
+    is_exchanged: bool = False  # Whether rows and columns are exchanged
+    is_legacy: bool = False  # Whether a ChArUco board has the legacy pattern
 
     def describe(self, board: Board) -> str:
         """Return what differs from the board of the rig; empty if nothing does."""
@@ -63,19 +58,12 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class DetectedImage:
-    """Corners that were found in an image.
-
-    Attributes:
-        path: Path of the image.
-        corner: Numbers of the corners on the board of the rig, (c,).
-        pixels: Image coordinates, (c, 2) [px].
-        problem: Why the image is not used, such as "no board found"; empty if it is.
-    """
+    """Corners that were found in an image."""
 
     path: str
-    corner: Array
-    pixels: Array
-    problem: str = ""
+    corner: Array  # Numbers of the corners on the board of the rig, (c,)
+    pixels: Array  # Image coordinates, (c, 2) [px]
+    problem: str = ""  # Why the image is not used, such as "no board found"; empty if it is
 
 
 def read_image(path: PathLike) -> Array:

@@ -26,17 +26,11 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """Corners of one board in all images.
+    """Corners of one board in all images."""
 
-    Attributes:
-        board: Board of the rig.
-        layout: Layout in which it was printed.
-        images: Result of each image, in the order of the files.
-    """
-
-    board: Board
-    layout: Layout
-    images: Sequence[DetectedImage]
+    board: Board  # Board of the rig
+    layout: Layout  # Layout in which it was printed
+    images: Sequence[DetectedImage]  # Result of each image, in the order of the files
 
     @property
     def used(self) -> list[DetectedImage]:

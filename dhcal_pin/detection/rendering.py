@@ -27,32 +27,20 @@ _MIN_COSINE = 1e-3
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """How a rendered image differs from an ideal one.
+    """How a rendered image differs from an ideal one."""
 
-    Attributes:
-        blur_std: Standard deviation of the blur [px].
-        noise_std: Standard deviation of the noise of the grey values, which go from 0 to 255.
-        n_points: Number of points per pixel along each axis.
-    """
-
-    blur_std: float = 0.7
-    noise_std: float = 2.0
-    n_points: int = 6
+    blur_std: float = 0.7  # Standard deviation of the blur [px]
+    noise_std: float = 2.0  # Standard deviation of the noise of the grey values, which go from 0 to 255
+    n_points: int = 6  # Number of points per pixel along each axis
 
 
 @dataclass(frozen=True, eq=False)
 class _Print:
-    """Print of a flat board as a table of grey values between edges.
+    """Print of a flat board as a table of grey values between edges."""
 
-    Attributes:
-        x: Edges along x, increasing [m].
-        y: Edges along y, increasing [m].
-        grey: Grey values between them, shape (len(y) + 1, len(x) + 1); NaN outside the paper.
-    """
-
-    x: Array
-    y: Array
-    grey: Array
+    x: Array  # Edges along x, increasing [m]
+    y: Array  # Edges along y, increasing [m]
+    grey: Array  # Grey values between them, shape (len(y) + 1, len(x) + 1); NaN outside the paper
 
     def at(self, x: Array, y: Array) -> Array:
         """Return the grey values of points of the board's plane [m]."""

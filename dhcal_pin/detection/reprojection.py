@@ -25,15 +25,10 @@ from .images import BoardDetection
 
 @dataclass(frozen=True, eq=False)
 class Reprojection:
-    """Corners of a board in the pose that explains the detected ones best.
+    """Corners of a board in the pose that explains the detected ones best."""
 
-    Attributes:
-        pixels: Image coordinates of all corners of the board, (c, 2) [px].
-        rms: RMS distance of the detected corners from them [px].
-    """
-
-    pixels: Array
-    rms: float
+    pixels: Array  # Image coordinates of all corners of the board, (c, 2) [px]
+    rms: float  # RMS distance of the detected corners from them [px]
 
 
 def camera_with_intrinsics(camera: Camera, detections: Sequence[BoardDetection]) -> Camera | None:

@@ -41,17 +41,11 @@ _UNBOUNDED_TOL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class FoldSystems:
-    """Triangular systems of the fitted and of the held-out samples of a fold, at one x.
+    """Triangular systems of the fitted and of the held-out samples of a fold, at one x."""
 
-    Attributes:
-        fitted: System of the fitted rows.
-        held_out: System of the held-out rows.
-        n_rows: Number of held-out rows.
-    """
-
-    fitted: TriangularSystem
-    held_out: TriangularSystem
-    n_rows: int
+    fitted: TriangularSystem  # System of the fitted rows
+    held_out: TriangularSystem  # System of the held-out rows
+    n_rows: int  # Number of held-out rows
 
     @property
     def is_unobserved(self) -> Array:

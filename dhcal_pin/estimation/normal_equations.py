@@ -26,13 +26,9 @@ _DIAGONAL_SHIFT = 1e-12
 
 
 class NormalEquations(TriangularSystem):
-    """Triangular system of the whitened rows [J | r] at one x, which is given by their inner products.
+    """Triangular system of the whitened rows [J | r] at one x, which is given by their inner products."""
 
-    Attributes:
-        products: [J | r]ᵀ·[J | r], shape (p+1, p+1).
-    """
-
-    products: Array
+    products: Array  # [J | r]ᵀ·[J | r], shape (p+1, p+1)
 
     def __init__(self, products: Array):
         """Store the inner products."""

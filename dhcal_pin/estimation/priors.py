@@ -80,23 +80,15 @@ def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PriorGroups:
-    """Groups of parameters whose default priors share one scale: those of one unit and one expected size.
+    """Groups of parameters whose default priors share one scale: those of one unit and one expected size."""
 
-    Attributes:
-        members: Indices of the parameters in any group, shape (n,).
-        group_index: Group of each of them, shape (n,).
-        expected_weights: Reciprocal expected standard deviation of each group, shape (g,).
-        min_weights: Smallest weight of each group, shape (g,).
-        max_weights: Largest weight of each group, shape (g,).
-        expectation_counts: Number of determined parameters that the expected standard deviation of each group
-            counts for against smaller errors, shape (g,).
-    """
-
-    members: Array
-    group_index: Array
-    expected_weights: Array
-    min_weights: Array
-    max_weights: Array
+    members: Array  # Indices of the parameters in any group, shape (n,)
+    group_index: Array  # Group of each of them, shape (n,)
+    expected_weights: Array  # Reciprocal expected standard deviation of each group, shape (g,)
+    min_weights: Array  # Smallest weight of each group, shape (g,)
+    max_weights: Array  # Largest weight of each group, shape (g,)
+    # Number of determined parameters that the expected standard deviation of each group counts for against
+    # smaller errors, shape (g,).
     expectation_counts: Array
 
     @classmethod

@@ -184,15 +184,10 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Some samples of one measurement, with the joint state that is the same at every x.
+    """Some samples of one measurement, with the joint state that is the same at every x."""
 
-    Attributes:
-        data: Samples.
-        nominal: Nominal chain; its geometric errors do not affect the joint state.
-    """
-
-    data: Measurement
-    nominal: Chain
+    data: Measurement  # Samples
+    nominal: Chain  # Nominal chain; its geometric errors do not affect the joint state
 
     @cached_property
     def joint_state(self) -> SampleState:
@@ -216,25 +211,15 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Model of a problem at one x, without data, so that it can be sent to the process that holds a chunk.
+    """Model of a problem at one x, without data, so that it can be sent to the process that holds a chunk."""
 
-    Attributes:
-        chain: Chain with the errors at x.
-        bodies: Body that each of the p robot errors moves, shape (p,); see `Chain.tool_jacobian`.
-        twists: Twists of those bodies, shape (p, 6).
-        instruments: Values of all instrument parameters by name [m or rad].
-        instrument_columns: Column of each unknown instrument parameter in J, by name.
-        arm_scale: Size of the chain; see `scale_gauge`.
-        gauge_rates: Rates of growth and rotation per unit of each robot error, shape (p, 4).
-    """
-
-    chain: Chain
-    bodies: Array
-    twists: Array
-    instruments: Mapping[str, float]
-    instrument_columns: Mapping[str, int]
-    arm_scale: float
-    gauge_rates: Array
+    chain: Chain  # Chain with the errors at x
+    bodies: Array  # Body that each of the p robot errors moves, shape (p,); see `Chain.tool_jacobian`
+    twists: Array  # Twists of those bodies, shape (p, 6)
+    instruments: Mapping[str, float]  # Values of all instrument parameters by name [m or rad]
+    instrument_columns: Mapping[str, int]  # Column of each unknown instrument parameter in J, by name
+    arm_scale: float  # Size of the chain; see `scale_gauge`
+    gauge_rates: Array  # Rates of growth and rotation per unit of each robot error, shape (p, 4)
 
     def r_factor(self, chunk: Chunk, small_angle: bool) -> Array:
         """Compute the R factor of a chunk's whitened rows [J | r]."""
@@ -330,20 +315,13 @@ class StructuredRows:
 
     A transmission coefficient moves one joint, in proportion to a term of the configuration. Its column is
     the column of that joint times the term.
-
-    Attributes:
-        dense: The c other columns, the last one r, shape (c, k, m).
-        joint_rows: Columns of the motion of each joint, shape (n, k, m).
-        terms: Term of each of the e coefficients, sorted by joint, shape (e, m).
-        blocks: Each joint that coefficients move, with its part of the terms.
-        columns: Column of [J | r] of each dense column, then of each coefficient, shape (c+e,).
     """
 
-    dense: Array
-    joint_rows: Array
-    terms: Array
-    blocks: tuple[tuple[int, slice], ...]
-    columns: Array
+    dense: Array  # The c other columns, the last one r, shape (c, k, m)
+    joint_rows: Array  # Columns of the motion of each joint, shape (n, k, m)
+    terms: Array  # Term of each of the e coefficients, sorted by joint, shape (e, m)
+    blocks: tuple[tuple[int, slice], ...]  # Each joint that coefficients move, with its part of the terms
+    columns: Array  # Column of [J | r] of each dense column, then of each coefficient, shape (c+e,)
 
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
@@ -428,15 +406,10 @@ def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> Trian
 
 
 class UnfactoredSystem(TriangularSystem):
-    """Triangular system of all data, without priors, that is computed when it is first needed.
+    """Triangular system of all data, without priors, that is computed when it is first needed."""
 
-    Attributes:
-        problem: Problem in p robot errors and s instrument parameters.
-        x: Unknowns of shape (p+s,).
-    """
-
-    problem: Problem
-    x: Array
+    problem: Problem  # Problem in p robot errors and s instrument parameters
+    x: Array  # Unknowns of shape (p+s,)
 
     def __init__(self, problem: Problem, x: Array):
         """Store the problem."""

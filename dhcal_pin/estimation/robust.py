@@ -231,17 +231,12 @@ def reject_groups(weights: Array, t: Array, item: Measurement) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class WeightChange:
-    """Change of the weights in one round of IRLS, before damping.
+    """Change of the weights in one round of IRLS, before damping."""
 
-    Attributes:
-        size: Largest change of a weight.
-        steps: Changes of each measurement's weights, shape (m,) each; empty before the first round.
-        n_reversals: Number of rounds of this stage that nearly undid the change of the round before.
-    """
-
-    size: float = np.inf
+    size: float = np.inf  # Largest change of a weight
+    # Changes of each measurement's weights, shape (m,) each; empty before the first round.
     steps: tuple[Array, ...] = ()
-    n_reversals: int = 0
+    n_reversals: int = 0  # Number of rounds of this stage that nearly undid the change of the round before
 
 
 def update_weights(

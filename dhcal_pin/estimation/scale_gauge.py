@@ -44,15 +44,10 @@ _N_SAMPLES = 100
 
 @dataclass(frozen=True, eq=False)
 class ScaleGauge:
-    """Size of a robot and its rates of growth and rotation.
+    """Size of a robot and its rates of growth and rotation."""
 
-    Attributes:
-        q: Joint positions of shape (c, n) [rad or m].
-        nominal: RMS distance of the nominal tool from its mean position [m].
-    """
-
-    q: Array
-    nominal: float
+    q: Array  # Joint positions of shape (c, n) [rad or m]
+    nominal: float  # RMS distance of the nominal tool from its mean position [m]
 
     @classmethod
     def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:

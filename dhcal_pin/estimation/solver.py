@@ -67,17 +67,11 @@ BOUND_TOL = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class DampingState:
-    """State of a Levenberg-Marquardt iteration that a continuation starts from.
-
-    Attributes:
-        damping: Damping λ.
-        scale: Column scales D of shape (p,), the largest norms of the columns of R so far.
-        last_change: Norm of the change of the rows by the last step; zero if unknown.
-    """
+    """State of a Levenberg-Marquardt iteration that a continuation starts from."""
 
     damping: float = rules.INITIAL_DAMPING
-    scale: Array | float = 0.0
-    last_change: float = 0.0
+    scale: Array | float = 0.0  # Column scales D of shape (p,), the largest norms of the columns of R so far
+    last_change: float = 0.0  # Norm of the change of the rows by the last step; zero if unknown
 
 
 @dataclass(frozen=True, eq=False)

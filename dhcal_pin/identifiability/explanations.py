@@ -142,19 +142,12 @@ def _explain_propagation(chain: Chain, way: Propagation, parameters: Sequence[Er
 
 @dataclass(frozen=True, eq=False)
 class Explainer:
-    """Sentences on the unobservable directions of one problem.
+    """Sentences on the unobservable directions of one problem."""
 
-    Attributes:
-        probe: Problem, and values at which its Jacobian is taken.
-        layers: Null space by cause, from `ObservabilityProbe.null_space_layers`.
-        names: Names of the unknowns, length p.
-        plain_errors: Geometric errors of the robot, the first of the unknowns.
-    """
-
-    probe: ObservabilityProbe
-    layers: dict[Cause, Array]
-    names: list[str]
-    plain_errors: PlainErrors
+    probe: ObservabilityProbe  # Problem, and values at which its Jacobian is taken
+    layers: dict[Cause, Array]  # Null space by cause, from `ObservabilityProbe.null_space_layers`
+    names: list[str]  # Names of the unknowns, length p
+    plain_errors: PlainErrors  # Geometric errors of the robot, the first of the unknowns
 
     def sentence(self, group: UnobservableGroup) -> str:
         """Explain one group of unobservable directions."""

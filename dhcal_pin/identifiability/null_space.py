@@ -51,15 +51,11 @@ _POINT_OFFSET = (0.11, 0.07, 0.05)
 
 @dataclass(frozen=True, eq=False)
 class UnobservableGroup:
-    """Unobservable directions with the same cause and on the same part of the chain.
+    """Unobservable directions with the same cause and on the same part of the chain."""
 
-    Attributes:
-        cause: What has to change to make the directions observable; "structure" if nothing can.
-        vectors: Combinations of the unknowns without effect on the measurements, shape (p, r) [m or rad]. The
-            largest entry of each is 1.
-    """
-
-    cause: Cause
+    cause: Cause  # What has to change to make the directions observable; "structure" if nothing can
+    # Combinations of the unknowns without effect on the measurements, shape (p, r) [m or rad]. The largest
+    # entry of each is 1.
     vectors: Array
 
     @property
@@ -85,15 +81,10 @@ def _unobservable_part(space: Array, r: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityProbe:
-    """Problem with its measurements, and Jacobians of hypothetical measurements.
+    """Problem with its measurements, and Jacobians of hypothetical measurements."""
 
-    Attributes:
-        problem: Unknowns and measurements.
-        x: Values of the unknowns for all Jacobians, shape (p,) [m or rad].
-    """
-
-    problem: Problem
-    x: Array
+    problem: Problem  # Unknowns and measurements
+    x: Array  # Values of the unknowns for all Jacobians, shape (p,) [m or rad]
 
     @property
     def chain(self) -> Chain:

@@ -34,19 +34,12 @@ _ALONG_AXIS_TOL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlainErrors:
-    """Chain with its geometric errors, which are constant twists (no transmission errors).
+    """Chain with its geometric errors, which are constant twists (no transmission errors)."""
 
-    Attributes:
-        chain: Chain at the current values of the parameters.
-        parameters: Geometric error parameters, shape (r,).
-        bodies: Body that each error moves, shape (r,).
-        twists: Twist of each error in its body frame, shape (r, 6).
-    """
-
-    chain: Chain
-    parameters: tuple[ErrorParameter, ...]
-    bodies: Array
-    twists: Array
+    chain: Chain  # Chain at the current values of the parameters
+    parameters: tuple[ErrorParameter, ...]  # Geometric error parameters, shape (r,)
+    bodies: Array  # Body that each error moves, shape (r,)
+    twists: Array  # Twist of each error in its body frame, shape (r, 6)
 
     @property
     def error_frames(self) -> Array:
@@ -63,18 +56,13 @@ class PlainErrors:
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
-    """Joints that a combination of errors passes unchanged, and its effect on the tool.
+    """Joints that a combination of errors passes unchanged, and its effect on the tool."""
 
-    Attributes:
-        translation_joints: Joints, from 1, that it passes as a translation along their axis.
-        rotation_joints: Joints, from 1, that it passes as a rotation about their axis.
-        crossed_prismatic_joints: Prismatic joints, from 1, that it passes as a translation across their axis.
-        tool_twists: Twists of the tool at the measured point, shape (c, 6); zero if the tool does not move.
-    """
-
-    translation_joints: list[int]
-    rotation_joints: list[int]
+    translation_joints: list[int]  # Joints, from 1, that it passes as a translation along their axis
+    rotation_joints: list[int]  # Joints, from 1, that it passes as a rotation about their axis
+    # Prismatic joints, from 1, that it passes as a translation across their axis.
     crossed_prismatic_joints: list[int]
+    # Twists of the tool at the measured point, shape (c, 6); zero if the tool does not move.
     tool_twists: Array
 
 

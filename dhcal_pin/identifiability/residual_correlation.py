@@ -62,15 +62,10 @@ FAR_CORRELATION, NEAR_CORRELATION, CORRELATION_LENGTH = 0.015, 0.15, 0.5
 
 @dataclass(frozen=True)
 class ResidualCorrelation:
-    """Correlation of the residuals of a fit between configurations.
+    """Correlation of the residuals of a fit between configurations."""
 
-    Attributes:
-        z: Score of the length at which it is farthest from 0, standard normal for independent residuals.
-        share: Share λ of the variance of the residuals that neighbours share, 0 to 1.
-    """
-
-    z: float
-    share: float
+    z: float  # Score of the length at which it is farthest from 0, standard normal for independent residuals
+    share: float  # Share λ of the variance of the residuals that neighbours share, 0 to 1
 
     @property
     def is_significant(self) -> bool:

@@ -25,25 +25,15 @@ _ROS_MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """Frame of a calibrated camera on a robot.
+    """Frame of a calibrated camera on a robot."""
 
-    Attributes:
-        camera: Camera with its estimated lens.
-        name: Name of the frame.
-        moves: Whether it moves with the tip; otherwise it stands still with the root.
-        base: Link that stands still: the one that carries the camera, or the root.
-        effector: Link that moves with the tip: the one that carries the camera, or the tip.
-        board: Name of a board at the other end.
-        pose: Pose of the camera in the link that carries it, shape (4, 4) [m].
-    """
-
-    camera: Camera
+    camera: Camera  # Camera with its estimated lens
     name: str
-    moves: bool
-    base: str
-    effector: str
-    board: str
-    pose: Array
+    moves: bool  # Whether it moves with the tip; otherwise it stands still with the root
+    base: str  # Link that stands still: the one that carries the camera, or the root
+    effector: str  # Link that moves with the tip: the one that carries the camera, or the tip
+    board: str  # Name of a board at the other end
+    pose: Array  # Pose of the camera in the link that carries it, shape (4, 4) [m]
 
     @property
     def parent(self) -> str:

@@ -134,25 +134,15 @@ def is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """Declaration of the value of a key; the functions below make those of each type.
+    """Declaration of the value of a key; the functions below make those of each type."""
 
-    Attributes:
-        description: Allowed values, for messages.
-        schema: The same as a JSON schema.
-        accepts: Whether a value is allowed.
-        converted: Allowed value in the type that readers use.
-        default: Value of an absent key; None if it has none.
-        is_optional: Whether a key without a default may be absent; its value is then None.
-        remedy: End of the message on another value; what is expected if it is empty.
-    """
-
-    description: str = "a value"
-    schema: Mapping[str, Any] = field(default_factory=dict)
-    accepts: Callable[[Any], bool] = lambda value: True
-    converted: Callable[[Any], Any] = lambda value: value
-    default: Any = None
-    is_optional: bool = False
-    remedy: str = ""
+    description: str = "a value"  # Allowed values, for messages
+    schema: Mapping[str, Any] = field(default_factory=dict)  # The same as a JSON schema
+    accepts: Callable[[Any], bool] = lambda value: True  # Whether a value is allowed
+    converted: Callable[[Any], Any] = lambda value: value  # Allowed value in the type that readers use
+    default: Any = None  # Value of an absent key; None if it has none
+    is_optional: bool = False  # Whether a key without a default may be absent; its value is then None
+    remedy: str = ""  # End of the message on another value; what is expected if it is empty
 
     @property
     def is_required(self) -> bool:

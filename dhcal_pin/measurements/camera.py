@@ -63,39 +63,24 @@ _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Model of all corners at one state. Derivatives by the unknowns are computed on first use.
+    """Model of all corners at one state. Derivatives by the unknowns are computed on first use."""
 
-    Attributes:
-        pixels: Image coordinates, (2, m) [px].
-        by_local: Derivative by the corner in the frame of the camera, (2, 3, m) [px/m].
-        by_lens: Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
-        moves: Whether the camera moves with the tool, (m,).
-        to_camera: Rotation from the frame of the camera's end to that of the camera, (3, 3, m).
-        between: Rotation from the frame of the board's end to that of the camera's end, (3, 3, m).
-        board_axes: Axes of the board in the frame of its end, (3, 3, m).
-        arm: Corner relative to the camera in the frame of the camera's end, (3, m) [m].
-        turned: Corner relative to the board in the frame of the board's end, (3, m) [m].
-        lever: Corner relative to the tool in the measuring frame, (3, m) [m].
-        camera_links: Axes of the link of the camera in the frame of its end, (3, 3, m).
-        board_links: Axes of the link of the board in the frame of its end, (3, 3, m).
-        camera_turns: Derivative of the camera's rotation by its rotation vector, (3, 3, m); see `_end_poses`.
-        board_turns: Derivative of the board's rotation by its rotation vector, (3, 3, m).
-    """
-
-    pixels: Array
-    by_local: Array
+    pixels: Array  # Image coordinates, (2, m) [px]
+    by_local: Array  # Derivative by the corner in the frame of the camera, (2, 3, m) [px/m]
+    # Derivative by the values of the lens of each camera, (2, s, m) for the samples of the camera.
     by_lens: list[Array]
-    moves: Array
-    to_camera: Array
-    between: Array
-    board_axes: Array
-    arm: Array
-    turned: Array
-    lever: Array
-    camera_links: Array
-    board_links: Array
+    moves: Array  # Whether the camera moves with the tool, (m,)
+    to_camera: Array  # Rotation from the frame of the camera's end to that of the camera, (3, 3, m)
+    between: Array  # Rotation from the frame of the board's end to that of the camera's end, (3, 3, m)
+    board_axes: Array  # Axes of the board in the frame of its end, (3, 3, m)
+    arm: Array  # Corner relative to the camera in the frame of the camera's end, (3, m) [m]
+    turned: Array  # Corner relative to the board in the frame of the board's end, (3, m) [m]
+    lever: Array  # Corner relative to the tool in the measuring frame, (3, m) [m]
+    camera_links: Array  # Axes of the link of the camera in the frame of its end, (3, 3, m)
+    board_links: Array  # Axes of the link of the board in the frame of its end, (3, 3, m)
+    # Derivative of the camera's rotation by its rotation vector, (3, 3, m); see `_end_poses`.
     camera_turns: Array
-    board_turns: Array
+    board_turns: Array  # Derivative of the board's rotation by its rotation vector, (3, 3, m)
 
     @property
     def by_velocity(self) -> Array:

@@ -20,15 +20,10 @@ from ..robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """How a camera or a board is fixed to a chain.
+    """How a camera or a board is fixed to a chain."""
 
-    Attributes:
-        moves: Whether it moves with the tool; otherwise it is fixed in the measuring frame.
-        link_pose: Pose of its link in the tool frame or in the measuring frame, shape (4, 4) [m].
-    """
-
-    moves: bool
-    link_pose: Array
+    moves: bool  # Whether it moves with the tool; otherwise it is fixed in the measuring frame
+    link_pose: Array  # Pose of its link in the tool frame or in the measuring frame, shape (4, 4) [m]
 
 
 @dataclass(frozen=True, eq=False)

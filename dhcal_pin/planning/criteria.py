@@ -96,13 +96,10 @@ class DOptimality:
 
 @dataclass(frozen=True, eq=False)
 class AOptimality:
-    """A- or I-optimality: sum of the variances of combinations of the unknowns.
+    """A- or I-optimality: sum of the variances of combinations of the unknowns."""
 
-    Attributes:
-        combinations: Combinations W, shape (p, w). Observable directions give A-optimality, the combinations
-            of `Information.task_combinations` I-optimality over a task.
-    """
-
+    # Combinations W, shape (p, w). Observable directions give A-optimality, the combinations of
+    # `Information.task_combinations` I-optimality over a task.
     combinations: Array
 
     def value(self, sqrt_covariance: Array) -> float:
@@ -119,13 +116,9 @@ class AOptimality:
 
 @dataclass(frozen=True, eq=False)
 class EOptimality:
-    """E-optimality: largest variance of any observable direction.
+    """E-optimality: largest variance of any observable direction."""
 
-    Attributes:
-        observable: Orthonormal observable directions V, shape (r, p).
-    """
-
-    observable: Array
+    observable: Array  # Orthonormal observable directions V, shape (r, p)
 
     def value(self, sqrt_covariance: Array) -> float:
         """Compute the logarithm of the largest eigenvalue of V·C·Vᵀ; see `Criterion.value`."""
@@ -156,16 +149,11 @@ class BiasVarianceCriterion:
 
     The geometric mean (a compound criterion, Läuter) weighs relative changes of both equally. Hence no
     assumption on the ratio of noise to omitted effects is needed.
-
-    Attributes:
-        fitted: Whether the fit estimates each unknown, shape (p+f,).
-        combinations: Combinations W of the fitted unknowns, orthogonal over the task, shape (p, w).
-        target_bias: Bias G of a fit to the task itself, shape (w, f).
     """
 
-    fitted: Array
-    combinations: Array
-    target_bias: Array
+    fitted: Array  # Whether the fit estimates each unknown, shape (p+f,)
+    combinations: Array  # Combinations W of the fitted unknowns, orthogonal over the task, shape (p, w)
+    target_bias: Array  # Bias G of a fit to the task itself, shape (w, f)
 
     def _fit_covariance_and_bias(self, sqrt_covariance: Array) -> tuple[Array, Array]:
         """Compute the square root (p, p) of the covariance C_f of the fit, and the bias B (p, f).

@@ -55,26 +55,19 @@ def _always_feasible(_: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
-    """Candidates of a design.
+    """Candidates of a design."""
 
-    Attributes:
-        rows: Whitened rows, with the unknowns in units of their prior standard deviations, shape (p, k, m).
-        coordinates: Coordinates of the candidates for their distances, shape (m, d). Effects that no model
-            describes are similar for neighbours, so two neighbours contain less information than their rows
-            say.
-        min_distance: Smallest distance of two selected candidates.
-        is_feasible: Expensive test of a candidate by its index; called only for candidates that are about to
-            be selected.
-        bin_columns: Columns of the coordinates that are joint values whose bins are filled evenly, shape
-            (j,); none by default.
-        infeasible: Candidates that failed the test so far, shape (m,); updated in place.
-    """
-
+    # Whitened rows, with the unknowns in units of their prior standard deviations, shape (p, k, m).
     rows: Array
+    # Coordinates of the candidates for their distances, shape (m, d). Effects that no model describes are
+    # similar for neighbours, so two neighbours contain less information than their rows say.
     coordinates: Array
-    min_distance: float = 0.0
+    min_distance: float = 0.0  # Smallest distance of two selected candidates
+    # Expensive test of a candidate by its index; called only for candidates that are about to be selected.
     is_feasible: Callable[[int], bool] = _always_feasible
+    # Columns of the coordinates that are joint values whose bins are filled evenly; none by default.
     bin_columns: Array = field(default_factory=lambda: np.zeros(0, int))
+    # Candidates that failed the test so far, shape (m,); updated in place.
     infeasible: Array = field(default_factory=lambda: np.zeros(0, bool))
 
     @classmethod

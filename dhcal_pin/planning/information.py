@@ -232,26 +232,17 @@ class Information:
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """Robot, instrument and existing measurements before a plan.
+    """Robot, instrument and existing measurements before a plan."""
 
-    Attributes:
-        errors: Error model of the robot.
-        x: Present values of its parameters, shape (p,) [m or rad].
-        sigma: Prior standard deviations of these and of the unknowns in `differences`.
-        instrument: Source of the measurements.
-        template: Measurements with initial values of the instrument parameters.
-        values: Values of instrument parameters that are known, or estimated from the existing measurements.
-        problem: Least-squares problem of the existing measurements; None without any.
-        differences: Its estimated instrument parameters less their initial values.
-    """
-
-    errors: ErrorModel
-    x: Array
-    sigma: Array
-    instrument: Instrument
-    template: Measurement
+    errors: ErrorModel  # Error model of the robot
+    x: Array  # Present values of its parameters, shape (p,) [m or rad]
+    sigma: Array  # Prior standard deviations of these and of the unknowns in `differences`
+    instrument: Instrument  # Source of the measurements
+    template: Measurement  # Measurements with initial values of the instrument parameters
+    # Values of instrument parameters that are known, or estimated from the existing measurements.
     values: dict[str, float]
-    problem: Problem | None = None
+    problem: Problem | None = None  # Least-squares problem of the existing measurements; None without any
+    # Its estimated instrument parameters less their initial values.
     differences: Array = field(default_factory=lambda: np.zeros(0))
 
 

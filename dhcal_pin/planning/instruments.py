@@ -39,19 +39,12 @@ _FREE_CHUNK = 10
 
 @dataclass(frozen=True, eq=False)
 class PresentModel:
-    """Robot and instrument at the present values of their parameters.
-
-    Attributes:
-        chain: Robot.
-        bodies: Bodies of its p errors, shape (p,).
-        twists: Twists of its errors, shape (p, 6).
-        values: Values of the s instrument parameters, shape (s,) [m, rad, px or 1].
-    """
+    """Robot and instrument at the present values of their parameters."""
 
     chain: Chain
-    bodies: Array
-    twists: Array
-    values: Array
+    bodies: Array  # Bodies of its p errors, shape (p,)
+    twists: Array  # Twists of its errors, shape (p, 6)
+    values: Array  # Values of the s instrument parameters, shape (s,) [m, rad, px or 1]
 
 
 class Instrument(Protocol):
@@ -86,15 +79,10 @@ class Instrument(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SimulatedInstrument:
-    """Instrument of a kind of measurement, in a sensible place.
-
-    Attributes:
-        kind: Kind of measurement.
-        noise: Standard deviations of a measurement [m, rad].
-    """
+    """Instrument of a kind of measurement, in a sensible place."""
 
     kind: type[Measurement]
-    noise: Noise
+    noise: Noise  # Standard deviations of a measurement [m, rad]
 
     @property
     def position_sigma(self) -> float:
@@ -123,14 +111,10 @@ class SimulatedInstrument:
 
 @dataclass(frozen=True, eq=False)
 class CameraInstrument:
-    """Cameras that see boards; a measurement is all images of one configuration.
+    """Cameras that see boards; a measurement is all images of one configuration."""
 
-    Attributes:
-        images: Cameras, boards, and limits of their views.
-        noise: Standard deviations of the displacement of the tool that all corners of a configuration share.
-    """
-
-    images: PlannedImages
+    images: PlannedImages  # Cameras, boards, and limits of their views
+    # Standard deviations of the displacement of the tool that all corners of a configuration share.
     noise: Noise
 
     @property
@@ -291,21 +275,13 @@ class CameraInstrument:
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Camera or board at an end of the robot, and how k instrument parameters move it.
+    """Camera or board at an end of the robot, and how k instrument parameters move it."""
 
-    Attributes:
-        pose: Pose in the frame of the end, shape (4, 4) [m].
-        point: Measured point in its own frame, shape (3,) [m].
-        columns: Instrument parameters that move it, shape (k,).
-        linear: Derivatives of its position by them, in axes of the end, shape (3, k).
-        angular: Derivatives of its rotation by them, in axes of the end, shape (3, k).
-    """
-
-    pose: Array
-    point: Array
-    columns: Array
-    linear: Array
-    angular: Array
+    pose: Array  # Pose in the frame of the end, shape (4, 4) [m]
+    point: Array  # Measured point in its own frame, shape (3,) [m]
+    columns: Array  # Instrument parameters that move it, shape (k,)
+    linear: Array  # Derivatives of its position by them, in axes of the end, shape (3, k)
+    angular: Array  # Derivatives of its rotation by them, in axes of the end, shape (3, k)
 
     @classmethod
     def of_pose(cls, pose: Array, link: Array, point: Array, first: int, u: Array) -> _End:

@@ -37,18 +37,14 @@ def _robust_criterion(
 
 @dataclass(frozen=True)
 class CriterionOption:
-    """Criterion that users select by name.
+    """Criterion that users select by name."""
 
-    Attributes:
-        create: Function from observable directions (r, p), observable combinations of the task (p, w),
-            knowledge and joint positions of the task (t, n) to the criterion.
-        help: One line for help texts.
-        omitted_sets: Parameter sets whose effects the fit omits and the criterion considers. The joint
-            positions then scatter in addition to the noise.
-    """
-
+    # Function from observable directions (r, p), observable combinations of the task (p, w), knowledge and
+    # joint positions of the task (t, n) to the criterion.
     create: Callable[[Array, Array, Information, Array], Criterion]
-    help: str
+    help: str  # One line for help texts
+    # Parameter sets whose effects the fit omits and the criterion considers. The joint positions then scatter
+    # in addition to the noise.
     omitted_sets: tuple[str, ...] = ()
 
 

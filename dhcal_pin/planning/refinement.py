@@ -28,46 +28,27 @@ STEP, SHRINK_FACTOR = 0.15, 0.65
 
 @dataclass(frozen=True, eq=False)
 class DesignGoal:
-    """Knowledge before the measurements, and what to optimize.
+    """Knowledge before the measurements, and what to optimize."""
 
-    Attributes:
-        expected: Error to expect over the task after the calibration.
-        ranking: Error by which plans are compared; it takes corners of boards as exact.
-        full_information: Knowledge of `ranking`, and about the unknowns that the fit omits.
-        criterion: Optimality criterion on all unknowns.
-        n_observable: Number of directions that measurements observe.
-        existing: Coordinates of existing measurements, shape (n, d).
-        sampler: Feasible configurations; None if the candidates are given.
-        bin_columns: Joints whose bins are filled evenly before the criterion decides, shape (j,).
-    """
-
-    expected: TaskError
-    ranking: TaskError
-    full_information: Information
-    criterion: Criterion
-    n_observable: int
-    existing: Array
-    sampler: ConfigurationSampler | None
-    bin_columns: Array
+    expected: TaskError  # Error to expect over the task after the calibration
+    ranking: TaskError  # Error by which plans are compared; it takes corners of boards as exact
+    full_information: Information  # Knowledge of `ranking`, and about the unknowns that the fit omits
+    criterion: Criterion  # Optimality criterion on all unknowns
+    n_observable: int  # Number of directions that measurements observe
+    existing: Array  # Coordinates of existing measurements, shape (n, d)
+    sampler: ConfigurationSampler | None  # Feasible configurations; None if the candidates are given
+    bin_columns: Array  # Joints whose bins are filled evenly before the criterion decides, shape (j,)
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Poses that the search has found for a goal.
+    """Poses that the search has found for a goal."""
 
-    Attributes:
-        candidates: Candidates to choose from.
-        q: Their joint positions, shape (m, n) [rad or m].
-        greedy: Indices of the greedy selection in its order, shape (c,).
-        selected: Indices of the selection after exchange, shape (c,).
-        refined: Joint positions after refinement, shape (c, n) [rad or m].
-    """
-
-    candidates: CandidateSet
-    q: Array
-    greedy: Array
-    selected: Array
-    refined: Array
+    candidates: CandidateSet  # Candidates to choose from
+    q: Array  # Their joint positions, shape (m, n) [rad or m]
+    greedy: Array  # Indices of the greedy selection in its order, shape (c,)
+    selected: Array  # Indices of the selection after exchange, shape (c,)
+    refined: Array  # Joint positions after refinement, shape (c, n) [rad or m]
 
 
 def refine(

@@ -19,11 +19,7 @@ from .views import CameraViews, PlannedImages, summarize_views
 
 @dataclass(frozen=True)
 class ToolSource:
-    """Measurements of the tool that can be taken in every configuration.
-
-    Attributes:
-        kind: Name in `KINDS`.
-    """
+    """Measurements of the tool that can be taken in every configuration."""
 
     kind: str
     # What a configuration needs beside the constraints of the robot, for messages.
@@ -44,13 +40,9 @@ class ToolSource:
 
 @dataclass(frozen=True, eq=False)
 class ImageSource:
-    """Images of boards.
+    """Images of boards."""
 
-    Attributes:
-        images: Cameras, boards and limits of their views.
-    """
-
-    images: PlannedImages
+    images: PlannedImages  # Cameras, boards and limits of their views
     kind = CameraCorners.kind
     condition = "; a board must be in view, and nothing may hide it"
 

@@ -16,15 +16,10 @@ from .information import Information
 
 @dataclass(frozen=True, eq=False)
 class TaskError:
-    """Position error over a task.
+    """Position error over a task."""
 
-    Attributes:
-        information: Knowledge before the measurements about the p unknowns.
-        combinations: Combinations of the unknowns whose variances sum to the mean squared position error,
-            shape (p, w) [m].
-    """
-
-    information: Information
+    information: Information  # Knowledge before the measurements about the p unknowns
+    # Combinations of the unknowns whose variances sum to the mean squared position error, shape (p, w) [m].
     combinations: Array
 
     @classmethod

@@ -42,18 +42,12 @@ N_EXTENSIONS, EXTENSION_RAD = 300, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """Order of poses and the ways between them.
+    """Order of poses and the ways between them."""
 
-    Attributes:
-        order: Indices of the poses, shape (n,).
-        q: Joint positions in this order, shape (n, dof) [rad or m].
-        ways: Way points before each pose of the tour, shapes (w, dof) [rad or m].
-        is_way_free: Whether the moves to each pose of the tour are free of collisions; true for the first.
-    """
-
-    order: Array
-    q: Array
-    ways: tuple[Array, ...]
+    order: Array  # Indices of the poses, shape (n,)
+    q: Array  # Joint positions in this order, shape (n, dof) [rad or m]
+    ways: tuple[Array, ...]  # Way points before each pose of the tour, shapes (w, dof) [rad or m]
+    # Whether the moves to each pose of the tour are free of collisions; true for the first.
     is_way_free: tuple[bool, ...]
 
 
@@ -161,17 +155,11 @@ def _connected(
 
 @dataclass(frozen=True, eq=False)
 class _Tree:
-    """Tree of configurations with free moves between each node and its parent.
-
-    Attributes:
-        checker: Collision checks.
-        nodes: Joint positions of the nodes, shapes (dof,) [rad or m]; the first is the root.
-        parents: Index of the parent of each node; -1 for the root.
-    """
+    """Tree of configurations with free moves between each node and its parent."""
 
     checker: CollisionChecker
-    nodes: list[Array]
-    parents: list[int]
+    nodes: list[Array]  # Joint positions of the nodes, shapes (dof,) [rad or m]; the first is the root
+    parents: list[int]  # Index of the parent of each node; -1 for the root
 
     def extend(self, target: Array) -> bool:
         """Add a node towards a configuration if the move is free; return whether it was added."""

@@ -36,13 +36,9 @@ _BOARD_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class ViewSampler(ConfigurationSampler):
-    """Sampler of configurations in which a camera sees a board.
+    """Sampler of configurations in which a camera sees a board."""
 
-    Attributes:
-        images: Cameras and boards.
-    """
-
-    images: PlannedImages
+    images: PlannedImages  # Cameras and boards
 
     @classmethod
     def from_sampler(cls, sampler: ConfigurationSampler, images: PlannedImages) -> ViewSampler:

@@ -126,21 +126,13 @@ def _with_equal_sigmas(item: Measurement) -> Measurement:
 
 @dataclass(frozen=True, eq=False)
 class _Noise:
-    """Noise of measurements as estimated from the residuals of a fit.
+    """Noise of measurements as estimated from the residuals of a fit."""
 
-    Attributes:
-        data: Measurements with these standard deviations.
-        log_determinant: Sum of the logarithms of all factors to the standard deviations of the rows.
-        length_scale: Standard deviation of a length residual [m]; NaN if no lengths are measured.
-        angle_scale: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
-        min_factor: Smallest common factor to the standard deviations that leaves none below `_MIN_SCALE`.
-    """
-
-    data: tuple[Measurement, ...]
-    log_determinant: float
-    length_scale: float
-    angle_scale: float
-    min_factor: float
+    data: tuple[Measurement, ...]  # Measurements with these standard deviations
+    log_determinant: float  # Sum of the logarithms of all factors to the standard deviations of the rows
+    length_scale: float  # Standard deviation of a length residual [m]; NaN if no lengths are measured
+    angle_scale: float  # Standard deviation of an angle residual [rad]; NaN if no angles are measured
+    min_factor: float  # Smallest common factor to the standard deviations that leaves none below `_MIN_SCALE`
 
 
 def _estimate_noise(problem: Problem, x: Array) -> _Noise:

@@ -44,19 +44,12 @@ class Change(Protocol):
 
 @dataclass(frozen=True)
 class JointChange:
-    """Other joint columns: q_j becomes sign_j · factor_j · q_source_j + offset_j.
+    """Other joint columns: q_j becomes sign_j · factor_j · q_source_j + offset_j."""
 
-    Attributes:
-        sources: Column that holds joint j, for each of the n joints.
-        signs: 1 or -1 for each joint.
-        offsets: Summand for each joint [rad or m].
-        factors: Factor of the unit for each joint.
-    """
-
-    sources: tuple[int, ...]
-    signs: tuple[int, ...]
-    offsets: tuple[float, ...]
-    factors: tuple[float, ...]
+    sources: tuple[int, ...]  # Column that holds joint j, for each of the n joints
+    signs: tuple[int, ...]  # 1 or -1 for each joint
+    offsets: tuple[float, ...]  # Summand for each joint [rad or m]
+    factors: tuple[float, ...]  # Factor of the unit for each joint
 
     @classmethod
     def of(
@@ -86,13 +79,9 @@ class JointChange:
 
 @dataclass(frozen=True)
 class RowShift:
-    """Joint positions belong to the measured values `step` rows below them.
+    """Joint positions belong to the measured values `step` rows below them."""
 
-    Attributes:
-        step: 1 or -1.
-    """
-
-    step: int
+    step: int  # 1 or -1
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measured values with the joint positions of neighbouring rows."""
@@ -111,13 +100,9 @@ class RowShift:
 
 @dataclass(frozen=True)
 class LengthChange:
-    """Other unit of measured lengths.
+    """Other unit of measured lengths."""
 
-    Attributes:
-        factor: Factor to all measured lengths and positions.
-    """
-
-    factor: float
+    factor: float  # Factor to all measured lengths and positions
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements with scaled lengths."""
@@ -130,15 +115,10 @@ class LengthChange:
 
 @dataclass(frozen=True)
 class AxisChange:
-    """Other axes of measured positions, rotations unchanged: axis i is sign_i times axis source_i as read.
+    """Other axes of measured positions, rotations unchanged: axis i is sign_i times axis source_i as read."""
 
-    Attributes:
-        sources: Column that holds each axis.
-        signs: 1 or -1 for each axis.
-    """
-
-    sources: tuple[int, int, int]
-    signs: tuple[int, int, int] = (1, 1, 1)
+    sources: tuple[int, int, int]  # Column that holds each axis
+    signs: tuple[int, int, int] = (1, 1, 1)  # 1 or -1 for each axis
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements with changed positions."""
@@ -159,13 +139,9 @@ class MirroredPoses:
 
 @dataclass(frozen=True)
 class QuaternionOrder:
-    """Other order of the components of measured quaternions.
+    """Other order of the components of measured quaternions."""
 
-    Attributes:
-        order: True order of the columns that were read in the other one.
-    """
-
-    order: QuaternionNotation
+    order: QuaternionNotation  # True order of the columns that were read in the other one
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the rotations of the reordered quaternions."""

@@ -27,29 +27,17 @@ _WIDTH, _NARROW, _BESIDE, _BELOW = 420.0, 320.0, 60.0, 46.0
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """Corners of one image.
+    """Corners of one image."""
 
-    Attributes:
-        number: Number in the report, from 1.
-        name: Name of its photograph, or the number if it has none.
-        source: Name of the file and lines of its rows.
-        camera: Camera that took it.
-        role: "fitted" or "hold-out".
-        pixels: Measured corners, (c, 2) [px].
-        before: Errors with the nominal arm, (c, 2) [px].
-        after: Errors after the calibration, (c, 2) [px].
-        distance: Errors at the board after the calibration, (c,) [m].
-    """
-
-    number: int
-    name: str
-    source: str
-    camera: Camera
-    role: str
-    pixels: Array
-    before: Array
-    after: Array
-    distance: Array
+    number: int  # Number in the report, from 1
+    name: str  # Name of its photograph, or the number if it has none
+    source: str  # Name of the file and lines of its rows
+    camera: Camera  # Camera that took it
+    role: str  # "fitted" or "hold-out"
+    pixels: Array  # Measured corners, (c, 2) [px]
+    before: Array  # Errors with the nominal arm, (c, 2) [px]
+    after: Array  # Errors after the calibration, (c, 2) [px]
+    distance: Array  # Errors at the board after the calibration, (c,) [m]
 
     @property
     def rms(self) -> float:

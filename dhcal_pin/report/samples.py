@@ -38,32 +38,19 @@ ROLES = ("fitted", "hold-out", "measured", "planned")
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Samples that a reader can select on a page.
+    """Samples that a reader can select on a page."""
 
-    Attributes:
-        chain: Robot whose tool poses are shown.
-        file: File of each sample, (N,).
-        line: Line of each sample in its file, (N,).
-        number: Number of each sample; numbers continue over the files, (N,).
-        role: One of `ROLES` for each sample, (N,).
-        is_outlier: Whether each sample is an outlier, (N,).
-        q: Joint positions of its first configuration, (N, n) [rad or m]; NaN if it has none.
-        errors: Error norms by group and state ("before", "after"), (N,) each [m or rad]; NaN for samples
-            without this group.
-        downloads: Files to download from the page, by name.
-        note: Sentence about samples that the page does not contain; empty if it has all.
-    """
-
-    chain: Chain
-    file: Array
-    line: Array
-    number: Array
-    role: Array
-    is_outlier: Array
-    q: Array
+    chain: Chain  # Robot whose tool poses are shown
+    file: Array  # File of each sample, (N,)
+    line: Array  # Line of each sample in its file, (N,)
+    number: Array  # Number of each sample; numbers continue over the files, (N,)
+    role: Array  # One of `ROLES` for each sample, (N,)
+    is_outlier: Array  # Whether each sample is an outlier, (N,)
+    q: Array  # Joint positions of its first configuration, (N, n) [rad or m]; NaN if it has none
+    # Error norms by group and state ("before", "after"), (N,) each [m or rad]; NaN without this group.
     errors: Mapping[str, Mapping[str, Array]]
-    downloads: Mapping[str, str] = field(default_factory=dict)
-    note: str = ""
+    downloads: Mapping[str, str] = field(default_factory=dict)  # Files to download from the page, by name
+    note: str = ""  # Sentence about samples that the page does not contain; empty if it has all
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -79,11 +79,7 @@ class Extraction:
 
 @dataclass(frozen=True)
 class _OriginParameters:
-    """The seven parameters of an origin [rad and m]; see the module docstring.
-
-    Attributes:
-        plain_offset: Largest offset that a row without β would need [m].
-    """
+    """The seven parameters of an origin [rad and m]; see the module docstring."""
 
     t1: float = 0.0
     d1: float = 0.0
@@ -92,7 +88,7 @@ class _OriginParameters:
     beta: float = 0.0
     d2: float = 0.0
     t2: float = 0.0
-    plain_offset: float = 0.0
+    plain_offset: float = 0.0  # Largest offset that a row without β would need [m]
 
     @property
     def before(self) -> Array:

@@ -39,15 +39,10 @@ MASS, INERTIA = 1e-3, 1e-6
 
 @dataclass(frozen=True)
 class _Skeleton:
-    """Line segments of a link in its own frame.
+    """Line segments of a link in its own frame."""
 
-    Attributes:
-        points: Points, each of shape (3,) [m].
-        materials: Material of each segment.
-    """
-
-    points: list[Array]
-    materials: list[str]
+    points: list[Array]  # Points, each of shape (3,) [m]
+    materials: list[str]  # Material of each segment
 
 
 def dh_to_urdf(table: DHTable, name: str) -> str:

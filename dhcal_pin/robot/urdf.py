@@ -77,23 +77,14 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?
 
 @dataclass(frozen=True, eq=False)
 class UrdfTag:
-    """Start tag of an XML element.
+    """Start tag of an XML element."""
 
-    Attributes:
-        source: Name of the file for messages.
-        line: Line of the tag, from 1.
-        label: Name of the element for messages.
-        start: Byte offset of the tag.
-        attributes: Values of the attributes by name.
-        children: Tags of the direct children by element name.
-    """
-
-    source: str
+    source: str  # Name of the file for messages
     line: int
-    label: str
-    start: int
-    attributes: dict[str, str]
-    children: dict[str, UrdfTag] = field(default_factory=dict)
+    label: str  # Name of the element for messages
+    start: int  # Byte offset of the tag
+    attributes: dict[str, str]  # Values of the attributes by name
+    children: dict[str, UrdfTag] = field(default_factory=dict)  # Tags of the direct children by element name
 
     def error(self, text: str) -> FileFormatError:
         """Create an error that names the file, the line and the element."""

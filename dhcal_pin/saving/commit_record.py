@@ -26,19 +26,12 @@ _TEMPORARY = re.compile(r"\.dhcal-[0-9a-f]{16}-\d+\.(?:new|old)")
 
 @dataclass(frozen=True)
 class CommitRecord:
-    """What a commit does in one folder.
+    """What a commit does in one folder."""
 
-    Attributes:
-        token: Random text that all records of a commit share.
-        folders: All folders of the commit, the primary one first.
-        renames: Pairs of the name of a temporary file and the name of its target.
-        removals: Names of files to remove.
-    """
-
-    token: str
-    folders: Sequence[str]
-    renames: Sequence[Sequence[str]]
-    removals: Sequence[str]
+    token: str  # Random text that all records of a commit share
+    folders: Sequence[str]  # All folders of the commit, the primary one first
+    renames: Sequence[Sequence[str]]  # Pairs of the name of a temporary file and the name of its target
+    removals: Sequence[str]  # Names of files to remove
 
     @classmethod
     def read(cls, folder: str) -> CommitRecord | None:

@@ -41,23 +41,14 @@ def write_files(
 
 @dataclass(frozen=True)
 class _Change:
-    """Change of one file.
+    """Change of one file."""
 
-    Attributes:
-        path: Path for messages.
-        folder: Absolute path of the folder, without symbolic links.
-        name: Name of the file in it.
-        data: New content; None to remove the file.
-        temporary: Path of the temporary file with the new content.
-        backup: Path of the backup of the old content.
-    """
-
-    path: PathLike
-    folder: str
-    name: str
-    data: bytes | None
-    temporary: str
-    backup: str
+    path: PathLike  # Path for messages
+    folder: str  # Absolute path of the folder, without symbolic links
+    name: str  # Name of the file in it
+    data: bytes | None  # New content; None to remove the file
+    temporary: str  # Path of the temporary file with the new content
+    backup: str  # Path of the backup of the old content
 
     @property
     def target(self) -> str:

@@ -183,19 +183,12 @@ def _draw(view: meshcat.Visualizer, style: tuple[int, float], visuals: Visuals, 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Connection of `meshcat.Visualizer` to the server; MeshCat's own one waits for an answer without limit.
+    """Connection of `meshcat.Visualizer` to the server; the one of MeshCat waits without limit."""
 
-    Attributes:
-        process: Process of the server.
-        socket: Connection to the server.
-        folder: Folder of the socket file.
-        web_url: Address of the page.
-    """
-
-    process: subprocess.Popen[str]
-    socket: zmq.Socket[bytes]
-    folder: TemporaryDirectory[str]
-    web_url: str
+    process: subprocess.Popen[str]  # Process of the server
+    socket: zmq.Socket[bytes]  # Connection to the server
+    folder: TemporaryDirectory[str]  # Folder of the socket file
+    web_url: str  # Address of the page
 
     @classmethod
     def start(cls) -> _Window:

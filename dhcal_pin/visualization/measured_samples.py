@@ -25,25 +25,15 @@ FITTED, HELD_OUT, OUTLIER = range(3)
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSamples:
-    """Measured positions of m samples.
+    """Measured positions of m samples."""
 
-    Attributes:
-        q: Joint positions, (m, n) [rad or m].
-        points: Measured positions in the measuring frame, (m, 3) [m].
-        residuals: Residuals of the calibrated robot, (m, 3) [m].
-        nominal_residuals: Residuals of the nominal robot, (m, 3) [m].
-        sets: Index into `SETS`, (m,).
-        files: Name of the file of each sample, (m,); empty for samples from Python.
-        lines: Line in the file, (m,); the number of the sample, from 1, if it has no file.
-    """
-
-    q: Array
-    points: Array
-    residuals: Array
-    nominal_residuals: Array
-    sets: Array
-    files: Array
-    lines: Array
+    q: Array  # Joint positions, (m, n) [rad or m]
+    points: Array  # Measured positions in the measuring frame, (m, 3) [m]
+    residuals: Array  # Residuals of the calibrated robot, (m, 3) [m]
+    nominal_residuals: Array  # Residuals of the nominal robot, (m, 3) [m]
+    sets: Array  # Index into `SETS`, (m,)
+    files: Array  # Name of the file of each sample, (m,); empty for samples from Python
+    lines: Array  # Line in the file, (m,); the number of the sample, from 1, if it has no file
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -45,17 +45,11 @@ AXIS_COLORS = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
 @dataclass(frozen=True, eq=False)
 class Visuals:
-    """Shapes of a robot.
+    """Shapes of a robot."""
 
-    Attributes:
-        shapes: Shapes of all bodies.
-        meshes: Meshes of the shapes.
-        note: Sentence about shapes that replace missing ones; empty if there are none.
-    """
-
-    shapes: list[dict[str, Any]]
+    shapes: list[dict[str, Any]]  # Shapes of all bodies
     meshes: list[Mesh]
-    note: str
+    note: str  # Sentence about shapes that replace missing ones; empty if there are none
 
 
 def visuals_of(
@@ -212,19 +206,12 @@ def _primitive(geometry: Any) -> dict[str, Any] | None:
 # --- meshes ----------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangle mesh whose vertices lie on a grid.
+    """Triangle mesh whose vertices lie on a grid."""
 
-    Attributes:
-        origin: Corner of the grid, shape (3,) [m].
-        step: Distance of the grid points [m].
-        corners: Vertices as integer multiples of the step, shape (v, 3).
-        triangles: Numbers of the vertices of each triangle, shape (t, 3).
-    """
-
-    origin: Array
-    step: float
-    corners: Array
-    triangles: Array
+    origin: Array  # Corner of the grid, shape (3,) [m]
+    step: float  # Distance of the grid points [m]
+    corners: Array  # Vertices as integer multiples of the step, shape (v, 3)
+    triangles: Array  # Numbers of the vertices of each triangle, shape (t, 3)
 
     @classmethod
     def from_geometry(cls, geometry: Any) -> Mesh:

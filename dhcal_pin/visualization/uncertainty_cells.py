@@ -26,18 +26,13 @@ _ROUND = np.array([1.0, 2.0, 5.0, 10.0])
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyCells:
-    """Cells that the tool reaches.
+    """Cells that the tool reaches."""
 
-    Attributes:
-        size: Side of a cell [m]; 1, 2 or 5 times a power of ten.
-        index: Integer coordinates, (c, 3): cell i contains the points p with floor(p / size) = index[i], in
-            the frame of the base link.
-        std: Predicted standard deviation of the tool position, (c,) [m].
-    """
-
-    size: float
+    size: float  # Side of a cell [m]; 1, 2 or 5 times a power of ten
+    # Integer coordinates, (c, 3): cell i contains the points p with floor(p / size) = index[i], in the frame
+    # of the base link.
     index: Array
-    std: Array
+    std: Array  # Predicted standard deviation of the tool position, (c,) [m]
 
 
 def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:

@@ -27,19 +27,12 @@ from .stages import ImageError, Stage, fitted_error
 
 @dataclass(frozen=True)
 class AxisOrder:
-    """Order of the values of a camera and of its image coordinates.
+    """Order of the values of a camera and of its image coordinates."""
 
-    Attributes:
-        intrinsics: Order of fx, fy, cx, cy.
-        pixels: Order of u, v.
-        place: Where the exchanged values are written.
-        min_error: Error of the stated order from which this one is tried [px].
-    """
-
-    intrinsics: tuple[int, ...] = (0, 1, 2, 3)
-    pixels: tuple[int, ...] = (0, 1)
-    place: str = "rig file"
-    min_error: float = 2.0
+    intrinsics: tuple[int, ...] = (0, 1, 2, 3)  # Order of fx, fy, cx, cy
+    pixels: tuple[int, ...] = (0, 1)  # Order of u, v
+    place: str = "rig file"  # Where the exchanged values are written
+    min_error: float = 2.0  # Error of the stated order from which this one is tried [px]
 
 
 # Orders besides the stated one, by what they exchange. Exchanged image coordinates make mirror images, whose
@@ -61,21 +54,13 @@ _MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
 
 @dataclass(frozen=True)
 class Exchange:
-    """Values of a camera that are exchanged in the rig, or image coordinates in the measurements.
-
-    Attributes:
-        camera: Name of the camera.
-        what: What is exchanged.
-        stated: Error with the values as they are stated.
-        exchanged: Error with the exchanged values; None if it is the size of the images.
-        unknowns: Number of unknowns of the comparison.
-    """
+    """Values of a camera that are exchanged in the rig, or image coordinates in the measurements."""
 
     camera: str
     what: str
-    stated: ImageError | None
-    exchanged: ImageError | None
-    unknowns: int = 0
+    stated: ImageError | None  # Error with the values as they are stated
+    exchanged: ImageError | None  # Error with the exchanged values; None if it is the size of the images
+    unknowns: int = 0  # Number of unknowns of the comparison
 
     @property
     def sentence(self) -> str:

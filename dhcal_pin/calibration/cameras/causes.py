@@ -67,40 +67,26 @@ _MAX_ITERATIONS = 40
 
 @dataclass(frozen=True)
 class Causes:
-    """Combination of causes.
+    """Combination of causes."""
 
-    Attributes:
-        arm: Parameter sets of the arm that are estimated; empty for the nominal arm.
-        has_lens: Whether the values of the lenses are estimated.
-        has_points: Whether the corners of the boards are estimated.
-        sizes: Size of each board relative to the stated one, by name.
-        shift: Number of rows by which the joint values are shifted; 0.5 is the mean of two rows.
-        has_exchanged_links: Whether cameras and boards are on each other's links.
-    """
-
-    arm: str = ""
-    has_lens: bool = False
-    has_points: bool = False
+    arm: str = ""  # Parameter sets of the arm that are estimated; empty for the nominal arm
+    has_lens: bool = False  # Whether the values of the lenses are estimated
+    has_points: bool = False  # Whether the corners of the boards are estimated
+    # Size of each board relative to the stated one, by name.
     sizes: Mapping[str, float] = field(default_factory=dict)
-    shift: float = 0.0
-    has_exchanged_links: bool = False
+    shift: float = 0.0  # Number of rows by which the joint values are shifted; 0.5 is the mean of two rows
+    has_exchanged_links: bool = False  # Whether cameras and boards are on each other's links
 
 
 @dataclass(frozen=True, eq=False)
 class HandEyeData:
-    """What all models of one hand-eye calibration share.
+    """What all models of one hand-eye calibration share."""
 
-    Attributes:
-        errors: Nominal chain; base and tool are its only parameters, if any.
-        data: Measurements with their own standard deviations, first values and no outliers.
-        known: Values of parameters that the calibration holds, by name [m, rad, px or 1].
-        sequence: Joint values of all images in the order of the file, held-out ones included, (k, n).
-    """
-
-    errors: ErrorModel
+    errors: ErrorModel  # Nominal chain; base and tool are its only parameters, if any
+    # Measurements with their own standard deviations, first values and no outliers.
     data: tuple[Measurement, ...]
-    known: Mapping[str, float]
-    sequence: Array
+    known: Mapping[str, float]  # Values of parameters that the calibration holds, by name [m, rad, px or 1]
+    sequence: Array  # Joint values of all images in the order of the file, held-out ones included, (k, n)
 
 
 def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:

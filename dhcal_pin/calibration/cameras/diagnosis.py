@@ -84,19 +84,12 @@ MIN_ROTATION = np.deg2rad(8.0)
 
 @dataclass(frozen=True)
 class Trial:
-    """One cause that was estimated along.
-
-    Attributes:
-        cause: Name of the cause.
-        error: Error of left-out images.
-        text: What differs, and by how much.
-        remedy: What to do about it.
-    """
+    """One cause that was estimated along."""
 
     cause: str
-    error: ImageError
-    text: str
-    remedy: str
+    error: ImageError  # Error of left-out images
+    text: str  # What differs, and by how much
+    remedy: str  # What to do about it
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for the JSON document."""
@@ -352,23 +345,14 @@ def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Fit of a combination of causes.
+    """Fit of a combination of causes."""
 
-    Attributes:
-        causes: Causes that are estimated.
-        fit: Fit of all images.
-        error: Error of left-out images.
-        scatter: Noise of the corners, from their scatter within an image [px].
-        noise: Error of left-out images that this noise predicts [px].
-        is_displaced: Whether the corners of an image are significantly displaced together.
-    """
-
-    causes: Causes
-    fit: Fit
-    error: ImageError
-    scatter: float
-    noise: float
-    is_displaced: bool
+    causes: Causes  # Causes that are estimated
+    fit: Fit  # Fit of all images
+    error: ImageError  # Error of left-out images
+    scatter: float  # Noise of the corners, from their scatter within an image [px]
+    noise: float  # Error of left-out images that this noise predicts [px]
+    is_displaced: bool  # Whether the corners of an image are significantly displaced together
 
     @classmethod
     def of(cls, hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> _State:

@@ -62,22 +62,15 @@ _N_CLUSTER_ROUNDS = 50
 
 @dataclass(frozen=True)
 class Gate:
-    """Result of the gate.
+    """Result of the gate."""
 
-    Attributes:
-        ratio: Error of left-out clusters with the arm estimated over that with the nominal arm; NaN if the
-            images cannot be divided.
-        temperature: Temperature of the residuals in the final fit.
-        n_configurations: Number of different configurations.
-        is_right: Whether the corners of an image share no displacement with the nominal arm.
-        is_complete: Whether they share none with the estimated arm.
-    """
-
+    # Error of left-out clusters with the arm estimated over that with the nominal arm; NaN if the images
+    # cannot be divided.
     ratio: float
-    temperature: float
-    n_configurations: int
-    is_right: bool
-    is_complete: bool
+    temperature: float  # Temperature of the residuals in the final fit
+    n_configurations: int  # Number of different configurations
+    is_right: bool  # Whether the corners of an image share no displacement with the nominal arm
+    is_complete: bool  # Whether they share none with the estimated arm
 
     @property
     def is_open(self) -> bool:
@@ -111,19 +104,12 @@ class Gate:
 
 @dataclass(frozen=True, eq=False)
 class GatedFit:
-    """Fits with and without errors of the arm, and the gate between them.
-
-    Attributes:
-        fit: Final fit.
-        nominal: Fit of independent corners with the nominal arm.
-        with_arm: Fit with the arm estimated.
-        gate: Whether the arm is estimated in the final fit.
-    """
+    """Fits with and without errors of the arm, and the gate between them."""
 
     fit: Fit
-    nominal: Fit
-    with_arm: Fit
-    gate: Gate
+    nominal: Fit  # Fit of independent corners with the nominal arm
+    with_arm: Fit  # Fit with the arm estimated
+    gate: Gate  # Whether the arm is estimated in the final fit
 
 
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
@@ -212,19 +198,12 @@ def residual_jitter(fit: Fit) -> Jitter:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Arm estimated with one model of the noise, as the gate judges it.
+    """Arm estimated with one model of the noise, as the gate judges it."""
 
-    Attributes:
-        model: Fit at temperature 1.
-        closed: Fit with the prior widths of greatest evidence at the temperature of the gate.
-        error: Error of left-out clusters with that fit [px]; NaN without clusters.
-        ratio: The same as a fraction of the error with the nominal arm.
-    """
-
-    model: Fit
-    closed: Fit
-    error: float
-    ratio: float
+    model: Fit  # Fit at temperature 1
+    closed: Fit  # Fit with the prior widths of greatest evidence at the temperature of the gate
+    error: float  # Error of left-out clusters with that fit [px]; NaN without clusters
+    ratio: float  # The same as a fraction of the error with the nominal arm
 
 
 def _trial(

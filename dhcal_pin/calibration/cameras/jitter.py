@@ -40,19 +40,12 @@ MIN_LOG_LIKELIHOOD_RATIO = 5.5
 
 @dataclass(frozen=True)
 class Jitter:
-    """Noise of corners and displacement of images.
+    """Noise of corners and displacement of images."""
 
-    Attributes:
-        noise: Standard deviation of an image coordinate, relative to the stated or placeholder one.
-        position: Standard deviation of the displacement of the tool along each axis [m].
-        rotation: Standard deviation of its rotation about each axis [rad].
-        log_likelihood_ratio: Logarithm of the likelihood with the displacement over that without it, where
-            the noise explains all residuals.
-    """
-
-    noise: float
-    position: float
-    rotation: float
+    noise: float  # Standard deviation of an image coordinate, relative to the stated or placeholder one
+    position: float  # Standard deviation of the displacement of the tool along each axis [m]
+    rotation: float  # Standard deviation of its rotation about each axis [rad]
+    # Logarithm of the likelihood with the displacement over that without it, where noise explains all.
     log_likelihood_ratio: float = 0.0
 
     @property

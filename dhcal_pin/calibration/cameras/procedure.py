@@ -43,19 +43,12 @@ def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[
 
 @dataclass(frozen=True)
 class ImageFitting:
-    """Settings of the fits of images.
+    """Settings of the fits of images."""
 
-    Attributes:
-        groups: Groups of priors of the robot, whose widths are estimated.
-        stages: Stages of the robust loss.
-        max_iterations: Largest number of iterations of one solution.
-        progress: Function that is called with the progress, if any.
-    """
-
-    groups: PriorGroups
-    stages: tuple[str, ...]
-    max_iterations: int
-    progress: Progress | None
+    groups: PriorGroups  # Groups of priors of the robot, whose widths are estimated
+    stages: tuple[str, ...]  # Stages of the robust loss
+    max_iterations: int  # Largest number of iterations of one solution
+    progress: Progress | None  # Function that is called with the progress, if any
 
     def reweight(self, fit: Fit) -> Fit:
         """Estimate noise, weights and widths of priors, those of lenses included."""

@@ -28,17 +28,12 @@ MAX_RATIO = 0.9
 
 @dataclass(frozen=True, eq=False)
 class TargetPoints:
-    """Result of a trial of the corners of boards as unknowns.
+    """Result of a trial of the corners of boards as unknowns."""
 
-    Attributes:
-        fit: Fit with the corners as unknowns, with the weights and standard deviations of that without them.
-        by_image: Error of left-out images relative to that with the stated corners.
-        by_region: The same for left-out clusters of joint space.
-    """
-
+    # Fit with the corners as unknowns, with the weights and standard deviations of that without them.
     fit: Fit
-    by_image: float
-    by_region: float
+    by_image: float  # Error of left-out images relative to that with the stated corners
+    by_region: float  # The same for left-out clusters of joint space
 
     @property
     def is_kept(self) -> bool:

@@ -41,25 +41,15 @@ _MEDIAN_PARTS, _MIN_PART_SAMPLES = 12, 5
 
 @dataclass(frozen=True, eq=False)
 class SampleErrors:
-    """Errors of N samples before and after a calibration, in one group of errors.
+    """Errors of N samples before and after a calibration, in one group of errors."""
 
-    Attributes:
-        group: "position", "orientation" or "residual".
-        unit: SI unit of the errors.
-        before: Error norms of the nominal robot, shape (N,) [`unit`].
-        after: Error norms of the calibrated robot, shape (N,) [`unit`].
-        is_holdout: Whether each sample was held out, shape (N,).
-        is_outlier: Whether each fitted sample is an outlier, shape (N,).
-        index: Index of each sample among all samples, fitted ones first, shape (N,).
-    """
-
-    group: str
-    unit: str
-    before: Array
-    after: Array
-    is_holdout: Array
-    is_outlier: Array
-    index: Array
+    group: str  # "position", "orientation" or "residual"
+    unit: str  # SI unit of the errors
+    before: Array  # Error norms of the nominal robot, shape (N,) [`unit`]
+    after: Array  # Error norms of the calibrated robot, shape (N,) [`unit`]
+    is_holdout: Array  # Whether each sample was held out, shape (N,)
+    is_outlier: Array  # Whether each fitted sample is an outlier, shape (N,)
+    index: Array  # Index of each sample among all samples, fitted ones first, shape (N,)
 
     @classmethod
     def from_fit(cls, fit: Evidence, group: str | None) -> SampleErrors:

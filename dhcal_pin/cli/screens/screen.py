@@ -47,42 +47,27 @@ class Line(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """Part of a screen: texts or a table.
+    """Part of a screen: texts or a table."""
 
-    Attributes:
-        content: Texts, each on a line of its own, or a table.
-        style: Style, such as "yellow" or "bold".
-        title: Line above the content; it is not shown without content.
-        noun: What an item is, such as "note on the files", for the number of items that are left out; a block
-            without it is never shortened.
-        rank: Blocks of the lowest rank are shortened first.
-        n_kept: Number of items that remain until all blocks are shortened.
-        is_verdict: Whether the block is also shown if only the verdict is asked for.
-        has_space: Whether an empty line precedes the block if there is space for it.
-        is_verbatim: Whether the texts are to be copied, so that no line of them is folded.
-    """
-
-    content: Sequence[str] | Table
-    style: str = ""
-    title: str = ""
+    content: Sequence[str] | Table  # Texts, each on a line of its own, or a table
+    style: str = ""  # Style, such as "yellow" or "bold"
+    title: str = ""  # Line above the content; it is not shown without content
+    # What an item is, such as "note on the files", for the number of items that are left out; a block without
+    # it is never shortened.
     noun: str = ""
-    rank: int = 0
-    n_kept: int = 1
-    is_verdict: bool = False
-    has_space: bool = False
-    is_verbatim: bool = False
+    rank: int = 0  # Blocks of the lowest rank are shortened first
+    n_kept: int = 1  # Number of items that remain until all blocks are shortened
+    is_verdict: bool = False  # Whether the block is also shown if only the verdict is asked for
+    has_space: bool = False  # Whether an empty line precedes the block if there is space for it
+    is_verbatim: bool = False  # Whether the texts are to be copied, so that no line of them is folded
 
 
 @dataclass(frozen=True)
 class Screen:
-    """Result of a command as it is shown.
+    """Result of a command as it is shown."""
 
-    Attributes:
-        blocks: What is always shown, shortened to one screen unless everything is asked for.
-        details: Makes what is shown above the blocks if everything is asked for.
-    """
-
-    blocks: Sequence[Block]
+    blocks: Sequence[Block]  # What is always shown, shortened to one screen unless everything is asked for
+    # Makes what is shown above the blocks if everything is asked for.
     details: Callable[[], Sequence[Block]] = tuple
 
     def lines(self, verbosity: Verbosity, width: int | None = WIDTH) -> list[Line]:

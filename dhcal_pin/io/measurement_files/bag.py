@@ -89,15 +89,10 @@ _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
 class ConvertedBag(NamedTuple):
-    """Measurement file made from a recording.
+    """Measurement file made from a recording."""
 
-    Attributes:
-        text: Text of the CSV file.
-        notes: Sentences on the recording.
-    """
-
-    text: str
-    notes: list[str]
+    text: str  # Text of the CSV file
+    notes: list[str]  # Sentences on the recording
 
 
 def is_bag(path: PathLike) -> bool:

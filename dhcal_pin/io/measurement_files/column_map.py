@@ -119,63 +119,37 @@ def rotation_keys(convention: str) -> dict[str, Key]:
 
 @dataclass(frozen=True)
 class ColumnRule:
-    """Rule that makes a column of the project from a column of the vendor: scale * column + offset.
+    """Rule that makes a column of the project from a column of the vendor: scale * column + offset."""
 
-    Attributes:
-        name: Name of the project's column.
-        content: "length", "angle", "number" or "text".
-        unit: Unit of the vendor's column and of the offset.
-        source_column: Header of the vendor's column, or its number counted from 1.
-        scale: Factor.
-        offset: Summand, in `unit`.
-    """
-
-    name: str
-    content: str
-    unit: str
-    source_column: str | int
-    scale: float = 1.0
-    offset: float = 0.0
+    name: str  # Name of the project's column
+    content: str  # "length", "angle", "number" or "text"
+    unit: str  # Unit of the vendor's column and of the offset
+    source_column: str | int  # Header of the vendor's column, or its number counted from 1
+    scale: float = 1.0  # Factor
+    offset: float = 0.0  # Summand, in `unit`
 
 
 @dataclass(frozen=True)
 class Rotation:
-    """Notation of a rotation. Keys that the convention does not need are empty.
+    """Notation of a rotation. Keys that the convention does not need are empty."""
 
-    Attributes:
-        convention: "rotvec", "euler", "quaternion" or "matrix".
-        columns: Header or number of each of the vendor's columns.
-        unit: Unit of angles.
-        axes: Euler axes in lower case, such as "zyx".
-        frame: "intrinsic" or "extrinsic".
-        order: "wxyz" or "xyzw".
-    """
-
-    convention: str
-    columns: tuple[str | int, ...]
-    unit: str = ""
-    axes: str = ""
-    frame: str = ""
-    order: str = ""
+    convention: str  # "rotvec", "euler", "quaternion" or "matrix"
+    columns: tuple[str | int, ...]  # Header or number of each of the vendor's columns
+    unit: str = ""  # Unit of angles
+    axes: str = ""  # Euler axes in lower case, such as "zyx"
+    frame: str = ""  # "intrinsic" or "extrinsic"
+    order: str = ""  # "wxyz" or "xyzw"
 
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Checked content of a column map.
+    """Checked content of a column map."""
 
-    Attributes:
-        source: Name of the map's file.
-        rules: Columns of the project that are columns of the vendor.
-        rotation: Notation of the rotation; None if the file has none.
-        constants: Columns of the project that have one text for the whole file.
-        layout: How the file is divided into cells.
-    """
-
-    source: str
-    rules: tuple[ColumnRule, ...]
-    rotation: Rotation | None
-    constants: Mapping[str, str]
-    layout: TextLayout
+    source: str  # Name of the map's file
+    rules: tuple[ColumnRule, ...]  # Columns of the project that are columns of the vendor
+    rotation: Rotation | None  # Notation of the rotation; None if the file has none
+    constants: Mapping[str, str]  # Columns of the project that have one text for the whole file
+    layout: TextLayout  # How the file is divided into cells
 
 
 # --- reading a map ---------------------------------------------------------------------------------

@@ -23,15 +23,10 @@ _TIME = re.compile(r"(\d{9,})(?:\.(\d+)|_(\d{9}))?(?!.*\d{9})")
 
 
 class RecordedImages(NamedTuple):
-    """Joint values of images.
+    """Joint values of images."""
 
-    Attributes:
-        joints: Cells of the joint columns by header, for the name of each image.
-        notes: Sentences on images during which the robot moved.
-    """
-
-    joints: dict[str, dict[str, str]]
-    notes: list[str]
+    joints: dict[str, dict[str, str]]  # Cells of the joint columns by header, for the name of each image
+    notes: list[str]  # Sentences on images during which the robot moved
 
 
 def image_time(name: str) -> float | None:

@@ -27,14 +27,9 @@ _MAX_LISTED_NAMES = 30
 
 @dataclass(frozen=True)
 class _VendorTable:
-    """File of another maker with the map of its columns.
+    """File of another maker with the map of its columns."""
 
-    Attributes:
-        table: Table of the file.
-        column_map: Map of its columns.
-    """
-
-    table: DataTable
+    table: DataTable  # Table of the file
     column_map: ColumnMap
 
     def column_index(self, name: str | int) -> int | None:

@@ -43,55 +43,33 @@ _MAX_INTERRUPTION_S = 1.0
 
 @dataclass(frozen=True, eq=False)
 class JointSeries:
-    """Recorded joint positions.
-
-    Attributes:
-        names: Names of the joints.
-        times: Times, ascending, shape (k,) [s].
-        q: Joint positions, shape (k, n) [rad or m].
-    """
+    """Recorded joint positions."""
 
     names: tuple[str, ...]
-    times: Array
-    q: Array
+    times: Array  # Times, ascending, shape (k,) [s]
+    q: Array  # Joint positions, shape (k, n) [rad or m]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSeries:
-    """Recorded positions or poses of the tool.
+    """Recorded positions or poses of the tool."""
 
-    Attributes:
-        times: Times, ascending, shape (p,) [s].
-        positions: Positions, shape (p, 3) [m].
-        rotations: Rotations, shape (p, 3, 3); None for a series of positions.
-        frame: Name of the frame that they are measured in.
-    """
-
-    times: Array
-    positions: Array
-    rotations: Array | None
-    frame: str
+    times: Array  # Times, ascending, shape (p,) [s]
+    positions: Array  # Positions, shape (p, 3) [m]
+    rotations: Array | None  # Rotations, shape (p, 3, 3); None for a series of positions
+    frame: str  # Name of the frame that they are measured in
 
 
 @dataclass(frozen=True, eq=False)
 class Stops:
-    """Mean joint positions and poses of each stop.
+    """Mean joint positions and poses of each stop."""
 
-    Attributes:
-        times: Middle of each stop in the clock of the joints, shape (m,) [s].
-        q: Joint positions, shape (m, n) [rad or m].
-        positions: Positions, shape (m, 3) [m].
-        rotations: Rotations, shape (m, 3, 3); None for a series of positions.
-        clock_offset: Clock of the poses minus that of the joints [s].
-        n_without_poses: Number of standstills of the joints without a pose, which are left out.
-    """
-
-    times: Array
-    q: Array
-    positions: Array
-    rotations: Array | None
-    clock_offset: float
-    n_without_poses: int
+    times: Array  # Middle of each stop in the clock of the joints, shape (m,) [s]
+    q: Array  # Joint positions, shape (m, n) [rad or m]
+    positions: Array  # Positions, shape (m, 3) [m]
+    rotations: Array | None  # Rotations, shape (m, 3, 3); None for a series of positions
+    clock_offset: float  # Clock of the poses minus that of the joints [s]
+    n_without_poses: int  # Number of standstills of the joints without a pose, which are left out
 
 
 def find_stops(joints: JointSeries, poses: PoseSeries) -> Stops:

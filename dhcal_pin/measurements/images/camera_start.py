@@ -58,43 +58,27 @@ _agreeing_points = _remember(agreeing_points)
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """Boards in images, each from its image alone: the joint values have no influence.
+    """Boards in images, each from its image alone: the joint values have no influence."""
 
-    Attributes:
-        lenses: Values of the lens of each camera.
-        sample: First sample of each view of a board, (v,).
-        poses: Poses of the board in the camera that explain the image, the better one first, (v, 2, 4, 4)
-            [m]. Both are the same if there is only one.
-        rms: RMS distance of its corners in the image with the better one, X/Z and Y/Z, (v,).
-    """
-
-    lenses: list[Array]
-    sample: Array
+    lenses: list[Array]  # Values of the lens of each camera
+    sample: Array  # First sample of each view of a board, (v,)
+    # Poses of the board in the camera that explain the image, the better one first, (v, 2, 4, 4) [m]. Both
+    # are the same if there is only one.
     poses: Array
-    rms: Array
+    rms: Array  # RMS distance of its corners in the image with the better one, X/Z and Y/Z, (v,)
 
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """Image coordinates of m corners.
+    """Image coordinates of m corners."""
 
-    Attributes:
-        q: Joint positions, (m, n) [rad or m].
-        values: Image coordinates, (m, 2) [px].
-        rig: Cameras and boards on the chain.
-        camera: Number of the camera of each corner, (m,).
-        board: Number of the board of each corner, (m,).
-        corner: Number of each corner on its board, (m,).
-        image: Number of the image of each corner, (m,).
-    """
-
-    q: Array
-    values: Array
-    rig: MountedRig
-    camera: Array
-    board: Array
-    corner: Array
-    image: Array
+    q: Array  # Joint positions, (m, n) [rad or m]
+    values: Array  # Image coordinates, (m, 2) [px]
+    rig: MountedRig  # Cameras and boards on the chain
+    camera: Array  # Number of the camera of each corner, (m,)
+    board: Array  # Number of the board of each corner, (m,)
+    corner: Array  # Number of each corner on its board, (m,)
+    image: Array  # Number of the image of each corner, (m,)
 
 
 def estimate_views(item: Corners) -> BoardViews:
