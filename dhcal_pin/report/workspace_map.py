@@ -14,18 +14,11 @@ from .. import se3
 from ..calibration.evaluation import position_errors
 from ..calibration.presentation.workspace import RELATIVE_TEXT, WorkspaceMap, predict_workspace, workspace_map
 from ..estimation.uncertainty import Predictor
-from ..exceptions import InvalidArgumentError
 from ..io.tabular import csv_text
 from ..measurements.base import Measurement
 from .document import Document, Section
 from .figures import workspace_maps
 from .html import html_page
-
-
-def check_map_ending(path: str) -> None:
-    """Raise an error if a path is neither that of a CSV file nor that of an HTML file."""
-    if not path.lower().endswith((".csv", ".html")):
-        raise InvalidArgumentError(f"{path}: unknown ending; write a map as .csv or .html")
 
 
 def map_content(

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
 from ..options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SKIP_BAD_ROWS, add_urdf_options
+from ..output_table import Output
 
 if TYPE_CHECKING:
-    from ...calibration import Accuracy
+    from ...calibration import Accuracy, Result
     from ...estimation.uncertainty import Predictor
     from ...io import MeasurementFile
-    from ...measurements import Measurement, MountedRig
+    from ...measurements import MeasuredRegion, Measurement, MountedRig
+    from ...report.validation import Validation
     from ...robot import Chain
 
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
@@ -56,33 +58,129 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--json", **JSON)
 
 
+class Given(NamedTuple):
+    """Robot and measurements of a validation, as the files state them."""
+
+    chain: Chain
+    files: list[MeasurementFile]
+    known: dict[str, float]  # Values of instrument parameters that the calibration estimated [m or rad]
+    rig: MountedRig | None
+    estimated: list[str]  # Cameras and boards of the rig that the calibration estimated
+    region: MeasuredRegion | None  # Measured region of the calibration
+    predictor: Predictor | None  # Uncertainty of the robot, for maps
+
+    @property
+    def data(self) -> list[Measurement]:
+        """Samples of each file."""
+        return [file.data for file in self.files]
+
+
+class Judged(NamedTuple):
+    """Robot with the base and tool that it is judged with, and the accuracies that are compared."""
+
+    chain: Chain
+    known: Mapping[str, float]  # Values of instrument parameters [m or rad]
+    fit: Result | None  # Fit of base and tool, on request
+    before: Accuracy
+    accuracies: dict[str, Accuracy]  # Accuracy by the name of the model; the last one is that of `chain`
+    reference: tuple[Chain, Mapping[str, float]] | None = None  # Nominal robot and its instrument parameters
+    remarks: Sequence[str] = ()
+
+
+class Validated(NamedTuple):
+    """Result of a validation, from which its output files are made."""
+
+    report: Validation
+    predictor: Predictor | None
+
+
+def _map_content(done: Validated, path: str) -> str:
+    from ...report.workspace_map import map_content  # lazy import: only for maps
+
+    assert done.predictor is not None
+    return map_content(path, done.predictor, done.report.data, done.report.known)
+
+
+def _report_content(done: Validated, path: str) -> str:
+    from ...report.validation import validation_page  # lazy import: only for reports
+
+    return validation_page(done.report)
+
+
+OUTPUTS: dict[str, Output[Validated]] = {
+    "json": Output(None),
+    "map": Output(_map_content, "a map", (".csv", ".html")),
+    "report": Output(_report_content, "the report of a validation", (".html",), (".htm",)),
+}
+
+
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...calibration import accuracy  # lazy import, as the following: they load Pinocchio
-    from ...diagnostics import FRAMES_WARNING, find_extrapolation, fit_frames, frames_differ
-    from ...io import (
-        existing_sidecar,
-        read_instrument,
-        read_measured_region,
-        read_measurement_file,
-        read_robot,
-    )
-    from ...measurements.position import require_common_reference_target
-    from ...report.html import check_html_ending
-    from ...report.json_document import main_statistics, result_to_dict, validation_to_dict
+    from ...diagnostics import find_extrapolation  # lazy import, as the following: they load Pinocchio
+    from ...io import existing_sidecar, robot_name
     from ...report.provenance import file_digests
-    from ...report.workspace_map import map_content
-    from ..outputs import existing_sidecars, json_path, require_writable_outputs, write_outputs
+    from ...report.validation import Validation
+    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
+    from ..outputs import require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
-    robots = [args.robot, args.nominal] if args.nominal else [args.robot]
-    given = filter(None, (sidecar, args.columns, args.rig))
-    inputs = [*robots, *args.data, *given, *existing_sidecars(robots[1:])]
-    require_writable_outputs([args.json, args.map, args.report], inputs)
-    if args.report:
-        check_html_ending(args.report, "the report of a validation")
+    inputs, outputs = _input_paths(args, sidecar), chosen_files(vars(args), OUTPUTS)
+    require_writable_outputs([file.path for file in outputs], inputs)
+    require_endings(outputs)
+    given = _read_input(args, sidecar)
+    judged = _judge(args, given)
+    data, accuracies = given.data, judged.accuracies
+    warnings = _input_warnings(args, given, judged)
+    notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
+    extrapolation = given.region and find_extrapolation(given.region, judged.chain, data, judged.known)
+    report = Validation(
+        robot_name(args.robot),
+        judged.chain,
+        data,
+        judged.known,
+        args.data,
+        accuracies,
+        judged.reference,
+        [
+            *judged.remarks,
+            *(extrapolation.sentences if extrapolation else ()),
+            *_rig_remarks(args, given, sidecar),
+        ],
+        [f"{path}: {text}" for path, texts in warnings.items() for text in texts],
+        notes,
+        file_digests(inputs),
+    )
+    files = paths_by_name(outputs)
+    document = _document(report, judged) | {
+        "estimated_entries": given.estimated,
+        "warnings": [*notes, *report.warnings],
+        "measured_region": extrapolation and extrapolation.to_dict(),
+        "files": files,
+    }
+    write_outputs(file_contents(outputs, Validated(report, given.predictor)), args.json, document)
+    title = f"{args.robot}: accuracy on {document['samples']} samples"
+    shown = {name: path for name, path in files.items() if name != "json"}
+    screen = validation_screen(title, accuracies, report.remarks, notes, warnings, shown)
+    console.show(screen, args.verbosity)
+    return 0
+
+
+def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
+    """List the files that a validation reads."""
+    from ..outputs import existing_sidecars  # lazy import: loads Pinocchio
+
+    nominal = [args.nominal] if args.nominal else []
+    others = filter(None, (sidecar, args.columns, args.rig))
+    return [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
+
+
+def _read_input(args: Namespace, sidecar: str | None) -> Given:
+    """Read robot and measurements, and what a calibration has written beside the robot."""
+    from ...io import read_instrument, read_measured_region, read_measurement_file, read_robot
+    from ...measurements.position import require_common_reference_target
+
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
     rig, estimated = _mounted_rig(args, sidecar, chain)
     predictor = _predictor(chain, sidecar, args) if args.map else None
@@ -90,86 +188,60 @@ def run(args: Namespace) -> int:
         read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig)
         for path in args.data
     ]
-    data = [file.data for file in files]
     instrument = read_instrument(sidecar) if sidecar else {}
-    used = {parameter.name for item in data for parameter in item.instrument_parameters}
-    require_common_reference_target(dict(zip(args.data, data, strict=True)), instrument)
+    require_common_reference_target({file.source: file.data for file in files}, instrument)
+    used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
     known = {name: value for name, value in instrument.items() if name in used}
-    given = accuracy(chain, data, known)
-    unstated = _unstated_entries(rig) if rig else []
-    accuracies = {"fitted to these images" if unstated else "base and tool as given": given}
+    region = read_measured_region(sidecar, chain) if sidecar else None
+    return Given(chain, files, known, rig, estimated, region, predictor)
+
+
+def _judge(args: Namespace, given: Given) -> Judged:
+    """Compute the accuracies that are compared, with base and tool as given or fitted."""
+    from ...calibration import accuracy  # lazy import, as the following: they load Pinocchio
+    from ...diagnostics import fit_frames
+
+    chain, data, known = given.chain, given.data, given.known
+    before = accuracy(chain, data, known)
+    name = "fitted to these images" if _unstated_entries(given.rig) else "base and tool as given"
+    judged = Judged(chain, known, None, before, {name: before})
     if args.fit_frames:
         fit = fit_frames(chain, data, known)
-        chain, known = fit.chain, known | fit.instruments
-        accuracies["base and tool fitted"] = fit.comparisons[-1].after
-        document = result_to_dict(fit, {}, file_digests(inputs), is_calibration=False)
+        accuracies = {name: before, "base and tool fitted": fit.comparisons[-1].after}
+        judged = Judged(fit.chain, known | fit.instruments, fit, before, accuracies)
+    if not args.nominal:
+        return judged
+    nominal, reference, remarks = _nominal_accuracy(judged.chain, data, judged.known, args)
+    accuracies = {"nominal": nominal, "calibrated": list(judged.accuracies.values())[-1]}
+    return judged._replace(before=nominal, accuracies=accuracies, reference=reference, remarks=remarks)
+
+
+def _document(report: Validation, judged: Judged) -> dict[str, Any]:
+    """Create the part of the JSON document that a calibration has, too."""
+    from ...report.json_document import main_statistics, result_to_dict, validation_to_dict
+
+    if judged.fit:
+        document = result_to_dict(judged.fit, {}, report.inputs, is_calibration=False)
     else:
-        document = validation_to_dict(chain, data, file_digests(inputs), known)
-    document["before"] = main_statistics(given)
-    document["estimated_entries"] = estimated
-    remarks: list[str] = []
-    reference = None
-    if args.nominal:
-        nominal, reference, remarks = _nominal_accuracy(chain, data, known, args)
-        document["before"] = main_statistics(nominal)
-        accuracies = {"nominal": nominal, "calibrated": list(accuracies.values())[-1]}
-    warnings = {file.source: _input_warnings(chain, file, args.fit_frames) for file in files}
-    if not args.fit_frames and frames_differ(chain, data, known):
-        warnings[args.robot] = [FRAMES_WARNING]
-    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    document["warnings"] = notes + [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
-    region = read_measured_region(sidecar, chain) if sidecar else None
-    extrapolation = find_extrapolation(region, chain, data, known) if region else None
-    document["measured_region"] = extrapolation and extrapolation.to_dict()
-    path = json_path(args.json)
-    document["files"] = {"json": path} if path else {}
-    contents = {}
-    if predictor:
-        document["files"]["map"] = args.map
-        contents[args.map] = map_content(args.map, predictor, data, known)
-    remarks += extrapolation.sentences if extrapolation else ()
-    if unstated:
+        document = validation_to_dict(report.chain, report.data, report.inputs, report.known)
+    return document | {"before": main_statistics(judged.before)}
+
+
+def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str]:
+    """Say which cameras and boards were fitted to the images, and which a calibration estimated."""
+    remarks = []
+    if unstated := _unstated_entries(given.rig):
         remarks.append(
             f"Poses or lenses of {', '.join(unstated)} are not stated and were fitted to these images; other "
             "images have larger errors."
         )
-    if estimated:
+    if given.estimated:
         others = f", not those of {args.rig}" if args.rig else ""
         remarks.append(
-            f"Poses, lenses and corners of {', '.join(estimated)} are the estimates of the calibration "
+            f"Poses, lenses and corners of {', '.join(given.estimated)} are the estimates of the calibration "
             f"({sidecar}){others}."
         )
-    if args.report:
-        from ...io.robot import robot_name  # lazy import, as the following: only for reports
-        from ...report.validation import Validation, validation_page
-
-        document["files"]["report"] = args.report
-        contents[args.report] = validation_page(
-            Validation(
-                robot_name(args.robot),
-                chain,
-                data,
-                known,
-                args.data,
-                accuracies,
-                reference,
-                remarks,
-                document["warnings"][len(notes) :],
-                notes,
-                file_digests(inputs),
-            )
-        )
-    write_outputs(contents, args.json, document)
-    screen = validation_screen(
-        f"{args.robot}: accuracy on {document['samples']} samples",
-        accuracies,
-        remarks,
-        notes,
-        warnings,
-        {kind: file for kind, file in document["files"].items() if kind != "json"},
-    )
-    console.show(screen, args.verbosity)
-    return 0
+    return remarks
 
 
 def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[MountedRig | None, list[str]]:
@@ -198,8 +270,10 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
     return mount_rig(with_estimates_of(rig, calibrated, ends), chain), names
 
 
-def _unstated_entries(rig: MountedRig) -> list[str]:
+def _unstated_entries(rig: MountedRig | None) -> list[str]:
     """Return the cameras without a pose or a lens and the boards without a pose, such as `camera.wrist`."""
+    if rig is None:
+        return []
     return [
         *(f"camera.{each.name}" for each in rig.cameras if each.pose is None or not each.has_intrinsics),
         *(f"board.{each.name}" for each in rig.boards if each.pose is None),
@@ -231,24 +305,28 @@ def _nominal_accuracy(
     return fit.comparisons[-1].after, (fit.chain, {**known, **fit.instruments}), [note]
 
 
-def _input_warnings(chain: Chain, file: MeasurementFile, has_unknown_frames: bool) -> list[str]:
-    """List the warnings about a file, rows that the robot cannot reach included; no row is excluded."""
-    from ...diagnostics.input_checks import find_input_warnings  # lazy import: loads Pinocchio
+def _input_warnings(args: Namespace, given: Given, judged: Judged) -> dict[str, list[str]]:
+    """List the warnings about each file, rows that the robot cannot reach included; no row is excluded."""
+    from ...diagnostics import FRAMES_WARNING, frames_differ  # lazy import, as the following
+    from ...diagnostics.input_checks import find_input_warnings
     from ...diagnostics.reachability import find_unreachable_rows
 
-    unreachable = [] if has_unknown_frames else find_unreachable_rows(chain, file)
-    return [
-        *find_input_warnings(chain, file),
-        *(f"line {item.row}: {item.reason}" for item in unreachable),
-    ]
+    warnings = {}
+    for file in given.files:
+        unreachable = [] if args.fit_frames else find_unreachable_rows(judged.chain, file)
+        warnings[file.source] = [
+            *find_input_warnings(judged.chain, file),
+            *(f"line {item.row}: {item.reason}" for item in unreachable),
+        ]
+    if not args.fit_frames and frames_differ(judged.chain, given.data, judged.known):
+        warnings[args.robot] = [FRAMES_WARNING]
+    return warnings
 
 
 def _predictor(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
     """Read the uncertainty that the calibration has written beside the robot."""
     from ...io.sidecar import read_uncertainty  # lazy import: loads Pinocchio
-    from ...report.workspace_map import check_map_ending
 
-    check_map_ending(args.map)
     if args.fit_frames:
         raise InvalidArgumentError(
             "--map: not available with --fit-frames; the uncertainty holds for base and tool as calibrated"
