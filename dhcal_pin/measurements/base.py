@@ -181,9 +181,8 @@ class Measurement(ABC):
     def in_order(self) -> Self:
         """Return a copy whose samples are declared to be in the order of measurement.
 
-        Returns:
-            Copy with the number of each sample, and with the direction of the last motion of each joint, from
-            the sample before, unless the directions are known.
+        It has the number of each sample, and the direction of the last motion of each joint, from the sample
+        before, unless the directions are known.
         """
         known = self.recorded or Conditions(self.q)
         approach = known.approach if known.approach is not None else directions_in_order(self.q)
@@ -205,11 +204,7 @@ class Measurement(ABC):
         return values
 
     def replace(self, **values: Any) -> Self:
-        """Return a copy with other values of some attributes, which are not checked.
-
-        Args:
-            **values: New values by attribute name.
-        """
+        """Return a copy with other values of some attributes, given by their names, which are not checked."""
         copy = object.__new__(type(self))
         known = self.__dict__
         # Attributes only: cached properties must not be copied.
@@ -217,37 +212,21 @@ class Measurement(ABC):
         return copy
 
     def take(self, index: Array | slice) -> Self:
-        """Return the samples of an index, mask or slice.
-
-        Args:
-            index: Indices or mask along the samples.
-        """
+        """Return the samples of an index, mask or slice."""
         parts = {name: getattr(self, name)[index] for name in self.sample_fields}
         return self.replace(**parts, recorded=self.recorded[index] if self.recorded else None)
 
     def resample(self, q: Array) -> Self:
-        """Return the same measurement at other joint positions, with unchanged measured values.
-
-        Args:
-            q: Joint positions, (c·m, n) as `configurations` returns them [rad or m].
-        """
+        """Return the same measurement at other joint positions, (c·m, n) as `configurations` returns them."""
         return self.replace(q=q)
 
     @abstractmethod
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
-        """Return a copy whose standard deviations are multiplied by a factor per residual group.
-
-        Args:
-            scales: Factor of each name in `residual_groups`.
-        """
+        """Return a copy with standard deviations times a factor for each name in `residual_groups`."""
 
     @abstractmethod
     def with_weights(self, weights: Array) -> Self:
-        """Return a copy whose standard deviations are divided by the square roots of sample weights.
-
-        Args:
-            weights: Weight of each sample, (m,).
-        """
+        """Return a copy whose standard deviations are divided by the square roots of sample weights, (m,)."""
 
     # ------------------------------------------------------------------------------------------- model
     @property
@@ -288,13 +267,9 @@ class Measurement(ABC):
         return 0
 
     def images_within(self, is_chosen: Array) -> list[str]:
-        """Return the names of the images all of whose corners are among some of the samples.
+        """Return the names of the images all of whose corners are among the chosen samples, a mask (m,).
 
-        Args:
-            is_chosen: Whether each sample is among them, (m,).
-
-        Returns:
-            Names of the images, empty texts for images without a name.
+        Names are empty for images without a name.
         """
         return []
 
@@ -303,19 +278,11 @@ class Measurement(ABC):
         return np.full(len(self.rows), "", object)
 
     def solved_rig(self, values: Mapping[str, float]) -> MountedRig | None:
-        """Return the rig with estimated poses, lenses and corners; None for kinds without a rig.
-
-        Args:
-            values: Values of all instrument parameters by name [m, rad, px or 1].
-        """
+        """Return the rig with estimated poses, lenses and corners; None for kinds without a rig."""
         return None
 
     def set_of(self, name: str) -> str:
-        """Return the parameter set of an instrument parameter; empty if it belongs to none.
-
-        Args:
-            name: Name of the parameter.
-        """
+        """Return the parameter set of the instrument parameter of a name; empty if it belongs to none."""
         return ""
 
     @property
@@ -332,11 +299,7 @@ class Measurement(ABC):
         return self
 
     def initialized(self, chain: Chain) -> Self:
-        """Return a copy with initial values of the instrument parameters.
-
-        Args:
-            chain: Robot whose tool poses the initial values are fitted to.
-        """
+        """Return a copy whose instrument parameters are initialized from the tool poses of a robot."""
         return self
 
     def initialized_from(self, chain: Chain, is_used: Array) -> Self:
@@ -482,11 +445,7 @@ class Measurement(ABC):
 
     @classmethod
     def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
-        """Return those of `COLUMNS` that a file of this kind uses.
-
-        Args:
-            values: Columns of the file by name.
-        """
+        """Return those of `COLUMNS` that a file of this kind with these columns uses."""
         return tuple(column for column in cls.COLUMNS if column.is_implied or column.name in values)
 
     def to_columns(self) -> dict[str, Any]:

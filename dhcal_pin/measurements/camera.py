@@ -210,16 +210,7 @@ class CameraCorners(Measurement):
     def from_columns(
         cls, q: Sequence[Array], values: Mapping[str, Any], rig: MountedRig | None = None
     ) -> Self:
-        """Return the measurements of a file.
-
-        Args:
-            q: Joint positions, (m, n) [rad or m].
-            values: Columns by name.
-            rig: Cameras and boards on the chain.
-
-        Raises:
-            InvalidArgumentError: There is no rig.
-        """
+        """Return the measurements of a file, which need a rig."""
         if rig is None:
             raise InvalidArgumentError(
                 "image coordinates need the cameras and boards of a rig; give --rig RIG.toml"
@@ -229,10 +220,7 @@ class CameraCorners(Measurement):
     def with_rig(self, rig: MountedRig) -> Self:
         """Return a copy with other properties of the same cameras and boards.
 
-        Values of parameters that both rigs have are kept.
-
-        Args:
-            rig: Rig with the same names, links and lenses.
+        Names, links and lenses are the same. Values of parameters that both rigs have are kept.
         """
         known = {p.name: p.nominal for p in self.instrument_parameters}
         parameters = tuple(
@@ -242,11 +230,7 @@ class CameraCorners(Measurement):
         return self.replace(rig=rig, instrument_parameters=parameters)
 
     def with_values(self, values: Mapping[str, float]) -> Self:
-        """Return a copy whose instrument parameters start from given values.
-
-        Args:
-            values: Values by name [m, rad, px or 1]; parameters without one keep theirs.
-        """
+        """Return a copy whose instrument parameters start from the values that are given by name."""
         parameters = tuple(
             replace(p, nominal=float(values.get(p.name, p.nominal))) for p in self.instrument_parameters
         )
@@ -280,14 +264,10 @@ class CameraCorners(Measurement):
         }
 
     def set_of(self, name: str) -> str:
-        """Return the parameter set of an instrument parameter.
+        """Return the parameter set of an instrument parameter such as `camera_wrist.fx`.
 
-        Args:
-            name: Name such as `camera_wrist.fx`.
-
-        Returns:
-            "camera" or "board" for a component of a pose, "intrinsics" for a value of a lens, "points" for a
-            coordinate of a corner.
+        It is "camera" or "board" for a component of a pose, "intrinsics" for a value of a lens, "points" for
+        a coordinate of a corner.
         """
         entry, _, component = name.rpartition(".")
         kind = entry.partition("_")[0]
@@ -296,11 +276,7 @@ class CameraCorners(Measurement):
         return "intrinsics" if kind == "camera" else POINTS_SET
 
     def solved_rig(self, values: Mapping[str, float]) -> MountedRig:
-        """Return the rig with estimated poses, lenses and corners.
-
-        Args:
-            values: Values of all instrument parameters by name [m, rad, px or 1].
-        """
+        """Return the rig with estimated poses, lenses and corners."""
         u = np.array([values[p.name] for p in self.instrument_parameters])
         parts = self._split(u)
         poses = [[se3.transform(se3.exp3(part[3:6]), part[:3]) for part in group] for group in parts]
@@ -348,14 +324,7 @@ class CameraCorners(Measurement):
         return self.image_names
 
     def images_within(self, is_chosen: Array) -> list[str]:
-        """Return the names of the images all of whose corners are among some of the samples.
-
-        Args:
-            is_chosen: Whether each sample is among them, (m,).
-
-        Returns:
-            Names of the images, empty texts for images without a name.
-        """
+        """Return the names of the images all of whose corners are among the chosen samples."""
         return [self.image_labels[number] for number in whole_images(self.image, is_chosen)]
 
     @cached_property
@@ -403,11 +372,7 @@ class CameraCorners(Measurement):
         return parts[: len(self.rig.cameras)], parts[len(self.rig.cameras) :]
 
     def lens_values(self, u: Array) -> list[Array]:
-        """Return the values of the lens of each camera.
-
-        Args:
-            u: Values of the instrument parameters, (s,).
-        """
+        """Return the values of the lens of each camera from the instrument parameters u."""
         parts = self._split(u)[0]
         return [
             part[6:] if camera.intrinsics != "fixed" else camera.values
@@ -415,11 +380,7 @@ class CameraCorners(Measurement):
         ]
 
     def points(self, u: Array) -> list[Array]:
-        """Return the corners of each board in its frame, (c, 3) [m] each.
-
-        Args:
-            u: Values of the instrument parameters, (s,).
-        """
+        """Return the corners of each board in its frame, (c, 3) [m], from the instrument parameters u."""
         parts = self._split(u)[1]
         return [
             part[6:].reshape(-1, 3) if board.has_free_points else board.points

@@ -162,13 +162,7 @@ class PointDistance(PointMeasurement):
     def from_columns(
         cls, q: Sequence[Array], values: Mapping[str, Any], rig: MountedRig | None = None
     ) -> Self:
-        """Return the distances of a file.
-
-        Args:
-            q: Joint positions of any values, (m, n).
-            values: Columns by name.
-            rig: Not used.
-        """
+        """Return the distances of a file."""
         arguments = cls._arguments(values)
         pairs = list(zip(arguments.pop("point_a"), arguments.pop("point_b"), strict=True))
         return cls(q[0].shape[1], pairs, **arguments)

@@ -181,13 +181,7 @@ class Inclination(Measurement):
 
     @classmethod
     def from_columns(cls, q: Any, values: Mapping[str, Any], rig: Any = None) -> Self:
-        """Return the measurements of a file with angles or with accelerations.
-
-        Args:
-            q: Joint positions, (m, n) [rad or m].
-            values: Columns by name.
-            rig: Not used.
-        """
+        """Return the measurements of a file with angles or with accelerations."""
         arguments = cls._arguments(values)
         return (cls.from_acceleration if "acceleration" in arguments else cls)(q[0], **arguments)
 
@@ -208,11 +202,7 @@ class Inclination(Measurement):
         return self.body
 
     def mounted(self, chain: Chain) -> Self:
-        """Return a copy that knows the body of a robot that carries the sensor.
-
-        Args:
-            chain: Robot with the link.
-        """
+        """Return a copy that knows the body of a robot that carries the sensor."""
         body, pose = chain.link_in_body(self.link or chain.tip)
         return self.replace(body=body, link_rotation=pose[:3, :3])
 

@@ -101,14 +101,7 @@ class Wires(PointMeasurement):
 
     @classmethod
     def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
-        """Return the columns `length` or L1, L2, ... that the file has.
-
-        Args:
-            values: Columns of the file by name.
-
-        Raises:
-            InvalidArgumentError: The wires are not numbered without a gap.
-        """
+        """Return the columns `length` or L1, L2, ... of a file, which are numbered without a gap."""
         single, *numbered = cls.COLUMNS
         if single.name in values:
             return (single,)

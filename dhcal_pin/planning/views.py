@@ -85,11 +85,7 @@ class PlannedImages:
             )
 
     def with_free_points(self, boards: Collection[str]) -> PlannedImages:
-        """Return a copy whose corners of some boards are unknowns.
-
-        Args:
-            boards: Names of the boards; the corners of all others are taken as exact.
-        """
+        """Return a copy whose corners of some boards are unknowns; those of all others are taken as exact."""
         changed = tuple(replace(board, has_free_points=board.name in boards) for board in self.rig.boards)
         return replace(self, rig=replace(self.rig, boards=changed))
 
@@ -129,22 +125,11 @@ class PlannedImages:
         return ViewLimits(low, high, self.max_angle, self.min_share, margin)
 
     def in_view(self, tools: Array) -> Array:
-        """Return in which poses of the tool a board is in view, shape (m,).
-
-        Args:
-            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-        """
+        """Return in which poses of the tool, shape (m, 4, 4), a board is in view, shape (m,)."""
         return np.any([corners.any(1) for corners in self.visible_corners(tools)], 0)
 
     def visible_corners(self, tools: Array) -> list[Array]:
-        """Return which corners are in view.
-
-        Args:
-            tools: Poses of the tool in the measuring frame, shape (m, 4, 4) [m].
-
-        Returns:
-            For each of `pairs`, whether each corner is in view, shape (m, c).
-        """
+        """Return for each of `pairs` which corners are in view at the tool poses, shape (m, c)."""
         return [
             visible_corners(self.rig, *pair, self.rig.board_in_camera(*pair, tools), self.limits(*pair))
             for pair in self.pairs

@@ -218,13 +218,10 @@ class Chain:
         return Chain.from_urdf(self.urdf, self.tip, self.root)
 
     def origin_frame(self, j: int) -> int:
-        """Return the index of the error frame at the origin of a joint in the URDF.
+        """Return the index of the error frame at the URDF origin of the moving joint j, 1 to k.
 
-        Args:
-            j: Number of the moving joint, 1 to k.
-
-        Returns:
-            Frame before the motion of the joint; after it, if the joint is passed from child to parent.
+        It is the frame before the motion of the joint, or after it, if the joint is passed from child to
+        parent.
         """
         return link_frame(j) if j <= self.n_reversed else joint_frame(j)
 
@@ -313,28 +310,14 @@ class Chain:
         ]
 
     def configurations(self, q: ArrayLike) -> Array:
-        """Return Pinocchio configurations; joints that are not on the chain stay at neutral.
+        """Return Pinocchio configurations (m, nq) at the actual joint positions.
 
-        Args:
-            q: Commanded joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Configurations of `model` at the actual joint positions, shape (m, nq).
+        Joints that are not on the chain stay at neutral.
         """
         return self.loads.configurations(self.actual_positions(Conditions(self.validated_q(q)))[0])
 
     def validated_q(self, q: ArrayLike) -> Array:
-        """Return joint positions as an array after checking shape and values.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Joint positions as floats, shape (m, n).
-
-        Raises:
-            InvalidArgumentError: The shape is not (m, n), or a value is not finite.
-        """
+        """Return joint positions as floats (m, n); another shape or a value not finite is an error."""
         q = np.asarray(q, float)
         n = self.n_joints
         if q.ndim != 2 or q.shape[1] != n:
@@ -347,14 +330,7 @@ class Chain:
         return q
 
     def conditions(self, q: ArrayLike | Conditions) -> Conditions:
-        """Return conditions after checking the joint positions.
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m], or conditions with joint positions.
-
-        Returns:
-            Conditions of m samples.
-        """
+        """Return the conditions of m samples from joint positions, which are checked, or conditions."""
         if isinstance(q, Conditions):
             return replace(q, q=self.validated_q(q.q))
         return Conditions(self.validated_q(q))
@@ -362,11 +338,7 @@ class Chain:
     def actual_positions(self, conditions: Conditions) -> tuple[Array, Array | None]:
         """Compute the actual joint positions, which differ from the commanded ones by transmission errors.
 
-        Args:
-            conditions: Conditions of m samples, with the commanded joint positions.
-
-        Returns:
-            Actual positions, shape (n, m), and transmission terms, shape (t, n, m), or None for ideal joints.
+        They have shape (n, m). Transmission terms follow, shape (t, n, m), or None for ideal joints.
         """
         if self.transmission is None:
             return np.ascontiguousarray(conditions.q.T), None
@@ -374,17 +346,7 @@ class Chain:
         return terms[0] + self.transmission.errors(terms), terms
 
     def with_transmission(self, transmission: Transmission) -> Chain:
-        """Return a copy with other transmission errors.
-
-        Args:
-            transmission: Transmission errors of the independent joints.
-
-        Returns:
-            Copy of the chain.
-
-        Raises:
-            InvalidArgumentError: The type or the shape of the coefficients does not fit the chain.
-        """
+        """Return a copy with other transmission errors of the independent joints; they must fit the chain."""
         shape = (n_coefficients(len(self.moving_joints), self.n_joints),)
         if not isinstance(transmission, Transmission):
             raise InvalidArgumentError(
@@ -397,17 +359,7 @@ class Chain:
         return replace(self, transmission=transmission)
 
     def with_payload(self, payload: Payload | None) -> Chain:
-        """Return a copy with another payload, whose weight loads compliant joints.
-
-        Args:
-            payload: Point mass at the tip, or None.
-
-        Returns:
-            Copy of the chain.
-
-        Raises:
-            InvalidArgumentError: The payload is not a `Payload`.
-        """
+        """Return a copy with another payload, whose weight loads compliant joints, or None."""
         if not (payload is None or isinstance(payload, Payload)):
             raise InvalidArgumentError(
                 f"payload has type {type(payload).__name__}; expected a Payload or None"
@@ -451,14 +403,10 @@ class Chain:
         return np.concatenate([self.link_transforms[:-1], self.link_transforms[-1:] @ self.tool])
 
     def joint_state(self, q: ArrayLike | Conditions) -> SampleState:
-        """Compute positions, cosines and sines of the moving joints.
+        """Compute positions, cosines and sines of the moving joints from joint positions or conditions.
 
-        Args:
-            q: Joint positions, shape (m, n) [rad or m], or conditions with joint positions.
-
-        Returns:
-            Joint state that `forward_kinematics` accepts in the place of q. Errors of the geometry do not
-            change it, so one state serves a whole optimization.
+        `forward_kinematics` accepts this state in the place of q. Errors of the geometry do not change it, so
+        one state serves a whole optimization.
         """
         conditions = self.conditions(q)
         return self._joint_state(np.ascontiguousarray(conditions.q.T), conditions)
@@ -497,16 +445,11 @@ class Chain:
         return batch
 
     def growth_motions(self, frames: FrameBatch) -> Array:
-        """Compute the tool twist per relative growth of each link.
+        """Compute the tool twist per relative growth of each link, shape (k+1, 6, m).
 
-        Growth moves all that is behind a link along the link; it turns nothing. A link grows in front of the
-        next joint, the last one behind the motion of the last joint, in front of all errors of its own.
-
-        Args:
-            frames: Frames of this chain at m samples.
-
-        Returns:
-            Twists [v, ω] of the tool point in axes of the measuring frame, shape (k+1, 6, m).
+        The twists [v, ω] are those of the tool point in axes of the measuring frame. Growth moves all that is
+        behind a link along the link; it turns nothing. A link grows in front of the next joint, the last one
+        behind the motion of the last joint, in front of all errors of its own.
         """
         assert self.transmission is not None
         axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
@@ -522,17 +465,10 @@ class Chain:
             )
 
     def pose_in_tip(self, link: str) -> Array:
-        """Return the constant pose of another link in the tip link.
+        """Return the constant pose of another link in the tip link, shape (4, 4) [m].
 
-        Args:
-            link: Name of a link that no joint moves against the tip.
-
-        Returns:
-            Pose, shape (4, 4) [m].
-
-        Raises:
-            UnknownNameError: There is no such link.
-            InvalidArgumentError: A joint moves the link against the tip.
+        An unknown link is an `UnknownNameError`, one that a joint moves against the tip an
+        `InvalidArgumentError`.
         """
         self._require_link(link)
         pose = self.fixed_pose(self.tip, link)
@@ -562,17 +498,10 @@ class Chain:
         return (own.placement.inverse() * wanted.placement).homogeneous
 
     def link_in_body(self, link: str) -> tuple[int, Array]:
-        """Find the body of the chain that carries a link, for sensors on the link.
+        """Find the body of the chain, 1 to k, that carries a link, and the pose of the link in its frame.
 
-        Args:
-            link: Name of a link of the robot.
-
-        Returns:
-            Number of the body, 1 to k, and pose of the link in the frame of the body, shape (4, 4) [m].
-
-        Raises:
-            UnknownNameError: There is no such link.
-            InvalidArgumentError: No joint of the chain moves the link, or a joint off the chain moves it.
+        Sensors may be on such a link. An unknown link is an `UnknownNameError`. One that no joint of the
+        chain moves, or that a joint off the chain moves, is an `InvalidArgumentError`.
         """
         self._require_link(link)
         found = link_on_path(self.urdf, self.root, self.moving_joints, self.n_reversed, link)
@@ -694,17 +623,7 @@ class Chain:
         return np.tensordot(self.mimic_matrix, jacobian, (0, 0))
 
     def perturbed_at(self, motions: Mapping[int, Array]) -> Chain:
-        """Return a copy with perturbations M ← M·motion of some error frames.
-
-        Args:
-            motions: Rigid motion (4, 4) by index of the error frame.
-
-        Returns:
-            Perturbed chain.
-
-        Raises:
-            InvalidArgumentError: An index is not an error frame, or a motion does not have shape (4, 4).
-        """
+        """Return a copy with perturbations M ← M·motion of some error frames, given by index, (4, 4) each."""
         every = np.tile(np.eye(4), (self.tool_frame_index + 1, 1, 1))
         for frame, motion in motions.items():
             if not 0 <= frame <= self.tool_frame_index:
@@ -719,17 +638,7 @@ class Chain:
         return self.perturbed(every)
 
     def perturbed(self, motions: Array) -> Chain:
-        """Return a copy with perturbations M ← M·motion of all error frames.
-
-        Args:
-            motions: Rigid motions by index of the error frame, shape (2k+4, 4, 4).
-
-        Returns:
-            Perturbed chain.
-
-        Raises:
-            InvalidArgumentError: The motions have another shape.
-        """
+        """Return a copy with perturbations M ← M·motion of all error frames, shape (2k+4, 4, 4)."""
         if motions.shape != (self.tool_frame_index + 1, 4, 4):
             raise InvalidArgumentError(
                 f"motions have shape {motions.shape}; expected ({self.tool_frame_index + 1}, 4, 4)"

@@ -78,14 +78,7 @@ class Obstacle:
 
     @classmethod
     def floor(cls, height: float) -> Obstacle:
-        """Create the floor.
-
-        Args:
-            height: z of its surface in the frame of the root link [m].
-
-        Returns:
-            Obstacle of the name `FLOOR`.
-        """
+        """Create the floor from the height z of its surface in the frame of the root link [m]."""
         length, width, depth = _FLOOR_SIZE
         return cls.box(
             np.array([-length / 2, -width / 2, height - depth]),

@@ -107,17 +107,7 @@ class DHTable:
         return len(self.names)
 
     def rows(self, q: Array) -> Array:
-        """Compute the link transforms A_i (equation 1 of the paper).
-
-        Args:
-            q: Joint positions, shape (m, n) [rad or m].
-
-        Returns:
-            Link transforms, shape (m, n, 4, 4).
-
-        Raises:
-            InvalidArgumentError: The joint positions have another shape.
-        """
+        """Compute the link transforms A_i, shape (m, n, 4, 4) (equation 1 of the paper)."""
         q = np.asarray(q, float)
         if q.ndim != 2 or q.shape[1] != self.n_joints:
             raise InvalidArgumentError(f"q has shape {q.shape}; expected shape (m, {self.n_joints})")
@@ -144,14 +134,12 @@ class DHTable:
         return out @ self.tool
 
     def origins(self) -> Array:
-        """Compute the joint origins and the tool of the equivalent URDF.
+        """Compute the joint origins and the tool of the equivalent URDF, shape (n+1, 4, 4) [m].
 
-        Each joint moves about or along its own z axis. In the standard convention, the origin of joint 1 is
-        the base, the origin of joint i+1 is row i, and the tool contains row n. In the modified convention,
-        the origin of joint i is row i. Each entry of the table thus changes exactly one origin.
-
-        Returns:
-            Poses of joints 1 to n and of the tool, each in the frame before it, shape (n+1, 4, 4) [m].
+        Each pose is given in the frame before it. Each joint moves about or along its own z axis. In the
+        standard convention, the origin of joint 1 is the base, the origin of joint i+1 is row i, and the tool
+        contains row n. In the modified convention, the origin of joint i is row i. Each entry of the table
+        thus changes exactly one origin.
         """
         rows = self.rows(np.zeros((1, self.n_joints)))[0]
         if self.convention == "standard":

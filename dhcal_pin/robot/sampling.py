@@ -66,14 +66,7 @@ class WorkspaceConstraints:
         return (*floor, *self.obstacles)
 
     def contains(self, poses: Array) -> Array:
-        """Return which tool poses are inside the box and face the instrument.
-
-        Args:
-            poses: Tool poses, shape (m, 4, 4) [m].
-
-        Returns:
-            Whether each pose satisfies the constraints, shape (m,).
-        """
+        """Return which tool poses (m, 4, 4) are inside the box and face the instrument, shape (m,)."""
         points = poses[:, :3, 3]
         inside = np.ones(len(poses), bool)
         if self.box is not None:

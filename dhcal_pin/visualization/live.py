@@ -108,13 +108,9 @@ class Live:
     _window: _Window
 
     def show(self, q: Array) -> None:
-        """Move the robots to a configuration.
+        """Move the robots to a configuration of shape (n,) [rad or m].
 
-        Args:
-            q: Joint positions, shape (n,) [rad or m].
-
-        Raises:
-            DhcalError: The shape of q is wrong, or the server does not answer within 3 s.
+        A wrong shape, or a server that does not answer within 3 s, is a `DhcalError`.
         """
         for name, chain in self.arms.items():
             for number, pose in enumerate(_body_poses(chain, q)):

@@ -107,14 +107,7 @@ class BatchProblem:
         return len(self.chains)
 
     def take(self, members: Array) -> BatchProblem:
-        """Select problems.
-
-        Args:
-            members: Indices of shape (j,).
-
-        Returns:
-            Batch of j problems.
-        """
+        """Select problems by their indices."""
         return replace(
             self,
             chains=self.chains.take(members),
@@ -138,11 +131,7 @@ class BatchProblem:
         return q.reshape(-1, len(self), m, q.shape[-1])
 
     def count_rows(self) -> Array:
-        """Count the rows of each problem without padding.
-
-        Returns:
-            Counts of shape (b,).
-        """
+        """Count the rows of each problem without padding, shape (b,)."""
         first = self.take(np.array([0]))
         total = np.zeros(len(self), int)
         for item, n_padding in zip(first.data, self._padding(), strict=True):
@@ -156,14 +145,7 @@ class BatchProblem:
         return np.broadcast_to(self.n_padding, (len(self.data), len(self)))
 
     def cost(self, x: Array) -> Array:
-        """Compute the sums of squared whitened residuals and priors.
-
-        Args:
-            x: Unknowns of shape (b, p).
-
-        Returns:
-            Costs of shape (b,).
-        """
+        """Compute the sums of squared whitened residuals and priors at x of shape (b, p), shape (b,)."""
         chains = self.chains.at(x)
         total = np.sum((self.weights * x) ** 2, -1)
         for item in self.data:
