@@ -291,11 +291,7 @@ class Measurement(ABC):
         return None
 
     def mounted(self, chain: Chain) -> Self:
-        """Return a copy that knows the body that it observes; kinds that observe the tool are returned as is.
-
-        Args:
-            chain: Robot that was measured.
-        """
+        """Return a copy that knows the body that it observes; unchanged if it observes the tool."""
         return self
 
     def initialized(self, chain: Chain) -> Self:
@@ -315,11 +311,7 @@ class Measurement(ABC):
         return self.replace(**{name: getattr(part, name) for name in common})
 
     def matched_to(self, known: Mapping[str, float]) -> Self:
-        """Return a copy with the unknowns of a calibration, where it decides which ones there are.
-
-        Args:
-            known: Values of instrument parameters of the calibration by name.
-        """
+        """Return a copy with the unknowns of a calibration, if its known values decide on them."""
         return self
 
     @abstractmethod

@@ -41,21 +41,14 @@ _MAX_ITERATIONS = 40
 
 @dataclass(frozen=True)
 class BoardSize:
-    """Size of the boards that makes the correction of the arm far smaller.
+    """Size of the boards that makes the correction of the arm far smaller."""
 
-    Attributes:
-        size: Size relative to the stated one.
-        square: Stated size of the squares of the first board [m]; 0 if it has none.
-        stated: RMS correction of the lengths of the arm in prior standard deviations, with the stated size.
-        found: The same with the other size.
-        log_ratio: Logarithm of the ratio of the likelihoods of the two sizes.
-    """
-
-    size: float
-    square: float
+    size: float  # Size relative to the stated one
+    square: float  # Stated size of the squares of the first board [m]; 0 if it has none
+    # RMS correction of the lengths of the arm in prior standard deviations, with the stated size.
     stated: float
-    found: float
-    log_ratio: float
+    found: float  # The same with the other size
+    log_ratio: float  # Logarithm of the ratio of the likelihoods of the two sizes
 
     @property
     def is_decisive(self) -> bool:

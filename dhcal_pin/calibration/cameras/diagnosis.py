@@ -239,17 +239,11 @@ def _error_dict(error: ImageError) -> dict[str, Any]:
 # ---------------------------------------------------------------------------------------------- diagnosis
 @dataclass(frozen=True, eq=False)
 class HandEyeFit:
-    """Poses of cameras and boards on the nominal arm, and what their diagnosis needs.
+    """Poses of cameras and boards on the nominal arm, and what their diagnosis needs."""
 
-    Attributes:
-        fit: Fit of the poses with the nominal arm; only base and tool of the robot may be unknown.
-        position_std: Largest standard deviation of the position of a camera or a board [m].
-        holdout: Held-out images, for the order of all images.
-    """
-
-    fit: Fit
-    position_std: float
-    holdout: tuple[Measurement, ...]
+    fit: Fit  # Fit of the poses with the nominal arm; only base and tool of the robot may be unknown
+    position_std: float  # Largest standard deviation of the position of a camera or a board [m]
+    holdout: tuple[Measurement, ...]  # Held-out images, for the order of all images
 
     @cached_property
     def diagnosis(self) -> HandEyeDiagnosis | None:

@@ -40,22 +40,15 @@ class ChainBatch:
     """b chains with the joints and the p error parameters of one model.
 
     Arrays that are equal for all chains have an axis of length 1 in place of b.
-
-    Attributes:
-        model: Error model whose joints, limits, parameter names and error frames all chains share.
-        n_chains: Number b of chains.
-        base: Poses of the base links in the measuring frame, shape (b, 4, 4).
-        link_transforms: Transforms between the joint motions, with joint axes along z, shape (b, k+1, 4, 4).
-        tool: Poses of the measured points in the tip frames, shape (b, 4, 4).
-        twists: Twists [v, ω] of the parameters in frames with joint axes along z, shape (b, p, 6).
     """
 
-    model: ErrorModel
-    n_chains: int
-    base: Array
+    model: ErrorModel  # Error model whose joints, limits, parameter names and error frames all chains share
+    n_chains: int  # Number b of chains
+    base: Array  # Poses of the base links in the measuring frame, shape (b, 4, 4)
+    # Transforms between the joint motions, with joint axes along z, shape (b, k+1, 4, 4).
     link_transforms: Array
-    tool: Array
-    twists: Array
+    tool: Array  # Poses of the measured points in the tip frames, shape (b, 4, 4)
+    twists: Array  # Twists [v, ω] of the parameters in frames with joint axes along z, shape (b, p, 6)
 
     @classmethod
     def from_models(cls, models: Sequence[ErrorModel]) -> ChainBatch:

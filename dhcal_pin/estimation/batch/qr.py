@@ -30,16 +30,11 @@ class TriangularSystemBatch:
     """R factors of the whitened rows [J | r] of b problems.
 
     `qr.TriangularSystem` documents the members that both classes share, and why there are two.
-
-    Attributes:
-        r: R factors of the Jacobians, upper triangular, shape (b, p, p).
-        z: Right-hand sides, shape (b, p).
-        min_cost: Costs that remain after the best steps, shape (b,).
     """
 
-    r: Array
-    z: Array
-    min_cost: Array
+    r: Array  # R factors of the Jacobians, upper triangular, shape (b, p, p)
+    z: Array  # Right-hand sides, shape (b, p)
+    min_cost: Array  # Costs that remain after the best steps, shape (b,)
 
     @classmethod
     def from_r_factors(cls, rows: Array) -> TriangularSystemBatch:

@@ -53,34 +53,21 @@ MIN_SCALE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LinearizedRows:
-    """Linearized rows in coordinates y.
+    """Linearized rows in coordinates y."""
 
-    Attributes:
-        items: Rows [B | r] of each measurement, shape (u+1, k, m) each.
-        row_classes: Class of each residual of each measurement, shape (k,) each.
-        gram: Products BᵀB of each block, shape (b, u·u).
-        right: Products Bᵀr of each block, shape (b, u).
-        groups: Residuals of each measurement that make a block of each sample.
-        counts: Number of rows of each block, shape (b,).
-        sample: Sample of each block, shape (b,).
-        noise_class: Class of each block, shape (b,); all numbers from 0 to c-1 occur.
-        is_estimated: Whether the noise scale of each class can be estimated, shape (c,); otherwise it is 1.
-        information: Information of the priors, shape (u, u).
-        prior_right: Right-hand side of the priors, shape (u,).
-        strata: Samples of each stratum and the smallest number of them in a fit, g pairs.
-    """
-
-    items: tuple[Array, ...]
-    row_classes: tuple[Array, ...]
-    gram: Array
-    right: Array
-    groups: tuple[tuple[slice, ...], ...]
-    counts: Array
-    sample: Array
-    noise_class: Array
+    items: tuple[Array, ...]  # Rows [B | r] of each measurement, shape (u+1, k, m) each
+    row_classes: tuple[Array, ...]  # Class of each residual of each measurement, shape (k,) each
+    gram: Array  # Products BᵀB of each block, shape (b, u·u)
+    right: Array  # Products Bᵀr of each block, shape (b, u)
+    groups: tuple[tuple[slice, ...], ...]  # Residuals of each measurement that make a block of each sample
+    counts: Array  # Number of rows of each block, shape (b,)
+    sample: Array  # Sample of each block, shape (b,)
+    noise_class: Array  # Class of each block, shape (b,); all numbers from 0 to c-1 occur
+    # Whether the noise scale of each class can be estimated, shape (c,); otherwise it is 1.
     is_estimated: Array
-    information: Array
-    prior_right: Array
+    information: Array  # Information of the priors, shape (u, u)
+    prior_right: Array  # Right-hand side of the priors, shape (u,)
+    # Samples of each stratum and the smallest number of them in a fit, g pairs.
     strata: tuple[tuple[Array, int], ...]
 
     @property

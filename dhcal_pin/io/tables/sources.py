@@ -18,17 +18,11 @@ from .text import DETECTED, TextLayout, read_text_table
 
 
 class TableFormat(NamedTuple):
-    """File format of a table.
+    """File format of a table."""
 
-    Attributes:
-        name: Name in messages.
-        endings: Endings of file names, lower case; none for the format of all other files.
-        read: Function that reads a file.
-    """
-
-    name: str
-    endings: tuple[str, ...]
-    read: Callable[[PathLike, TextLayout], DataTable]
+    name: str  # Name in messages
+    endings: tuple[str, ...]  # Endings of file names, lower case; none for the format of all other files
+    read: Callable[[PathLike, TextLayout], DataTable]  # Function that reads a file
 
 
 FORMATS = (

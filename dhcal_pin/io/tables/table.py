@@ -36,17 +36,11 @@ MAX_LISTED_RUNS = 100
 
 @dataclass(frozen=True)
 class Column:
-    """Header entry `name[unit]`.
-
-    Attributes:
-        name: Name of the column.
-        unit: Unit in brackets; empty if the header has none.
-        index: Position in the header, counted from 0.
-    """
+    """Header entry `name[unit]`."""
 
     name: str
-    unit: str
-    index: int
+    unit: str  # Unit in brackets; empty if the header has none
+    index: int  # Position in the header, counted from 0
 
     def divisor(self, units: Mapping[str, float], where: str) -> float:
         """Return the divisor that converts the column to SI units."""
@@ -62,33 +56,20 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class DataTable:
-    """Table of a file, or of a part of one, with m rows and c columns.
+    """Table of a file, or of a part of one, with m rows and c columns."""
 
-    Attributes:
-        source: Name of the file.
-        headers: Header cell of each column, or its number if the file has no header.
-        cells: Text of the cells of each row, m rows.
-        lines: Line of each row in the file.
-        header_line: Line of the header, or of the first row if the file has none.
-        comments: Text of the comment lines, without `#`.
-        numbers: Numbers of the columns that were parsed already, shape (m,) each, by column index.
-        decimal: Decimal sign of the cells.
-        bad_rows: Reason why a row was left out, by line.
-        description: How the file is written, such as "semicolons, decimal commas".
-        notes: Sentences on what was not read, such as further sheets.
-    """
-
-    source: str
-    headers: tuple[str, ...]
-    cells: Sequence[Sequence[str]]
-    lines: Sequence[int]
-    header_line: int
-    comments: tuple[str, ...] = ()
+    source: str  # Name of the file
+    headers: tuple[str, ...]  # Header cell of each column, or its number if the file has no header
+    cells: Sequence[Sequence[str]]  # Text of the cells of each row, m rows
+    lines: Sequence[int]  # Line of each row in the file
+    header_line: int  # Line of the header, or of the first row if the file has none
+    comments: tuple[str, ...] = ()  # Text of the comment lines, without `#`
+    # Numbers of the columns that were parsed already, shape (m,) each, by column index.
     numbers: Mapping[int, Array] = field(default_factory=dict)
-    decimal: str = "."
-    bad_rows: Mapping[int, str] = field(default_factory=dict)
-    description: str = ""
-    notes: tuple[str, ...] = ()
+    decimal: str = "."  # Decimal sign of the cells
+    bad_rows: Mapping[int, str] = field(default_factory=dict)  # Reason why a row was left out, by line
+    description: str = ""  # How the file is written, such as "semicolons, decimal commas"
+    notes: tuple[str, ...] = ()  # Sentences on what was not read, such as further sheets
 
     @classmethod
     def from_columns(

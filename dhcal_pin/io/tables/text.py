@@ -45,23 +45,15 @@ _DECIMALS = {sign: re.compile(rf"[+-]?(?:\d+\{sign}\d*|\{sign}\d+)(?:[eE][+-]?\d
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a text file is divided into cells.
+    """How a text file is divided into cells."""
 
-    Attributes:
-        separator: Key of `SEPARATORS`; empty if it is to be detected.
-        decimal: Decimal sign; empty if it is to be detected.
-        skip: Number of lines before the header.
-        has_header: Whether the first row is a header.
-        comment: Start of a comment line; empty if there are none.
-        encoding: Encoding of the file.
-    """
-
-    separator: str = ""
-    decimal: str = ""
-    skip: int = 0
-    has_header: bool = True
+    separator: str = ""  # Key of `SEPARATORS`; empty if it is to be detected
+    decimal: str = ""  # Decimal sign; empty if it is to be detected
+    skip: int = 0  # Number of lines before the header
+    has_header: bool = True  # Whether the first row is a header
+    # Start of a comment line; empty if there are none.
     comment: str = "#"
-    encoding: str = "utf-8"
+    encoding: str = "utf-8"  # Encoding of the file
 
 
 # Layout of a file of which nothing is known.
