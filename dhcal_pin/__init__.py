@@ -3,8 +3,8 @@
 Lengths are metres and angles radians everywhere. Joint positions q have shape (m, n), one row per sample;
 poses have shape (m, 4, 4); twists are [v, ω]; T_ab is the pose of frame b in frame a.
 
-The public names are listed in `__init__.pyi`. The list is read, and each name is loaded, on first use, so
-that `import dhcal_pin` and `dhcal --help` are fast.
+The public names of a package are listed in its `__init__.pyi`. Each name is loaded on first use, so that
+`import dhcal_pin` and `dhcal --help` are fast.
 """
 
 from functools import cache

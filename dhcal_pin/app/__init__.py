@@ -3,8 +3,6 @@
 The server keeps nothing: a request brings its files and options, its answer brings progress and the results.
 The calculation is the command `dhcal` in a process of its own, in a temporary folder that exists during the
 request only. The page (`app.html`, `app.css`, `app.js`) shows the answers; it needs no network.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

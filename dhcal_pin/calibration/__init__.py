@@ -7,8 +7,6 @@ samples, `model_selection` adds families of joint errors, `streaming` reads samp
 
 Not here: the least-squares solver (`estimation`), explanations of what the data cannot determine
 (`identifiability`), checks of input data (`diagnostics`), and files (`io`).
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

@@ -5,18 +5,6 @@ from images, the poses of cameras and boards on the robot, and focal lengths are
 a start for the calibration. Files and the detection of boards in images are the concern of other packages.
 """
 
-from .boards import Board
-from .hand_eye import solve_hand_eye
-from .lens import LENSES, Lens
-from .pose_from_points import estimate_pose
-from .rig import Camera, Rig
+import lazy_loader
 
-__all__ = [
-    "LENSES",
-    "Board",
-    "Camera",
-    "Lens",
-    "Rig",
-    "estimate_pose",
-    "solve_hand_eye",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,30 +7,6 @@ board that was printed with rows and columns exchanged, or in the older layout o
 camera is at hand.
 """
 
-from .corners import DetectedImage, Layout, detect_corners, find_layout, read_image
-from .images import BoardDetection, corner_columns, detect_boards, image_files, unused_images
-from .overlays import overlay_files
-from .printing import black_rectangles, board_pdf
-from .rendering import ImageQuality, render_images
-from .reprojection import Reprojection, camera_with_intrinsics, reproject_corners
+import lazy_loader
 
-__all__ = [
-    "BoardDetection",
-    "DetectedImage",
-    "ImageQuality",
-    "Layout",
-    "Reprojection",
-    "black_rectangles",
-    "board_pdf",
-    "camera_with_intrinsics",
-    "corner_columns",
-    "detect_boards",
-    "detect_corners",
-    "find_layout",
-    "image_files",
-    "overlay_files",
-    "read_image",
-    "render_images",
-    "reproject_corners",
-    "unused_images",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

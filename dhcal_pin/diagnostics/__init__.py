@@ -2,8 +2,6 @@
 
 Diagnostics read a robot, measurements and a calibration, and return findings; they change nothing and leave
 no files. Their presentation belongs to the packages `report` and `cli`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

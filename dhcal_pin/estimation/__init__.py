@@ -24,8 +24,6 @@ system of one linearization (`TriangularSystem`).
 
 The choice of noise scales and hold-out data belongs to `calibration`. Reports on parameters
 that the data do not determine belong to `identifiability`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

@@ -3,8 +3,6 @@
 Numbers (rank, observability indices, directions) are in `observability`, the causes of unobservable
 directions in `null_space`, their geometry in `propagation`, and the sentences for users in `explanations`.
 All of them analyze a linearized problem; what solves problems belongs to `estimation`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

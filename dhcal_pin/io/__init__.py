@@ -5,8 +5,6 @@ radians. Errors in the content of a file are `FileFormatError` and name the file
 expected. What the content means belongs to `robot`, `measurements` and `estimation`.
 
 To add a robot file format, add a module with its functions, and one row to `robot.FORMATS`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

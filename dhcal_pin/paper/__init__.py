@@ -2,8 +2,6 @@
 
 Everything here reproduces or checks the paper "Positioning Accuracy Improvement of Robots by Link Parameter
 Calibration". Methods that other packages use do not belong here.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

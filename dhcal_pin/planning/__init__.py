@@ -2,8 +2,6 @@
 
 Optimality criteria, knowledge before a measurement, and the search for good poses belong here. Random
 configurations, workspace constraints and collision checks belong to `robot`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

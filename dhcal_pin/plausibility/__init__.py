@@ -7,8 +7,6 @@ manufacturing errors.
 
 Not here: single implausible values, such as joints beyond their limits (`diagnostics`), and the judgement of
 a calibration (`calibration.verdict`).
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

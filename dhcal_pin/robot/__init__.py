@@ -2,8 +2,6 @@
 
 This package holds what is known about a robot without measurements. Error parameters and their estimation
 belong to `estimation`; reading and writing of files other than URDF belongs to `io`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

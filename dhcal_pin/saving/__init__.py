@@ -10,8 +10,6 @@
 
 A run that is killed before step 4 has changed no target. If it is killed later, the next command that reads a
 robot or writes files in one of the folders completes it. Interrupts wait until the files are saved.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

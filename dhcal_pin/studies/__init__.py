@@ -2,8 +2,6 @@
 
 This package holds the grid with its file, the simulation of its settings, and the journal of an unfinished
 study. The command line and the plots of a study belong to `cli` and `visualization`.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

@@ -2,8 +2,6 @@
 
 This package draws what other packages have computed. Which plots a report contains is decided in `report`.
 matplotlib is imported by the first plot; `live`, which imports MeshCat's server, is imported by itself.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

@@ -4,14 +4,6 @@
 systems.
 """
 
-from .chains import ChainBatch
-from .qr import TriangularSystemBatch
-from .solver import BatchProblem, BatchResult, solve_batch
+import lazy_loader
 
-__all__ = [
-    "BatchProblem",
-    "BatchResult",
-    "ChainBatch",
-    "TriangularSystemBatch",
-    "solve_batch",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

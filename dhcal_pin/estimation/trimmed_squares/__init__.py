@@ -4,13 +4,6 @@
 of the robot, where gross mistakes ruin base, tool and instruments.
 """
 
-from .initial_outliers import find_initial_outliers
-from .search import MIN_SCALE, LinearizedRows, linearize_rows, search_majorities
+import lazy_loader
 
-__all__ = [
-    "MIN_SCALE",
-    "LinearizedRows",
-    "find_initial_outliers",
-    "linearize_rows",
-    "search_majorities",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

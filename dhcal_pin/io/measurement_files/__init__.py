@@ -2,8 +2,6 @@
 
 `read_measurement_file` reads a table with the package `tables`, finds the measurement kind from the columns
 and converts the values to metres and radians.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

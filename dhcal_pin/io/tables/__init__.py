@@ -1,8 +1,6 @@
 """Tables: text files, Excel workbooks, Parquet files and data frames become one table of text and numbers.
 
 `read_table` reads any of them. What the columns mean belongs to the readers of measurement and DH files.
-
-The public names are listed in `__init__.pyi`. Each is loaded on first use.
 """
 
 import lazy_loader

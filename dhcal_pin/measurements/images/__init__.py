@@ -3,15 +3,6 @@
 The measurement kind itself is `measurements.camera`.
 """
 
-from .board_view import ViewLimits, is_board_in_view, project_board, visible_corners
-from .camera_parameters import rig_parameters
-from .camera_start import first_values
+import lazy_loader
 
-__all__ = [
-    "ViewLimits",
-    "first_values",
-    "is_board_in_view",
-    "project_board",
-    "rig_parameters",
-    "visible_corners",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

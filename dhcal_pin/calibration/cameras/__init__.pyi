@@ -1,0 +1,31 @@
+"""Public names of dhcal_pin.calibration.cameras; `__init__.py` loads each on first use."""
+
+from .axis_order import axis_stages as axis_stages
+from .axis_order import exchange_axes as exchange_axes
+from .axis_order import reorder as reorder
+from .board_size import BoardSize as BoardSize
+from .board_size import find_board_size as find_board_size
+from .diagnosis import LARGE_ERROR as LARGE_ERROR
+from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
+from .diagnosis import HandEyeFit as HandEyeFit
+from .gate import apply_gate as apply_gate
+from .gate import judge_stages as judge_stages
+from .gate import judge_target_points as judge_target_points
+from .lens_priors import lens_prior_groups as lens_prior_groups
+from .lens_priors import with_lens_priors as with_lens_priors
+from .lens_priors import with_stated_distortion as with_stated_distortion
+from .seen_ranges import seen_ranges_warning as seen_ranges_warning
+from .sets import DEFAULT_SETS as DEFAULT_SETS
+from .sets import HAND_EYE_SETS as HAND_EYE_SETS
+from .sets import RIG_SETS as RIG_SETS
+from .sets import default_sets as default_sets
+from .sets import has_images as has_images
+from .sets import has_joint_values as has_joint_values
+from .sets import held_values as held_values
+from .sets import require_joint_values as require_joint_values
+from .sets import split_sets as split_sets
+from .stages import STAGES as STAGES
+from .stages import ImageError as ImageError
+from .stages import Stage as Stage
+from .stages import fitted_error as fitted_error
+from .target_points import judged_boards as judged_boards

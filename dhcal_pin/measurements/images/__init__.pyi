@@ -1,0 +1,8 @@
+"""Public names of dhcal_pin.measurements.images; `__init__.py` loads each on first use."""
+
+from .board_view import ViewLimits as ViewLimits
+from .board_view import is_board_in_view as is_board_in_view
+from .board_view import project_board as project_board
+from .board_view import visible_corners as visible_corners
+from .camera_parameters import rig_parameters as rig_parameters
+from .camera_start import first_values as first_values
