@@ -38,7 +38,7 @@ from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from .base import Measurement, Noise, format_sigma, label_stops
-from .columns import pixel_columns, remark_column, text_column
+from .columns import Column
 from .groups import ErrorGroup, Group
 from .images.camera_parameters import (
     POINTS_SET,
@@ -146,11 +146,12 @@ class CameraCorners(Measurement):
     }
     further_errors: ClassVar = {"board": ErrorGroup("board", "m", "error at the board", 4)}
     COLUMNS = (
-        pixel_columns("pixels", "u", "v")
-        + text_column("corner", "corner")
-        + text_column("camera", "camera")
-        + text_column("board", "board")
-        + remark_column("image_names", "image")
+        Column("u", "pixel", "pixels"),
+        Column("v", "pixel", "pixels"),
+        Column("corner", "text", "corner"),
+        Column("camera", "text", "camera"),
+        Column("board", "text", "board"),
+        Column("image", "remark", "image_names"),
     )
     required_columns = (frozenset(("u", "v", "corner")),)
     accepts_tool_poses = True

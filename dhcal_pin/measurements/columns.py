@@ -90,19 +90,9 @@ def angle_columns(argument: str, *names: str) -> tuple[Column, ...]:
     return tuple(Column(name, "angle", argument) for name in names)
 
 
-def pixel_columns(argument: str, *names: str) -> tuple[Column, ...]:
-    """Declare columns of image coordinates that fill one argument of the constructor."""
-    return tuple(Column(name, "pixel", argument) for name in names)
-
-
 def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Column, ...]:
     """Declare a column of text."""
     return (Column(name, "text", argument, is_common=is_common),)
-
-
-def remark_column(argument: str, name: str) -> tuple[Column, ...]:
-    """Declare a column of texts that only people need."""
-    return (Column(name, "remark", argument),)
 
 
 def file_columns(columns: Sequence[Column]) -> dict[str, str]:

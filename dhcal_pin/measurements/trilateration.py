@@ -1,4 +1,4 @@
-"""Positions from wire lengths: the paper's three-wire device, and any number of anchors.
+"""Positions from the wire lengths of the paper's three-wire device, and points from distances.
 
 A point p at distance L_i from the anchor P_i satisfies |p - P_i|² = L_i². Differences of these equations are
 linear in p. For three anchors the remaining equation is quadratic, (41) of the paper; its two solutions are
@@ -18,15 +18,10 @@ from numpy.typing import ArrayLike
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 
-# Anchors closer to one line or plane than this, relative to their extent, are regarded as collinear or
-# coplanar.
-MAX_RELATIVE_FLATNESS = 1e-6
-# The same for the paper's device, relative to its largest dimension.
+# Anchors of the paper's device closer to one line than this are collinear, relative to its largest dimension.
 MIN_RELATIVE_DIMENSION = 1e-9
 # Relative singular values below this are cut when a point is located.
 POINT_RCOND = 1e-9
-# Gauss-Newton steps for more than three anchors; noise-free lengths need about five.
-N_STEPS = 20
 
 
 def device_anchors(a: float, b: float, c: float) -> Array:
@@ -49,54 +44,12 @@ def trilaterate_three_wires(lengths: ArrayLike, a: float, b: float, c: float, si
     y = (l3**2 - l2**2) / (4 * b)
     z = (l2**2 + l3**2 - 2 * (l1**2 - a**2 + b**2 + c**2)) / (4 * (a - c))
     x_squared = l1**2 - y**2 - (z - a) ** 2
-    _require_meeting(x_squared, "three wires", "x²")
-    return np.stack([np.sign(side) * np.sqrt(x_squared), y, z], -1)
-
-
-def trilaterate(lengths: ArrayLike, anchors: ArrayLike, side: int = 1) -> Array:
-    """Compute positions (m, 3) [m] from the lengths (m, w) of wires to three or more anchors (w, 3).
-
-    The linear differences of the equations give an initial position. If the anchors lie in a plane, the
-    height above it follows from the mean equation. The plane is a mirror; `side` is the sign along the normal
-    (P2 - P1) × (P3 - P1). For more than three anchors Gauss-Newton steps minimize the errors of the lengths.
-    Collinear anchors and lengths that do not meet raise `InvalidArgumentError`.
-    """
-    lengths, anchors = np.asarray(lengths, float), np.asarray(anchors, float)
-    centre = anchors.mean(0)
-    arms = anchors - centre
-    flat = MAX_RELATIVE_FLATNESS
-    if len(anchors) < 3 or (s := np.linalg.svd(arms, compute_uv=False))[1] < flat * s[0]:
+    if (bad := np.flatnonzero(x_squared < 0)).size:
         raise InvalidArgumentError(
-            f"trilateration: the {len(anchors)} anchors lie on one line; expected three anchors that do not"
-        )
-    # |p - P_i|² = L_i² minus its mean over the anchors is linear in p.
-    right = 0.5 * (np.sum(arms**2, 1) - lengths**2)
-    right -= right.mean(1, keepdims=True)
-    offset = np.linalg.lstsq(arms, right.T, rcond=flat)[0].T
-    if s[2] < flat * s[0]:
-        normal = np.cross(anchors[1] - anchors[0], anchors[2] - anchors[0])
-        normal /= np.linalg.norm(normal)
-        height_squared = np.mean(lengths**2 - np.sum((offset[:, None] - arms) ** 2, 2), 1)
-        _require_meeting(height_squared, "trilateration", "height²")
-        offset = offset + (np.sign(side) * np.sqrt(height_squared))[:, None] * normal
-    points = centre + offset
-    for _ in range(N_STEPS if len(anchors) > 3 else 0):
-        vectors = points[:, None] - anchors
-        modelled = np.linalg.norm(vectors, axis=2)
-        jacobian = vectors / modelled[..., None]
-        step = np.linalg.pinv(jacobian) @ (lengths - modelled)[..., None]
-        points = points + step[..., 0]
-    return points
-
-
-def _require_meeting(squares: Array, where: str, name: str) -> None:
-    """Check that squared coordinates are not negative."""
-    bad = np.flatnonzero(squares < 0)
-    if bad.size:
-        raise InvalidArgumentError(
-            f"{where}: the lengths of sample {bad[0] + 1} do not meet ({name} = {squares[bad[0]]:.3g} m²); "
+            f"three wires: the lengths of sample {bad[0] + 1} do not meet (x² = {x_squared[bad[0]]:.3g} m²); "
             "check its lengths and the anchors, or remove the sample"
         )
+    return np.stack([np.sign(side) * np.sqrt(x_squared), y, z], -1)
 
 
 def position_dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
