@@ -47,20 +47,9 @@ from itertools import pairwise
 import numpy as np
 
 from .._typing import Array
+from ..estimation import robust
 from ..estimation.problem import Problem, linearize_and_factor, whitened_residuals
 from ..estimation.qr import rank
-from ..estimation.robust import (
-    FAR_REJECTED,
-    FAR_THRESHOLD,
-    OUTLIER_THRESHOLD,
-    REJECTED,
-    REJECTION_THRESHOLD,
-    ZERO_WEIGHT,
-    is_chi_square,
-    rejection_stage,
-    standardize_ratios,
-    standardized_residuals,
-)
 from ..estimation.solver import SolverResult
 from ..estimation.trimmed_squares import MIN_SCALE, LinearizedRows, linearize_rows, search_majorities
 from ..measurements.base import Measurement
@@ -95,14 +84,14 @@ def find_good_samples(
     """Find the samples that agree with the fit of a majority of the samples."""
     counts = [len(item.rows) for item in data]
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
-        return GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
+        return GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
     drawn = _draw_samples(sum(counts))
     starts = np.cumsum([0, *counts])
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
     root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
-    all_good = GoodSamples([np.ones(count) for count in counts], FAR_REJECTED)
+    all_good = GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
@@ -113,12 +102,12 @@ def find_good_samples(
     core = _best_core(rows, search_majorities(rows, groups[drawn], n_determined), redundancy)
     if core is None:
         return all_good
-    stage = rejection_stage(core.t)
-    threshold = REJECTION_THRESHOLD if stage == REJECTED else FAR_THRESHOLD
+    stage = robust.rejection_stage(core.t)
+    threshold = robust.REJECTION_THRESHOLD if stage == robust.REJECTED else robust.FAR_THRESHOLD
     if len(drawn) < len(groups):
         x = solution.x + root @ core.y
         return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)
-    weights = np.where(core.t > threshold, ZERO_WEIGHT, 1.0)
+    weights = np.where(core.t > threshold, robust.ZERO_WEIGHT, 1.0)
     return GoodSamples([weights[a:b] for a, b in pairwise(starts)], stage)
 
 
@@ -135,8 +124,8 @@ def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:
         for rows in (group.rows for group in item.residual_groups.values()):
             k = np.arange(len(residual))[rows].size
             mean_squares = np.mean(residual[rows] ** 2, 0)
-            t = standardize_ratios(mean_squares, k)
-            if t.max() > OUTLIER_THRESHOLD or not is_chi_square(mean_squares, k):
+            t = robust.standardize_ratios(mean_squares, k)
+            if t.max() > robust.OUTLIER_THRESHOLD or not robust.is_chi_square(mean_squares, k):
                 return False
     return True
 
@@ -146,8 +135,8 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
     weights = []
     for residual, classes in zip(whitened_residuals(problem, x), rows.row_classes, strict=True):
         residual = residual / scales[classes][:, None]
-        t = standardize_ratios(np.mean(residual**2, 0), len(residual))
-        weights.append(np.where(t > threshold, ZERO_WEIGHT, 1.0))
+        t = robust.standardize_ratios(np.mean(residual**2, 0), len(residual))
+        weights.append(np.where(t > threshold, robust.ZERO_WEIGHT, 1.0))
     return weights
 
 
@@ -192,7 +181,7 @@ def _best_core(rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], redund
         if not any((core.t[is_good] <= STRICT_THRESHOLD).all() for core in cores):
             cores.append(_extend(rows, is_good, noise, redundancy))
     best = min(cores, key=lambda core: core.log_likelihood)
-    has_outlier = (best.t > OUTLIER_THRESHOLD).any()
+    has_outlier = (best.t > robust.OUTLIER_THRESHOLD).any()
     is_likely = best.log_likelihood < _log_likelihood(rows, everything, scales, redundancy)
     return best if has_outlier and is_likely else None
 
@@ -213,7 +202,7 @@ def _extend(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: flo
         previous, is_good = is_good, t <= STRICT_THRESHOLD
         if np.array_equal(previous, is_good):
             break
-    return _Core(y, scales, t, _log_likelihood(rows, t <= REJECTION_THRESHOLD, scales, redundancy))
+    return _Core(y, scales, t, _log_likelihood(rows, t <= robust.REJECTION_THRESHOLD, scales, redundancy))
 
 
 def _log_likelihood(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: float) -> float:
@@ -253,6 +242,6 @@ def _standardized(
         b, residual = scaled[:-1], scaled[-1] - np.tensordot(y, scaled[:-1], (0, 0))
         leverages = np.einsum("ukm,ulm->mkl", b, np.tensordot(covariance, b, 1), optimize=True)
         sign = np.where(fitted, -1.0, 1.0)[:, None, None]
-        out.append(standardized_residuals(residual, np.eye(k) + sign * leverages, fitted))
+        out.append(robust.standardized_residuals(residual, np.eye(k) + sign * leverages, fitted))
         first += m
     return np.concatenate(out)

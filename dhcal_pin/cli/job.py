@@ -19,34 +19,7 @@ from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-from .job_outputs import (
-    ROBOT_FORMATS,
-    Calibrated,
-    certificate_content,
-    curves_content,
-    map_content,
-    report_content,
-    residuals_content,
-    scene_content,
-)
-from .options import (
-    COLUMNS,
-    DATA,
-    FIX,
-    FREE,
-    INSTRUMENT,
-    JSON,
-    MEND,
-    NON_NEGATIVE_INTEGER,
-    PACKAGE_DIR,
-    PARAMETERS,
-    POSITIVE_INTEGER,
-    RIG,
-    ROBOT,
-    ROOT,
-    SKIP_BAD_ROWS,
-    TIP,
-)
+from . import job_outputs, options
 from .output_table import Output, OutputFile, chosen_files
 
 if TYPE_CHECKING:
@@ -66,8 +39,8 @@ class Job:
         metadata={
             "flags": ("robot",),
             "metavar": "ROBOT",
-            "type": ROBOT["type"],
-            "help": f"{ROBOT['help']}; or a manifest of several robots, NAME{MANIFEST_ENDING}",
+            "type": options.ROBOT["type"],
+            "help": f"{options.ROBOT['help']}; or a manifest of several robots, NAME{MANIFEST_ENDING}",
         }
     )
     data: tuple[str, ...] = field(
@@ -75,7 +48,7 @@ class Job:
             "flags": ("data",),
             "metavar": "DATA",
             "nargs": "*",
-            "help": f"{DATA['help']}; none with a manifest",
+            "help": f"{options.DATA['help']}; none with a manifest",
         }
     )
     output: str = field(
@@ -83,19 +56,19 @@ class Job:
             "flags": ("-o", "--output"),
             "metavar": "OUT.urdf",
             "required": True,
-            "help": "; ".join(item.help for item in ROBOT_FORMATS.values())
+            "help": "; ".join(item.help for item in job_outputs.ROBOT_FORMATS.values())
             + "; with a manifest, a summary of all robots (.csv)",
             "output": None,
         }
     )
-    tip: str | None = field(default=None, metadata=TIP)
-    root: str | None = field(default=None, metadata=ROOT)
-    package_dir: tuple[str, ...] = field(default=(), metadata=PACKAGE_DIR)
-    columns: str | None = field(default=None, metadata=COLUMNS)
-    rig: str | None = field(default=None, metadata=RIG)
-    skip_bad_rows: bool = field(default=False, metadata=SKIP_BAD_ROWS)
-    mend: tuple[str, ...] = field(default=(), metadata=MEND)
-    parameters: str | None = field(default=None, metadata=PARAMETERS)
+    tip: str | None = field(default=None, metadata=options.TIP)
+    root: str | None = field(default=None, metadata=options.ROOT)
+    package_dir: tuple[str, ...] = field(default=(), metadata=options.PACKAGE_DIR)
+    columns: str | None = field(default=None, metadata=options.COLUMNS)
+    rig: str | None = field(default=None, metadata=options.RIG)
+    skip_bad_rows: bool = field(default=False, metadata=options.SKIP_BAD_ROWS)
+    mend: tuple[str, ...] = field(default=(), metadata=options.MEND)
+    parameters: str | None = field(default=None, metadata=options.PARAMETERS)
     extend: str = field(
         default="auto",
         metadata={
@@ -104,8 +77,8 @@ class Job:
             "none (geometry only), or some of {error_families}",
         },
     )
-    fix: str = field(default="", metadata=FIX)
-    free: str = field(default="", metadata=FREE)
+    fix: str = field(default="", metadata=options.FIX)
+    free: str = field(default="", metadata=options.FREE)
     holdout: str | None = field(
         default=None,
         metadata={
@@ -144,7 +117,7 @@ class Job:
             "help": "lower and upper bounds by parameter name",
         },
     )
-    instrument: str | None = field(default=None, metadata=INSTRUMENT)
+    instrument: str | None = field(default=None, metadata=options.INSTRUMENT)
     payload: str | None = field(
         default=None,
         metadata={
@@ -157,7 +130,7 @@ class Job:
         default=100,
         metadata={
             "metavar": "N",
-            "type": POSITIVE_INTEGER,
+            "type": options.POSITIVE_INTEGER,
             "help": "maximum number of iterations (default: %(default)s)",
         },
     )
@@ -165,7 +138,7 @@ class Job:
         default=0,
         metadata={
             "metavar": "N",
-            "type": NON_NEGATIVE_INTEGER,
+            "type": options.NON_NEGATIVE_INTEGER,
             "help": "random seed of the hold-out selection (default: %(default)s)",
         },
     )
@@ -209,7 +182,7 @@ class Job:
             "metavar": "MAP",
             "help": "write the predicted position uncertainty and the hold-out errors over the workspace "
             "(.csv or .html)",
-            "output": Output(map_content, "a map", (".csv", ".html")),
+            "output": Output(job_outputs.map_content, "a map", (".csv", ".html")),
         },
     )
     scene: str | None = field(
@@ -217,7 +190,7 @@ class Job:
         metadata={
             "metavar": "SCENE.html",
             "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
-            "output": Output(scene_content, "a scene", (".html",), (".htm",)),
+            "output": Output(job_outputs.scene_content, "a scene", (".html",), (".htm",)),
         },
     )
     curves: str | None = field(
@@ -226,7 +199,7 @@ class Job:
             "metavar": "CURVES.csv",
             "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
             "to add to it before it is commanded, in steps of 1 degree (.csv)",
-            "output": Output(curves_content, "a table of corrections", (".csv",)),
+            "output": Output(job_outputs.curves_content, "a table of corrections", (".csv",)),
         },
     )
     residuals: str | None = field(
@@ -235,12 +208,12 @@ class Job:
             "metavar": "R.csv",
             "help": "write the residuals of all measurements with their files and lines (.csv)",
             "output": Output(
-                residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
+                job_outputs.residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
             ),
         },
     )
     json: str | None = field(
-        default=None, metadata={**JSON, "output": Output(None, is_written_if_refused=True)}
+        default=None, metadata={**options.JSON, "output": Output(None, is_written_if_refused=True)}
     )
     report: tuple[str, ...] = field(
         default=(),
@@ -248,7 +221,11 @@ class Job:
             "metavar": "R.html",
             "help": "write a report (.html or .md); may be repeated",
             "output": Output(
-                report_content, "a report", (".html", ".md"), (".htm",), is_written_if_refused=True
+                job_outputs.report_content,
+                "a report",
+                (".html", ".md"),
+                (".htm",),
+                is_written_if_refused=True,
             ),
         },
     )
@@ -257,7 +234,7 @@ class Job:
         metadata={
             "metavar": "C.html",
             "help": "write a certificate for quality records, to print or save as PDF (.html)",
-            "output": Output(certificate_content, "a certificate", (".html",), (".htm",)),
+            "output": Output(job_outputs.certificate_content, "a certificate", (".html",), (".htm",)),
         },
     )
     meta: tuple[str, ...] = field(
@@ -280,7 +257,7 @@ class Job:
         return cls(**values)
 
     @property
-    def outputs(self) -> list[OutputFile[Calibrated]]:
+    def outputs(self) -> list[OutputFile[job_outputs.Calibrated]]:
         """Output files except the robot."""
         rows = {option.name: option.metadata.get("output") for option in fields(self)}
         return chosen_files(vars(self), {name: output for name, output in rows.items() if output})

@@ -4,20 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser
 
-from .options import (
-    COLUMNS,
-    FIX,
-    FREE,
-    INSTRUMENT,
-    JSON,
-    NON_NEGATIVE_INTEGER,
-    PARAMETERS,
-    POSITIVE_INTEGER,
-    RIG,
-    ROBOT,
-    add_motion_options,
-    add_urdf_options,
-)
+from . import options
 
 # Standard deviation of a laser tracker and a precise robot, used without --sigma and --data.
 DEFAULT_SIGMA = "0.1mm,0.01deg"
@@ -29,9 +16,9 @@ N_CANDIDATES, N_IMAGE_CANDIDATES = 5000, 2000
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal plan`."""
-    parser.add_argument("robot", **ROBOT)
+    parser.add_argument("robot", **options.ROBOT)
     parser.add_argument(
-        "-n", "--count", type=POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
+        "-n", "--count", type=options.POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
     )
     parser.add_argument(
         "-o",
@@ -40,14 +27,14 @@ def add_arguments(parser: ArgumentParser) -> None:
         required=True,
         help="joint values to write, ordered as a short tour",
     )
-    add_urdf_options(parser)
+    options.add_urdf_options(parser)
     _add_measurement_options(parser)
     _add_calibration_options(parser)
     _add_search_options(parser)
-    add_motion_options(parser, "deg")
+    options.add_motion_options(parser, "deg")
     parser.add_argument("--html", metavar="FILE", help="page with a preview of the poses and the moves")
     parser.add_argument("--report", metavar="R.html", help="write a report with the poses (.html)")
-    parser.add_argument("--json", **JSON)
+    parser.add_argument("--json", **options.JSON)
 
 
 def _add_measurement_options(parser: ArgumentParser) -> None:
@@ -66,7 +53,7 @@ def _add_measurement_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rig",
-        metavar=RIG["metavar"],
+        metavar=options.RIG["metavar"],
         help="plan images by these cameras of these boards, with approximate poses and intrinsics; poses "
         "that are missing are those of a calibrated robot, or are estimated from --data",
     )
@@ -108,27 +95,27 @@ def _add_calibration_options(parser: ArgumentParser) -> None:
         metavar="FILE",
         help="configurations where the accuracy matters: joint values, or tool positions x[mm],y[mm],z[mm]",
     )
-    parser.add_argument("--parameters", **PARAMETERS)
-    parser.add_argument("--fix", default="", **FIX)
-    parser.add_argument("--free", default="", **FREE)
+    parser.add_argument("--parameters", **options.PARAMETERS)
+    parser.add_argument("--fix", default="", **options.FIX)
+    parser.add_argument("--free", default="", **options.FREE)
     parser.add_argument(
         "--priors",
         metavar="default|FILE",
         help="prior standard deviations, as in calibrate (default: the uncertainty in the sidecar of a "
         "calibrated robot, else default)",
     )
-    parser.add_argument("--instrument", **INSTRUMENT)
+    parser.add_argument("--instrument", **options.INSTRUMENT)
     parser.add_argument(
         "--data", metavar="DATA", nargs="+", help="existing measurements to complement, as CSV files"
     )
-    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--columns", **options.COLUMNS)
 
 
 def _add_search_options(parser: ArgumentParser) -> None:
     """Declare where the poses may be."""
     parser.add_argument(
         "--candidates",
-        type=POSITIVE_INTEGER,
+        type=options.POSITIVE_INTEGER,
         metavar="N",
         help=f"number of random candidates (default: {N_CANDIDATES}; {N_IMAGE_CANDIDATES} with --rig)",
     )
@@ -172,7 +159,7 @@ def _add_search_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         metavar="N",
-        type=NON_NEGATIVE_INTEGER,
+        type=options.NON_NEGATIVE_INTEGER,
         default=0,
         help="random seed of the candidates (default: %(default)s)",
     )

@@ -9,13 +9,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation import qr
 from ..robot.sampling import scale_joint_units
-from .exchange import (
-    MAX_EXCHANGE_CANDIDATES,
-    CandidateSet,
-    compute_sqrt_covariance,
-    improve_by_exchange,
-    select_greedily,
-)
+from . import exchange
 from .refinement import DesignGoal, Selection, refine
 
 # Random plans per number of poses, numbers of poses, and smallest number of poses that they are drawn from.
@@ -53,7 +47,7 @@ def _error_of_smaller(
     goal: DesignGoal, found: Selection, size: int, is_refined: bool, rng: np.random.Generator
 ) -> float:
     """Predict the error of a plan that starts from the first poses of the greedy selection."""
-    selection = improve_by_exchange(
+    selection = exchange.improve_by_exchange(
         found.candidates,
         goal.full_information.prior_factor,
         found.greedy[:size],
@@ -71,7 +65,7 @@ def _larger_plan(goal: DesignGoal, found: Selection, plan_rows: Array) -> Array:
     """Return the joint positions (w, n) of the plan and of more poses, each the best one to add next."""
     candidates, prior_factor = found.candidates, goal.full_information.prior_factor
     count = len(found.refined)
-    sqrt_covariance = compute_sqrt_covariance(
+    sqrt_covariance = exchange.compute_sqrt_covariance(
         prior_factor, np.ascontiguousarray(plan_rows.transpose(2, 1, 0))
     )
     coordinates = scale_joint_units(goal.full_information.chain, found.refined)
@@ -79,16 +73,16 @@ def _larger_plan(goal: DesignGoal, found: Selection, plan_rows: Array) -> Array:
     gains += candidates.filling_gains(np.arange(len(gains)), np.concatenate([goal.existing, coordinates]))
     gains[candidates.infeasible] = -np.inf
     gains[found.selected] = -np.inf
-    promising = np.argsort(-gains)[: min(MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
+    promising = np.argsort(-gains)[: min(exchange.MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
     # The plan's poses come first and are feasible.
-    extended = CandidateSet.from_rows(
+    extended = exchange.CandidateSet.from_rows(
         np.concatenate([plan_rows, candidates.rows[:, :, promising]], 2),
         np.concatenate([coordinates, candidates.coordinates[promising]]),
         candidates.min_distance,
         lambda i: i < count or candidates.is_feasible(int(promising[i - count])),
         candidates.bin_columns,
     )
-    order = select_greedily(
+    order = exchange.select_greedily(
         extended, prior_factor, max(count, EXTRA_POSES), goal.criterion, np.arange(count), goal.existing
     )
     return np.concatenate([found.refined, found.q[promising]])[order]
@@ -98,7 +92,9 @@ def plans_for_curves(goal: DesignGoal, found: Selection) -> list[Array]:
     """Return an empty plan, the plan found and plans of `CURVE_SIZES` poses (n, dof), by size."""
     prior_factor, nearby = goal.full_information.prior_factor, replace(found.candidates, min_distance=0.0)
     n_more = max(0, CURVE_SIZES[-1] - len(found.greedy))
-    order = select_greedily(nearby, prior_factor, n_more, goal.criterion, found.greedy, goal.existing)
+    order = exchange.select_greedily(
+        nearby, prior_factor, n_more, goal.criterion, found.greedy, goal.existing
+    )
     plans = {size: found.q[order[:size]] for size in (0, *CURVE_SIZES) if size <= len(order)}
     return [plan for _, plan in sorted((plans | {len(found.refined): found.refined}).items())]
 

@@ -7,18 +7,10 @@ from functools import partial
 
 import numpy as np
 
+from ...calibration import summary
 from ...calibration.cameras import split_sets
 from ...calibration.evaluation import Comparison
 from ...calibration.result import Result
-from ...calibration.summary import (
-    before_and_after,
-    format_share,
-    headline,
-    judged_regions,
-    largest_corrections,
-    parameter_notes,
-    regressions,
-)
 from ...calibration.verdict import Verdict
 from ...formatting import Quantity, Table
 from ...identifiability import EXPECTED
@@ -42,7 +34,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     names = short_names([job.robot, *outcome.n_rows])
     is_refused = fit.verdict.is_refused
     # The parameters of a refused robot have no meaning.
-    unidentified = [] if is_refused else parameter_notes(fit.unobservable, fit.weakly_observable)
+    unidentified = [] if is_refused else summary.parameter_notes(fit.unobservable, fit.weakly_observable)
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
     warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
     notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
@@ -60,7 +52,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
         Block(warnings, "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
-        Block([] if is_refused else [headline(fit.comparisons).text], "bold", has_space=True),
+        Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),
         *verdict_blocks(fit.verdict, job.force),
     ]
     return Screen(blocks, partial(_details, fit))
@@ -174,7 +166,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     if covered is None or reached is None:
         places = ("among the measured poses", "outside of them")
     for place, (comparison, reason) in zip(
-        places, judged_regions(fit.generalization, fit.comparisons), strict=True
+        places, summary.judged_regions(fit.generalization, fit.comparisons), strict=True
     ):
         if comparison:
             rows += _accuracy_rows(comparison, place)
@@ -182,14 +174,14 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
             sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
     if rows and covered is not None and reached is not None:
         sentences.append(
-            f"Measured region: {format_share(covered)} of joint space. "
-            f"Accuracy unknown: {format_share(1 - reached)} of joint space."
+            f"Measured region: {summary.format_share(covered)} of joint space. "
+            f"Accuracy unknown: {summary.format_share(1 - reached)} of joint space."
         )
     table = Table(["RMS error", "judged on", "before", "after"], rows, 2)
     return [
         Block(table, noun="figure", rank=7, n_kept=len(rows), has_space=True),
         Block(sentences),
-        Block(regressions(fit.errors, fit.comparisons), "yellow"),
+        Block(summary.regressions(fit.errors, fit.comparisons), "yellow"),
     ]
 
 
@@ -200,13 +192,13 @@ def _accuracy_rows(comparison: Comparison, place: str) -> Iterator[list[str | Qu
         judged = "left-out regions" if is_region else f"{after.samples} {comparison.title}"
         errors = ERROR_GROUPS[group]
         name = errors.name if errors.is_vector else errors.label
-        yield [f"{name} {place}", judged, *before_and_after(comparison, group)]
+        yield [f"{name} {place}", judged, *summary.before_and_after(comparison, group)]
 
 
 def _correction_block(fit: Result) -> Block:
     """Describe the largest corrections of the robot."""
     is_shown = fit.shrinkage_factor and not fit.verdict.is_refused
-    corrections = largest_corrections(fit.estimates, fit.x, fit.prior_std)[:N_CORRECTIONS]
+    corrections = summary.largest_corrections(fit.estimates, fit.x, fit.prior_std)[:N_CORRECTIONS]
     rows = [
         [e.name, *(Quantity(v, e.unit, e.std, is_small=True) for v in (e.change, e.std))]
         for e in (corrections if is_shown else ())

@@ -14,16 +14,8 @@ from ...measurements.position import Position
 from ...robot.chain import Chain
 from ...robot.conditions import Conditions
 from ..tables import read_table
+from . import reading
 from .columns import check_columns, check_joint_names, find_kind, value_table
-from .reading import (
-    build_measurement,
-    column_units,
-    ignored_columns_note,
-    open_measurement_table,
-    parse_joint_positions,
-    parse_values,
-    with_conditions,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +67,19 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
             "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
         )
     has_joints = bool(set(chain.joint_names) & set(table.columns))
-    near = parse_joint_positions(table, chain) if has_joints else None
+    near = reading.parse_joint_positions(table, chain) if has_joints else None
     placeholder = np.zeros((len(table.lines), chain.n_joints))
-    data = build_measurement(table, kind, [placeholder], parse_values(measured, kind), chain)
+    data = reading.build_measurement(table, kind, [placeholder], reading.parse_values(measured, kind), chain)
     values = data.poses if isinstance(data, Pose) else data.positions()
-    conditions = with_conditions(data, table, chain).recorded
-    notes = (*table.notes, *ignored_columns_note(ignored))
-    return TargetPoses(table.source, values, near, column_units(table), data.rows, notes, conditions)
+    conditions = reading.with_conditions(data, table, chain).recorded
+    notes = (*table.notes, *reading.ignored_columns_note(ignored))
+    return TargetPoses(table.source, values, near, reading.column_units(table), data.rows, notes, conditions)
 
 
 def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
     """Read the joint positions of a file; measured values beside them are ignored."""
     check_joint_names(chain)
-    table = open_measurement_table(path, chain, columns)
+    table = reading.open_measurement_table(path, chain, columns)
     table.require_good_rows()
     check_columns(table, chain)
-    return parse_joint_positions(table, chain)
+    return reading.parse_joint_positions(table, chain)
