@@ -25,6 +25,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -92,6 +93,7 @@ class Measurement(ABC):
         q: Joint positions of the first configuration of each sample, (m, n) [rad or m].
         rows: Line of each sample in its file, (m,), as text editors count; samples from Python are numbered
             from 1.
+        sigma: Standard deviations of the measured values, (m, k) [m, rad or px].
         source: Name of the file; empty for samples from Python.
         has_stated_sigma: Whether the standard deviations are those of the instrument, not placeholders that
             are estimated with the fit.
@@ -104,6 +106,7 @@ class Measurement(ABC):
 
     q: Array
     rows: Array
+    sigma: Array
     has_stated_sigma: bool
     instrument_parameters: tuple[InstrumentParameter, ...]
     source: str
@@ -220,13 +223,19 @@ class Measurement(ABC):
         """Return the same measurement at other joint positions, (c·m, n) as `configurations` returns them."""
         return self.replace(q=q)
 
-    @abstractmethod
     def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
         """Return a copy with standard deviations times a factor for each name in `residual_groups`."""
+        (scale,) = scales.values()
+        return self.replace(sigma=self.sigma * scale)
 
-    @abstractmethod
     def with_weights(self, weights: Array) -> Self:
         """Return a copy whose standard deviations are divided by the square roots of sample weights, (m,)."""
+        return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])
+
+    @cached_property
+    def _weights(self) -> Array:
+        """1 / sigma, (k, m), contiguous along the samples."""
+        return 1 / np.ascontiguousarray(self.sigma.T)
 
     # ------------------------------------------------------------------------------------------- model
     @property
@@ -342,9 +351,10 @@ class Measurement(ABC):
             u: Values of the instrument parameters, (s,).
         """
 
-    @abstractmethod
     def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
         """Return residuals and observation matrix of the paper, which assume small rotation errors.
+
+        They are exact for kinds without a measured rotation.
 
         Args:
             frames: Frames of the chain at `configurations()`.
@@ -353,6 +363,8 @@ class Measurement(ABC):
         Returns:
             Residuals (k, m) by the paper's (35) and (36), and the matching observation matrix.
         """
+        residual = self.residual(frames, u)
+        return residual, self.observation_matrix(frames, u, residual)
 
     @abstractmethod
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:

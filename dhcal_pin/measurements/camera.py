@@ -354,11 +354,6 @@ class CameraCorners(Measurement):
         """Names of the residuals of a sample."""
         return ("pixels_u", "pixels_v")
 
-    @cached_property
-    def _weights(self) -> Array:
-        """1 / sigma, (2, m)."""
-        return 1 / np.ascontiguousarray(self.sigma.T)
-
     # ------------------------------------------------------------------------------------------- model
     @cached_property
     def _parameter_ends(self) -> Array:
@@ -509,11 +504,6 @@ class CameraCorners(Measurement):
                 start += 3 * len(board.points)
         return self._whiten(out)
 
-    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
-        """Return the exact residuals and observation matrix, as there is no measured rotation in them."""
-        residual = self.residual(frames, u)
-        return residual, self.observation_matrix(frames, u, residual)
-
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
         """Return the errors "pixels" (m, 2) [px] and "board" (m, 3) [m].
 
@@ -575,14 +565,6 @@ class CameraCorners(Measurement):
     def board_views(self) -> BoardViews:
         """Poses of the boards in the cameras, from each image alone."""
         return estimate_views(self.corners)
-
-    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
-        """Return a copy with multiplied standard deviations."""
-        return self.replace(sigma=self.sigma * scales["pixels"])
-
-    def with_weights(self, weights: Array) -> Self:
-        """Return a copy with standard deviations divided by the square roots of the weights (m,)."""
-        return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])
 
     # ------------------------------------------------------------------------------------------- files
     def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -269,11 +269,6 @@ class Inclination(Measurement):
         by_gravity = np.einsum("ijm,jt->mit", to_sensor, by_tilt)
         return np.einsum("rim,mit->trm", self._derivative(h), np.concatenate([by_sensor, by_gravity], 2))
 
-    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
-        """Return the exact residuals and observation matrix."""
-        residual = self.residual(frames, u)
-        return residual, self.observation_matrix(frames, u, residual)
-
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
         """Return the angles "inclination" (m, 2) [rad]."""
         return {"inclination": self.residual(frames, u).T * self.sigma}
@@ -306,14 +301,6 @@ class Inclination(Measurement):
         best = int(np.argmax(misfit <= _MAX_MISFIT_RATIO * misfit.min() + _ROUNDING))
         points_down, parameters = _parameters(self.link, sensors[best], up[best])
         return item.replace(points_down=points_down, instrument_parameters=parameters)
-
-    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
-        """Return a copy with multiplied standard deviations of "inclination"."""
-        return self.replace(sigma=self.sigma * scales["inclination"])
-
-    def with_weights(self, weights: Array) -> Self:
-        """Return a copy with standard deviations divided by the square roots of the weights (m,)."""
-        return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])
 
     def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:
         values = dict(zip(_ANGLES, self.angles.T, strict=True))

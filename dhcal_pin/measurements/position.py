@@ -111,11 +111,6 @@ class PointMeasurement(Measurement):
         return self.values.shape[1]
 
     @cached_property
-    def _weights(self) -> Array:
-        """1 / sigma, (k, m), contiguous along the samples."""
-        return 1 / np.ascontiguousarray(self.sigma.T)
-
-    @cached_property
     def _values(self) -> Array:
         """Measured values, (k, m), contiguous along the samples."""
         return np.ascontiguousarray(self.values.T)
@@ -139,26 +134,12 @@ class PointMeasurement(Measurement):
         """Return the derivatives (s, k, m) of the whitened model with respect to u."""
         return self.model(self._points(frames), u)[2] * self._weights
 
-    def small_angle(self, frames: FrameBatch, u: Array) -> tuple[Array, ObservationMatrix]:
-        """Return the exact residuals and observation matrix, as there is no rotation in them."""
-        residual = self.residual(frames, u)
-        return residual, self.observation_matrix(frames, u, residual)
-
     def errors(self, frames: FrameBatch, u: Array) -> dict[str, Array]:
         """Return measured minus modelled values (m, ·) by residual group [m]."""
         return {
             name: (self.residual(frames, u) * self.sigma.T)[group.rows].T
             for name, group in self.residual_groups.items()
         }
-
-    def with_scaled_sigma(self, scales: Mapping[str, float]) -> Self:
-        """Return a copy with multiplied standard deviations; there is one residual group."""
-        (scale,) = scales.values()
-        return self.replace(sigma=self.sigma * scale)
-
-    def with_weights(self, weights: Array) -> Self:
-        """Return a copy with standard deviations divided by the square roots of the weights (m,)."""
-        return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])
 
 
 class Position(PointMeasurement):
