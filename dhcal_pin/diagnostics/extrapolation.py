@@ -28,28 +28,19 @@ _MAX_JOINTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Extrapolation:
-    """Samples inside and outside the measured region of a calibration.
+    """Samples inside and outside the measured region of a calibration."""
 
-    Attributes:
-        n_samples: Number of samples.
-        n_outside: Number of samples outside the region.
-        n_beyond_reach: Number of samples that are farther away than regions that were left out.
-        max_distance: Largest distance of a sample from the region's configurations, in radii of the region.
-        max_excess: Largest distance of a joint value from the measured range of each joint [rad or m]; only
-            joints that exceed it.
-        is_prismatic: Whether each of these joints is prismatic.
-        inside: Accuracy of the samples inside; empty if there are none.
-        outside: Accuracy of the samples outside; empty if there are none.
-    """
-
-    n_samples: int
-    n_outside: int
-    n_beyond_reach: int
+    n_samples: int  #: Number of samples.
+    n_outside: int  #: Number of samples outside the region.
+    n_beyond_reach: int  #: Number of samples that are farther away than regions that were left out.
+    #: Largest distance of a sample from the region's configurations, in radii of the region.
     max_distance: float
+    #: Largest distance of a joint value from the measured range of each joint [rad or m]; only joints that
+    #: exceed it.
     max_excess: Mapping[str, float]
-    is_prismatic: Mapping[str, bool]
-    inside: Accuracy
-    outside: Accuracy
+    is_prismatic: Mapping[str, bool]  #: Whether each of these joints is prismatic.
+    inside: Accuracy  #: Accuracy of the samples inside; empty if there are none.
+    outside: Accuracy  #: Accuracy of the samples outside; empty if there are none.
 
     @property
     def sentences(self) -> list[str]:

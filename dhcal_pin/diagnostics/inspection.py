@@ -43,66 +43,41 @@ _MIN_NUMERIC_SHARE = 0.5
 
 @dataclass(frozen=True)
 class ColumnSummary:
-    """Content of a column.
+    """Content of a column."""
 
-    Attributes:
-        name: Name in the header, or number of a column without a name.
-        unit: Unit in the header.
-        role: "joint", "measured", "sigma", "other" (such as the set or commanded positions) or "ignored".
-        minimum: Smallest number, in `unit`; None for texts.
-        maximum: Largest number, in `unit`; None for texts.
-        lower: Lower joint limit, in `unit`; None without a robot or a limit.
-        upper: Upper joint limit, in `unit`; None without a robot or a limit.
-        coverage: Share of the 5° bins that were visited; None for columns other than revolute joints.
-        counts: Number of rows with each text; empty for numbers.
-    """
-
-    name: str
-    unit: str
-    role: str
-    minimum: float | None = None
-    maximum: float | None = None
-    lower: float | None = None
-    upper: float | None = None
+    name: str  #: Name in the header, or number of a column without a name.
+    unit: str  #: Unit in the header.
+    role: str  #: "joint", "measured", "sigma", "other" (such as the set or commanded positions) or "ignored".
+    minimum: float | None = None  #: Smallest number, in `unit`; None for texts.
+    maximum: float | None = None  #: Largest number, in `unit`; None for texts.
+    lower: float | None = None  #: Lower joint limit, in `unit`; None without a robot or a limit.
+    upper: float | None = None  #: Upper joint limit, in `unit`; None without a robot or a limit.
+    #: Share of the 5° bins that were visited; None for columns other than revolute joints.
     coverage: float | None = None
+    #: Number of rows with each text; empty for numbers.
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class FileInspection:
-    """Content of a measurement file.
+    """Content of a measurement file."""
 
-    Attributes:
-        path: Name of the file.
-        form: How it is written, such as "semicolons, decimal commas".
-        rows: Number of rows with values, usable or not.
-        first_line: Line of the first row.
-        last_line: Line of the last row.
-        kind: Measurement kind; empty if the columns are those of none.
-        columns: Content of each column.
-        configurations: Number of different configurations; None if no joint is known.
-        repeated_lines: Lines that are equal to an earlier one in all joints and measured values.
-        bad_rows: Reason why a row cannot be used, by line.
-        problem: Error that `dhcal calibrate` would raise; empty if it reads the file.
-        column_map: Lines of a column map that would read a file with unknown columns; empty if not needed.
-        warnings: Suspected mistakes, one sentence each.
-        notes: What of the file is not read, such as further sheets.
-    """
-
-    path: str
-    form: str
-    rows: int
-    first_line: int
-    last_line: int
-    kind: str
-    columns: tuple[ColumnSummary, ...]
-    configurations: int | None
+    path: str  #: Name of the file.
+    form: str  #: How it is written, such as "semicolons, decimal commas".
+    rows: int  #: Number of rows with values, usable or not.
+    first_line: int  #: Line of the first row.
+    last_line: int  #: Line of the last row.
+    kind: str  #: Measurement kind; empty if the columns are those of none.
+    columns: tuple[ColumnSummary, ...]  #: Content of each column.
+    configurations: int | None  #: Number of different configurations; None if no joint is known.
+    #: Lines that are equal to an earlier one in all joints and measured values.
     repeated_lines: tuple[int, ...]
-    bad_rows: Mapping[int, str]
-    problem: str = ""
+    bad_rows: Mapping[int, str]  #: Reason why a row cannot be used, by line.
+    problem: str = ""  #: Error that `dhcal calibrate` would raise; empty if it reads the file.
+    #: Lines of a column map that would read a file with unknown columns; empty if not needed.
     column_map: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  #: Suspected mistakes, one sentence each.
+    notes: tuple[str, ...] = ()  #: What of the file is not read, such as further sheets.
 
 
 def inspect_file(

@@ -41,17 +41,12 @@ _N_POSES = 40
 
 @dataclass(frozen=True)
 class InstallationCheck:
-    """Result of one check.
+    """Result of one check."""
 
-    Attributes:
-        name: What was checked.
-        status: "ok"; "note" if something optional is missing or slow; "failed" if the installation is broken.
-        text: What was found, and what to do about it.
-    """
-
-    name: str
+    name: str  #: What was checked.
+    #: "ok"; "note" if something optional is missing or slow; "failed" if the installation is broken.
     status: Status
-    text: str
+    text: str  #: What was found, and what to do about it.
 
 
 def check_installation() -> Iterator[InstallationCheck]:

@@ -41,17 +41,11 @@ SOLUTION_TOL = 1e-6
 
 @dataclass(frozen=True)
 class UnreachableRow:
-    """Row of a file that is impossible.
+    """Row of a file that is impossible."""
 
-    Attributes:
-        row: Line in the file; for data from Python the number of the sample, from 1.
-        error: Distance between the position and the one at the row's joint positions [m].
-        reason: Explanation for users, without a full stop.
-    """
-
-    row: int
-    error: float
-    reason: str
+    row: int  #: Line in the file; for data from Python the number of the sample, from 1.
+    error: float  #: Distance between the position and the one at the row's joint positions [m].
+    reason: str  #: Explanation for users, without a full stop.
 
 
 def reach_sphere(chain: Chain) -> tuple[Array, float]:

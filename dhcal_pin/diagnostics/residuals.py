@@ -35,19 +35,12 @@ MAX_PROFILE_STD = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Outlier:
-    """Sample whose residual is too large for its standard deviation.
+    """Sample whose residual is too large for its standard deviation."""
 
-    Attributes:
-        item: Index of the measurement object in the fitted data.
-        row: Line in its file; for data from Python the number of the sample, from 1.
-        error_norms: Error by group, "position" [m], "orientation" [rad] or "residual" [m].
-        score: Studentized residual; standard normal for a sample that is not an outlier.
-    """
-
-    item: int
-    row: int
-    error_norms: dict[str, float]
-    score: float
+    item: int  #: Index of the measurement object in the fitted data.
+    row: int  #: Line in its file; for data from Python the number of the sample, from 1.
+    error_norms: dict[str, float]  #: Error by group, "position" [m], "orientation" [rad] or "residual" [m].
+    score: float  #: Studentized residual; standard normal for a sample that is not an outlier.
 
 
 def find_outliers(fit: Result) -> list[Outlier]:
@@ -82,31 +75,20 @@ def median_sigmas(fit: Result) -> list[dict[str, float]]:
 
 @dataclass(frozen=True, eq=False)
 class JointProfile:
-    """Residual joint error over the joint position.
+    """Residual joint error over the joint position."""
 
-    Attributes:
-        name: Name of the joint.
-        is_prismatic: Whether it is prismatic.
-        values: Joint positions of the samples, (m,) [rad or m].
-        error_norms: Errors of the samples after the calibration, (m,) [m], or [rad] if only rotations are
-            measured.
-        centres: Centres of the b parts of the range that have enough samples, (b,) [rad or m].
-        before: Offset of this joint alone that would explain the residuals of a part best, for the nominal
-            robot, (b,) [rad or m].
-        before_std: Standard errors of `before`, (b,).
-        after: The same for the calibrated robot, (b,) [rad or m].
-        after_std: Standard errors of `after`, (b,).
-    """
-
-    name: str
-    is_prismatic: bool
-    values: Array
+    name: str  #: Name of the joint.
+    is_prismatic: bool  #: Whether it is prismatic.
+    values: Array  #: Joint positions of the samples, (m,) [rad or m].
+    #: Errors of the samples after the calibration, (m,) [m], or [rad] if only rotations are measured.
     error_norms: Array
-    centres: Array
+    centres: Array  #: Centres of the b parts of the range that have enough samples, (b,) [rad or m].
+    #: Offset of this joint alone that would explain the residuals of a part best, for the nominal robot, (b,)
+    #: [rad or m].
     before: Array
-    before_std: Array
-    after: Array
-    after_std: Array
+    before_std: Array  #: Standard errors of `before`, (b,).
+    after: Array  #: The same for the calibrated robot, (b,) [rad or m].
+    after_std: Array  #: Standard errors of `after`, (b,).
 
 
 def joint_offset_profiles(fit: Result) -> list[JointProfile]:

@@ -58,25 +58,20 @@ class Problem:
     """Least-squares problem in p robot errors and s instrument parameters.
 
     Measurements share the instrument parameters that have the same name.
-
-    Attributes:
-        errors: Nominal chain and its p errors.
-        data: Measurements of any kinds.
-        weights: Weights √T/σ of the prior rows, with the prior standard deviations σ and the temperature T,
-            shape (p+s,); zero without a prior.
-        known: Values of instrument parameters that are not estimated, by name [m or rad].
-        executor: Executes the work on the chunks. The result does not depend on it.
-        bounds: Smallest and largest x, shape (2, p+s) [m and rad]; None if nothing is bounded.
-        temperature: Factor T by which correlation of the residuals enlarges their variance: N samples count
-            as N/T independent ones against the priors. The whitened rows do not contain it.
     """
 
-    errors: ErrorModel
-    data: tuple[Measurement, ...]
+    errors: ErrorModel  #: Nominal chain and its p errors.
+    data: tuple[Measurement, ...]  #: Measurements of any kinds.
+    #: Weights √T/σ of the prior rows, with the prior standard deviations σ and the temperature T, shape
+    #: (p+s,); zero without a prior.
     weights: Array
+    #: Values of instrument parameters that are not estimated, by name [m or rad].
     known: Mapping[str, float] = field(default_factory=dict)
-    executor: TaskExecutor = SERIAL
+    executor: TaskExecutor = SERIAL  #: Executes the work on the chunks. The result does not depend on it.
+    #: Smallest and largest x, shape (2, p+s) [m and rad]; None if nothing is bounded.
     bounds: Array | None = None
+    #: Factor T by which correlation of the residuals enlarges their variance, so that N samples count as N/T
+    #: independent ones against the priors. The whitened rows do not contain it.
     temperature: float = 1.0
 
     @property

@@ -100,12 +100,9 @@ class TriangularSystem:
     `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes
     are separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer
     for stacks: a damped step with p = 24 takes seven times as long in a stack of one.
-
-    Attributes:
-        rows: [R z; 0 ρ], upper triangular, shape (p+1, p+1).
     """
 
-    rows: Array
+    rows: Array  #: [R z; 0 ρ], upper triangular, shape (p+1, p+1).
 
     @property
     def r(self) -> Array:

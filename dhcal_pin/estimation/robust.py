@@ -120,16 +120,12 @@ WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
 
 @dataclass(frozen=True)
 class Loss:
-    """Robust loss that a user can choose.
+    """Robust loss that a user can choose."""
 
-    Attributes:
-        stages: Keys of `WEIGHT_FUNCTIONS`, TRIMMED or KEPT in the order of their use, each until the weights
-            have settled.
-        help: One line for help texts.
-    """
-
+    #: Keys of `WEIGHT_FUNCTIONS`, TRIMMED or KEPT in the order of their use, each until the weights have
+    #: settled.
     stages: tuple[str, ...]
-    help: str
+    help: str  #: One line for help texts.
 
 
 # "auto" finds the samples that a majority agrees with, whatever the others are. It then fits these samples

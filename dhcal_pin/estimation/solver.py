@@ -76,23 +76,14 @@ class DampingState:
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """Result of `minimize`.
+    """Result of `minimize`."""
 
-    Attributes:
-        x: Solution of shape (p,) [m and rad].
-        system: Triangular system of the data at x, without priors.
-        iterations: Number of iterations.
-        converged: Whether the last step was negligible.
-        iterates: All x from the start to the solution, shape (iterations + 1, p).
-        damping_state: State to continue from (`warm_start`).
-    """
-
-    x: Array
-    system: TriangularSystem
-    iterations: int
-    converged: bool
-    iterates: Array
-    damping_state: DampingState = DampingState()
+    x: Array  #: Solution of shape (p,) [m and rad].
+    system: TriangularSystem  #: Triangular system of the data at x, without priors.
+    iterations: int  #: Number of iterations.
+    converged: bool  #: Whether the last step was negligible.
+    iterates: Array  #: All x from the start to the solution, shape (iterations + 1, p).
+    damping_state: DampingState = DampingState()  #: State to continue from (`warm_start`).
 
 
 def minimize(

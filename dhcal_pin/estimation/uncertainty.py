@@ -98,26 +98,19 @@ class Uncertainty:
     The rows of the square root are the twists [v, ω] of bodies 0 to k, then the e uncertain transmission
     coefficients. Body 0, the base link, counts in axes of the measuring frame; the other bodies count in
     their own link frames.
-
-    Attributes:
-        chain: Calibrated chain.
-        entries: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
-        sqrt_covariance: Square root of the covariance, shape (6(k+1)+e, r).
-        unbounded_directions: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
-        temperature: Factor on the variance of correlated residuals that the covariance contains.
-        model_std: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of
-            the orientation [rad] of the tool.
-        frame_part: Part of the square root and of the unbounded directions, shape (6(k+1)+e, r+h), that is
-            only another pose of a base or tool that the measurements leave free, see `frame_gauge`; shape
-            (0, 0) if they leave none free.
     """
 
-    chain: Chain
-    entries: Array
-    sqrt_covariance: Array
-    unbounded_directions: Array
-    temperature: float = 1.0
+    chain: Chain  #: Calibrated chain.
+    entries: Array  #: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
+    sqrt_covariance: Array  #: Square root of the covariance, shape (6(k+1)+e, r).
+    unbounded_directions: Array  #: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
+    temperature: float = 1.0  #: Factor on the variance of correlated residuals that the covariance contains.
+    #: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of the
+    #: orientation [rad] of the tool.
     model_std: tuple[float, float] = (0.0, 0.0)
+    #: Part of the square root and of the unbounded directions, shape (6(k+1)+e, r+h), that is only another
+    #: pose of a base or tool that the measurements leave free, see `frame_gauge`; shape (0, 0) if they leave
+    #: none free.
     frame_part: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property

@@ -19,52 +19,34 @@ from ..robot.urdf import Urdf
 
 @dataclass(frozen=True)
 class RobotSource:
-    """Robot that is to be written in another format.
+    """Robot that is to be written in another format."""
 
-    Attributes:
-        path: File that the robot was read from.
-        chain: The robot with base, tool and joint errors from its sidecar.
-        table: DH table of the file; None if the format holds none.
-        convention: Convention requested for a DH table; None if any will do.
-    """
-
-    path: str
-    chain: Chain
-    table: DHTable | None
-    convention: Convention | None
+    path: str  #: File that the robot was read from.
+    chain: Chain  #: The robot with base, tool and joint errors from its sidecar.
+    table: DHTable | None  #: DH table of the file; None if the format holds none.
+    convention: Convention | None  #: Convention requested for a DH table; None if any will do.
 
 
 class ConvertedRobot(NamedTuple):
-    """Text of a robot file, and notes on what the format could not hold.
+    """Text of a robot file, and notes on what the format could not hold."""
 
-    Attributes:
-        text: Content of the file.
-        notes: One sentence each.
-    """
-
-    text: str
-    notes: Sequence[str] = ()
+    text: str  #: Content of the file.
+    notes: Sequence[str] = ()  #: One sentence each.
 
 
 @dataclass(frozen=True)
 class RobotFormat:
-    """File format of a robot.
+    """File format of a robot."""
 
-    Attributes:
-        name: Name in help texts and messages.
-        endings: Recommended endings of file names, lower case.
-        convert: Function that returns the text of a robot at a path.
-        read_table: Function that reads a DH table; None if the format holds none.
-        read_urdf: Function that reads a URDF; None if the format holds none.
-        other_endings: Endings that are accepted, too.
-    """
-
-    name: str
-    endings: tuple[str, ...]
+    name: str  #: Name in help texts and messages.
+    endings: tuple[str, ...]  #: Recommended endings of file names, lower case.
+    #: Function that returns the text of a robot at a path.
     convert: Callable[[RobotSource, PathLike], ConvertedRobot]
+    #: Function that reads a DH table; None if the format holds none.
     read_table: Callable[[PathLike], DHTable] | None = None
+    #: Function that reads a URDF; None if the format holds none.
     read_urdf: Callable[[PathLike], Urdf] | None = None
-    other_endings: tuple[str, ...] = ()
+    other_endings: tuple[str, ...] = ()  #: Endings that are accepted, too.
 
     @property
     def is_readable(self) -> bool:

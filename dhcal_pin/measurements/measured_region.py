@@ -36,24 +36,15 @@ _CHUNK_SIZE = 128
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRegion:
-    """Region of joint space around measured configurations.
+    """Region of joint space around measured configurations."""
 
-    Attributes:
-        is_prismatic: Whether each joint is prismatic, (n,).
-        lower: Smallest measured value of each joint, (n,) [rad or m].
-        upper: Largest measured value of each joint, (n,) [rad or m].
-        spread: Standard deviation of the measured values of each joint, (n,) [rad or m].
-        configurations: Configurations that represent the region, (k, n) [rad or m].
-        radius: Largest distance from the nearest of them inside the region.
-        reach: Largest distance at which the accuracy was judged by leaving out regions; at least the radius.
-    """
-
-    is_prismatic: Array
-    lower: Array
-    upper: Array
-    spread: Array
-    configurations: Array
-    radius: float
+    is_prismatic: Array  #: Whether each joint is prismatic, (n,).
+    lower: Array  #: Smallest measured value of each joint, (n,) [rad or m].
+    upper: Array  #: Largest measured value of each joint, (n,) [rad or m].
+    spread: Array  #: Standard deviation of the measured values of each joint, (n,) [rad or m].
+    configurations: Array  #: Configurations that represent the region, (k, n) [rad or m].
+    radius: float  #: Largest distance from the nearest of them inside the region.
+    #: Largest distance at which the accuracy was judged by leaving out regions; at least the radius.
     reach: float
 
     @classmethod

@@ -58,29 +58,18 @@ def _rms(differences: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PaperExperiment:
-    """Result of the paper's experiment.
+    """Result of the paper's experiment."""
 
-    Attributes:
-        chain: Robot as designed (Table 3).
-        measurements: Table 5 as printed.
-        unreachable_rows: Its rows that the robot cannot reach.
-        data: Samples of the other rows.
-        fixed: Parameters that these positions cannot determine, and that are held.
-        fit: Least-squares calibration with these parameters held.
-        comparison: Its accuracy on each sample under the fit to all others, before and after.
-        rows: Description, RMS of the fitted samples and leave-one-out RMS of each variant [mm], as text.
-        figures: RMS position error of each variant by name [m].
-    """
-
-    chain: Chain
-    measurements: MeasurementFile
-    unreachable_rows: list[UnreachableRow]
-    data: Measurement
-    fixed: list[str]
-    fit: Result
-    comparison: Comparison
+    chain: Chain  #: Robot as designed (Table 3).
+    measurements: MeasurementFile  #: Table 5 as printed.
+    unreachable_rows: list[UnreachableRow]  #: Its rows that the robot cannot reach.
+    data: Measurement  #: Samples of the other rows.
+    fixed: list[str]  #: Parameters that these positions cannot determine, and that are held.
+    fit: Result  #: Least-squares calibration with these parameters held.
+    comparison: Comparison  #: Its accuracy on each sample under the fit to all others, before and after.
+    #: Description, RMS of the fitted samples and leave-one-out RMS of each variant [mm], as text.
     rows: list[list[str]]
-    figures: dict[str, float]
+    figures: dict[str, float]  #: RMS position error of each variant by name [m].
 
 
 def run_experiment() -> PaperExperiment:

@@ -70,24 +70,16 @@ class Simulation:
     """Runs of the paper's loop on a simulated arm.
 
     Parameters that no measurement of the actual arm determines do not count in the parameter errors.
-
-    Attributes:
-        angle: Largest angle error of the parameters by run and iteration, shape (seeds, steps+1) [rad].
-        length: Largest length error of the parameters by run and iteration, shape (seeds, steps+1) [m].
-        test: Largest position error over random test poses by run and iteration, shape (seeds, steps+1) [m].
-        residual: Largest whitened residual after the last iteration, shape (seeds,) [1 mm or 1 mrad].
-        rank: Rank of the stacked error factors at the nominal arm, first run.
-        rank_found: Rank at the arm that the first run ends with.
-        null_space: Whether no measurement of the actual arm determines a parameter, shape (p,).
     """
 
-    angle: Array
-    length: Array
+    angle: Array  #: Largest angle error of the parameters by run and iteration, shape (seeds, steps+1) [rad].
+    length: Array  #: Largest length error of the parameters by run and iteration, shape (seeds, steps+1) [m].
+    #: Largest position error over random test poses by run and iteration, shape (seeds, steps+1) [m].
     test: Array
-    residual: Array
-    rank: int
-    rank_found: int
-    null_space: Array
+    residual: Array  #: Largest whitened residual after the last iteration, shape (seeds,) [1 mm or 1 mrad].
+    rank: int  #: Rank of the stacked error factors at the nominal arm, first run.
+    rank_found: int  #: Rank at the arm that the first run ends with.
+    null_space: Array  #: Whether no measurement of the actual arm determines a parameter, shape (p,).
 
 
 def simulate(

@@ -48,33 +48,23 @@ ZERO_STD_RTOL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PlannedCalibration:
-    """Calibration whose measurements are planned; the options are those of `calibrate`.
+    """Calibration whose measurements are planned; the options are those of `calibrate`."""
 
-    Attributes:
-        chain: Nominal robot.
-        kind: Name in `KINDS`; "camera" with `images`.
-        noise: Standard deviations of a measurement [m, rad]; None for those of the existing measurements.
-        parameters: Parameter sets; None for those of the chain, or for images the default ones.
-        priors: Prior standard deviations.
-        fix: Parameters to fix.
-        free: Parameters to free.
-        data: Existing measurements.
-        known: Values of known instrument parameters.
-        prior_uncertainty: Uncertainty of the calibration that made the chain. It replaces the priors of the
-            parameters that the calibration estimated.
-        images: Cameras and boards of the kind "camera"; existing measurements are images by them.
-    """
-
-    chain: Chain
-    kind: str
+    chain: Chain  #: Nominal robot.
+    kind: str  #: Name in `KINDS`; "camera" with `images`.
+    #: Standard deviations of a measurement [m, rad]; None for those of the existing measurements.
     noise: Noise | None
+    #: Parameter sets; None for those of the chain, or for images the default ones.
     parameters: str | None = None
-    priors: Priors = "default"
-    fix: Sequence[str] = ()
-    free: Sequence[str] = ()
-    data: Sequence[Measurement] = ()
-    known: Mapping[str, float] = field(default_factory=dict)
+    priors: Priors = "default"  #: Prior standard deviations.
+    fix: Sequence[str] = ()  #: Parameters to fix.
+    free: Sequence[str] = ()  #: Parameters to free.
+    data: Sequence[Measurement] = ()  #: Existing measurements.
+    known: Mapping[str, float] = field(default_factory=dict)  #: Values of known instrument parameters.
+    #: Uncertainty of the calibration that made the chain. It replaces the priors of the parameters that the
+    #: calibration estimated.
     prior_uncertainty: Uncertainty | None = None
+    #: Cameras and boards of the kind "camera"; existing measurements are images by them.
     images: PlannedImages | None = None
 
     def with_free_points(self, boards: Collection[str]) -> PlannedCalibration:
@@ -91,28 +81,17 @@ class Information:
     Shapes: p robot parameters, s instrument parameters of the kind, s' further unknowns of instruments. The
     unknowns are the robot parameters, then the instrument parameters, in units of their prior standard
     deviations.
-
-    Attributes:
-        errors: Error model of the robot.
-        x: Present values of the robot parameters, shape (p,) [m or rad].
-        instrument: Source of the measurements.
-        instrument_values: Values of the kind's instrument parameters, shape (s,).
-        instrument_columns: Column of each of them among the unknowns, -1 if it is known, shape (s,).
-        prior_sigma: Prior standard deviations of the unknowns, shape (p+s',) [m or rad].
-        prior_factor: R factor of priors and existing measurements, shape (p+s', p+s').
-        data_factor: R factor of the existing measurements alone, shape (p+s', p+s') or (0, p+s').
-        fitted: Whether the fit estimates each unknown, shape (p+s',). It takes the others as zero.
     """
 
-    errors: ErrorModel
-    x: Array
-    instrument: Instrument
-    instrument_values: Array
-    instrument_columns: Array
-    prior_sigma: Array
-    prior_factor: Array
-    data_factor: Array
-    fitted: Array
+    errors: ErrorModel  #: Error model of the robot.
+    x: Array  #: Present values of the robot parameters, shape (p,) [m or rad].
+    instrument: Instrument  #: Source of the measurements.
+    instrument_values: Array  #: Values of the kind's instrument parameters, shape (s,).
+    instrument_columns: Array  #: Column of each of them among the unknowns, -1 if it is known, shape (s,).
+    prior_sigma: Array  #: Prior standard deviations of the unknowns, shape (p+s',) [m or rad].
+    prior_factor: Array  #: R factor of priors and existing measurements, shape (p+s', p+s').
+    data_factor: Array  #: R factor of the existing measurements alone, shape (p+s', p+s') or (0, p+s').
+    fitted: Array  #: Whether the fit estimates each unknown, shape (p+s',). It takes the others as zero.
 
     @cached_property
     def _model(self) -> PresentModel:

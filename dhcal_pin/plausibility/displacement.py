@@ -29,19 +29,12 @@ _MIN_RELATIVE = 0.5
 
 @dataclass(frozen=True)
 class CorrectionSize:
-    """Largest displacement by a correction.
+    """Largest displacement by a correction."""
 
-    Attributes:
-        frame: "tool", or the name of a joint whose axis moves.
-        displacement: RMS over the configurations [m], or [rad] if `is_angle`.
-        expected: The same for robots with errors drawn from the default priors.
-        is_angle: Whether the direction of the axis changes most, rather than its place.
-    """
-
-    frame: str
-    displacement: float
-    expected: float
-    is_angle: bool
+    frame: str  #: "tool", or the name of a joint whose axis moves.
+    displacement: float  #: RMS over the configurations [m], or [rad] if `is_angle`.
+    expected: float  #: The same for robots with errors drawn from the default priors.
+    is_angle: bool  #: Whether the direction of the axis changes most, rather than its place.
 
     @property
     def ratio(self) -> float:

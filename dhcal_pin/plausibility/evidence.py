@@ -64,19 +64,13 @@ _OUTLIER_RATIO = 4.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence of measurements for a robot with small errors.
+    """Evidence of measurements for a robot with small errors."""
 
-    Attributes:
-        log: Logarithm of the evidence, up to a constant that depends on number and kind of the samples only.
-        width: Errors of the robot, in default standard deviations.
-        length_scale: Standard deviation of a length residual [m]; NaN if no lengths are measured.
-        angle_scale: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
-    """
-
+    #: Logarithm of the evidence, up to a constant that depends on number and kind of the samples only.
     log: float
-    width: float
-    length_scale: float
-    angle_scale: float
+    width: float  #: Errors of the robot, in default standard deviations.
+    length_scale: float  #: Standard deviation of a length residual [m]; NaN if no lengths are measured.
+    angle_scale: float  #: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
 
 
 def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:

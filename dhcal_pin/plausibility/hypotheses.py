@@ -219,17 +219,11 @@ def _quaternion_to_matrix(quaternions: Array) -> Array:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Assumption about what was mixed up.
+    """Assumption about what was mixed up."""
 
-    Attributes:
-        key: Short name, by which users select the change.
-        description: What was mixed up, as a clause.
-        change: Change that undoes it.
-    """
-
-    key: str
-    description: str
-    change: Change
+    key: str  #: Short name, by which users select the change.
+    description: str  #: What was mixed up, as a clause.
+    change: Change  #: Change that undoes it.
 
     def apply(self, data: Sequence[Measurement]) -> list[Measurement] | None:
         """Undo the mistake in measurements."""

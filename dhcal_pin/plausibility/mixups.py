@@ -49,20 +49,14 @@ _N_SAMPLES, _N_ROWS, _MIN_SAMPLES_PER_ITEM = 50, 200, 8
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Hypotheses that explain measurements decisively better than the measurements as they were read.
+    """Hypotheses that explain measurements decisively better than the measurements as they were read."""
 
-    Attributes:
-        before: Evidence of the measurements as they were read.
-        hypotheses: Equivalent hypotheses, the simplest first; empty if none is decisive.
-        after: Evidence with the first hypothesis.
-        source: File that the hypotheses are about; empty for all measurements together.
-        fits_separately: Whether each of several measurements fits the robot, but not all of them together.
-    """
-
-    before: Evidence
+    before: Evidence  #: Evidence of the measurements as they were read.
+    #: Equivalent hypotheses, the simplest first; empty if none is decisive.
     hypotheses: tuple[Hypothesis, ...] = ()
-    after: Evidence | None = None
-    source: str = ""
+    after: Evidence | None = None  #: Evidence with the first hypothesis.
+    source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
+    #: Whether each of several measurements fits the robot, but not all of them together.
     fits_separately: bool = False
 
     @property

@@ -17,15 +17,10 @@ from .samples import Samples, result_samples
 
 @dataclass(frozen=True, eq=False)
 class ReportContext:
-    """A result with everything that its sections and figures need.
+    """A result with everything that its sections and figures need."""
 
-    Attributes:
-        fit: Result of the calibration.
-        source: Files, settings and other facts that the result does not contain.
-    """
-
-    fit: Result
-    source: Provenance
+    fit: Result  #: Result of the calibration.
+    source: Provenance  #: Files, settings and other facts that the result does not contain.
 
     @cached_property
     def outliers(self) -> Sequence[Outlier]:

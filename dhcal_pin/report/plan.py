@@ -22,31 +22,18 @@ from .samples import Samples, samples_section
 
 @dataclass(frozen=True, eq=False)
 class PlanReport:
-    """Plan and what its page shows beside it.
+    """Plan and what its page shows beside it."""
 
-    Attributes:
-        plan: Plan.
-        chain: Robot.
-        name: Name of the robot.
-        file: Name of the file with the poses.
-        first_line: Line of the first pose in this file.
-        text: Content of this file.
-        moves: Sentences on the moves between the poses.
-        scene: Page of a 3-D scene with the poses.
-        inputs: SHA-256 of each input file by path.
-        pixel_sigma: Standard deviation of the corners of planned images [px].
-    """
-
-    plan: Plan
-    chain: Chain
-    name: str
-    file: str
-    first_line: int
-    text: str
-    moves: Sequence[str]
-    scene: str
-    inputs: Mapping[str, str] = field(default_factory=dict)
-    pixel_sigma: float = float("nan")
+    plan: Plan  #: Plan.
+    chain: Chain  #: Robot.
+    name: str  #: Name of the robot.
+    file: str  #: Name of the file with the poses.
+    first_line: int  #: Line of the first pose in this file.
+    text: str  #: Content of this file.
+    moves: Sequence[str]  #: Sentences on the moves between the poses.
+    scene: str  #: Page of a 3-D scene with the poses.
+    inputs: Mapping[str, str] = field(default_factory=dict)  #: SHA-256 of each input file by path.
+    pixel_sigma: float = float("nan")  #: Standard deviation of the corners of planned images [px].
 
 
 def plan_page(report: PlanReport) -> str:

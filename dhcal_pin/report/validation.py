@@ -25,33 +25,21 @@ from .samples import Samples, measured_samples, samples_section
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Accuracy of a robot on measurements.
+    """Accuracy of a robot on measurements."""
 
-    Attributes:
-        name: Name of the robot.
-        chain: Robot, with the base and tool that it was judged with.
-        data: Measurements.
-        known: Values of their instrument parameters by name [m or rad]; others are fitted to the data.
-        paths: File of each measurement.
-        accuracies: Accuracy by the name of the model; the last one is that of `chain`.
-        reference: Nominal robot and the instrument parameters it was judged with, if there is one.
-        remarks: Sentences on the figures.
-        warnings: What a reader must know before relying on the figures.
-        notes: What of the input is not used.
-        inputs: SHA-256 of each input file by path.
-    """
-
-    name: str
-    chain: Chain
-    data: Sequence[Measurement]
+    name: str  #: Name of the robot.
+    chain: Chain  #: Robot, with the base and tool that it was judged with.
+    data: Sequence[Measurement]  #: Measurements.
+    #: Values of their instrument parameters by name [m or rad]; others are fitted to the data.
     known: Mapping[str, float]
-    paths: Sequence[str]
-    accuracies: Mapping[str, Accuracy]
+    paths: Sequence[str]  #: File of each measurement.
+    accuracies: Mapping[str, Accuracy]  #: Accuracy by the name of the model; the last one is that of `chain`.
+    #: Nominal robot and the instrument parameters it was judged with, if there is one.
     reference: tuple[Chain, Mapping[str, float]] | None = None
-    remarks: Sequence[str] = ()
-    warnings: Sequence[str] = ()
-    notes: Sequence[str] = ()
-    inputs: Mapping[str, str] = field(default_factory=dict)
+    remarks: Sequence[str] = ()  #: Sentences on the figures.
+    warnings: Sequence[str] = ()  #: What a reader must know before relying on the figures.
+    notes: Sequence[str] = ()  #: What of the input is not used.
+    inputs: Mapping[str, str] = field(default_factory=dict)  #: SHA-256 of each input file by path.
 
 
 def validation_page(validation: Validation) -> str:

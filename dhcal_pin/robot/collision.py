@@ -89,19 +89,12 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class CollisionChecker:
-    """Collision checks of a robot.
+    """Collision checks of a robot."""
 
-    Attributes:
-        chain: Kinematic chain of the robot.
-        geometry: Pinocchio's collision shapes and the pairs to check; None if there is nothing to check.
-        note: What is not checked and why, or an empty text.
-        n_robot_shapes: Number of shapes of the robot, which precede those of floor and obstacles.
-    """
-
-    chain: Chain
-    geometry: Any
-    note: str = ""
-    n_robot_shapes: int = 0
+    chain: Chain  #: Kinematic chain of the robot.
+    geometry: Any  #: Pinocchio's collision shapes and the pairs to check; None if there is nothing to check.
+    note: str = ""  #: What is not checked and why, or an empty text.
+    n_robot_shapes: int = 0  #: Number of shapes of the robot, which precede those of floor and obstacles.
 
     @classmethod
     def from_chain(cls, chain: Chain, obstacles: Sequence[Obstacle] = ()) -> CollisionChecker:

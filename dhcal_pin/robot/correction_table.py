@@ -32,17 +32,11 @@ _STEP_TOL, _MAX_STEPS = 1e-15, 50
 
 @dataclass(frozen=True, eq=False)
 class JointCorrection:
-    """Correction of one joint over its range.
+    """Correction of one joint over its range."""
 
-    Attributes:
-        joint: Name of the joint.
-        values: Joint values that are meant, ascending, shape (m,) [rad].
-        corrections: Angles to add to them before they are commanded, shape (m,) [rad].
-    """
-
-    joint: str
-    values: Array
-    corrections: Array
+    joint: str  #: Name of the joint.
+    values: Array  #: Joint values that are meant, ascending, shape (m,) [rad].
+    corrections: Array  #: Angles to add to them before they are commanded, shape (m,) [rad].
 
 
 def joint_corrections(chain: Chain) -> list[JointCorrection]:

@@ -44,19 +44,12 @@ _MIN_REPETITIONS = 2
 
 @dataclass(frozen=True, eq=False)
 class JointCoverage:
-    """Parts of a turn that a revolute joint visited.
+    """Parts of a turn that a revolute joint visited."""
 
-    Attributes:
-        joint: Name of the joint.
-        values: Joint values of the different configurations, shape (m,) [rad].
-        counts: Number of configurations in each bin, shape (b,).
-        is_in_range: Whether each bin is within the joint limits, shape (b,).
-    """
-
-    joint: str
-    values: Array
-    counts: Array
-    is_in_range: Array
+    joint: str  #: Name of the joint.
+    values: Array  #: Joint values of the different configurations, shape (m,) [rad].
+    counts: Array  #: Number of configurations in each bin, shape (b,).
+    is_in_range: Array  #: Whether each bin is within the joint limits, shape (b,).
 
     @property
     def n_in_range(self) -> int:

@@ -65,16 +65,11 @@ class Extraction:
         origins[·] ← origins[·] · F_i · exp(ε ξ) · F_i⁻¹
 
     with ξ along x, about x or about y. Changes of θ and d act about and along z of the joint's own frame.
-
-    Attributes:
-        table: Table with base and tool; its poses are those of the origins at every q.
-        frames: Frames F_i, shape (n, 4, 4) [m].
-        notes: One sentence for every pair of axes whose row has β.
     """
 
-    table: DHTable
-    frames: Array
-    notes: tuple[str, ...]
+    table: DHTable  #: Table with base and tool; its poses are those of the origins at every q.
+    frames: Array  #: Frames F_i, shape (n, 4, 4) [m].
+    notes: tuple[str, ...]  #: One sentence for every pair of axes whose row has β.
 
 
 @dataclass(frozen=True)

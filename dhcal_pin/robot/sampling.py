@@ -105,21 +105,13 @@ def _is_prismatic(chain: Chain) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ConfigurationSampler:
-    """Sampler of configurations that a robot can take.
+    """Sampler of configurations that a robot can take."""
 
-    Attributes:
-        chain: Kinematic chain with base and tool as far as they are known.
-        workspace: Constraints of the tool pose.
-        low: Lowest joint positions, shape (n,) [rad or m].
-        high: Highest joint positions, shape (n,) [rad or m].
-        collision: Collision checks of the robot.
-    """
-
-    chain: Chain
-    workspace: WorkspaceConstraints
-    low: Array
-    high: Array
-    collision: CollisionChecker
+    chain: Chain  #: Kinematic chain with base and tool as far as they are known.
+    workspace: WorkspaceConstraints  #: Constraints of the tool pose.
+    low: Array  #: Lowest joint positions, shape (n,) [rad or m].
+    high: Array  #: Highest joint positions, shape (n,) [rad or m].
+    collision: CollisionChecker  #: Collision checks of the robot.
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -93,61 +93,39 @@ class UrdfTag:
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """Joint of a URDF.
+    """Joint of a URDF."""
 
-    Attributes:
-        name: Name, unique among the joints.
-        type: "revolute", "continuous", "prismatic", "fixed", "floating" or "planar".
-        parent: Name of the parent link.
-        child: Name of the child link.
-        origin: Pose of the joint frame in the parent link, shape (4, 4) [m]; identity if the file has none.
-        rpy: Roll, pitch and yaw of the origin as in the file, shape (3,) [rad]; zeros if the file has none.
-        axis: Unit axis in the joint frame, shape (3,); (1, 0, 0) if the file has none.
-        lower: Lower limit [rad or m]; -inf if the file has none and for continuous joints.
-        upper: Upper limit [rad or m]; inf if the file has none and for continuous joints.
-        mimic: Name of the joint that this joint mimics, multiplier and offset; None if it mimics none.
-        line: Line of the tag, from 1.
-        start: Byte offset of the tag.
-        first_child: Byte offset of the first child element.
-        origin_start: Byte offset of the <origin> tag; None if the file has none.
-    """
-
-    name: str
-    type: str
-    parent: str
-    child: str
+    name: str  #: Name, unique among the joints.
+    type: str  #: "revolute", "continuous", "prismatic", "fixed", "floating" or "planar".
+    parent: str  #: Name of the parent link.
+    child: str  #: Name of the child link.
+    #: Pose of the joint frame in the parent link, shape (4, 4) [m]; identity if the file has none.
     origin: Array
+    #: Roll, pitch and yaw of the origin as in the file, shape (3,) [rad]; zeros if the file has none.
     rpy: Array
-    axis: Array
-    lower: float
-    upper: float
+    axis: Array  #: Unit axis in the joint frame, shape (3,); (1, 0, 0) if the file has none.
+    lower: float  #: Lower limit [rad or m]; -inf if the file has none and for continuous joints.
+    upper: float  #: Upper limit [rad or m]; inf if the file has none and for continuous joints.
+    #: Name of the joint that this joint mimics, multiplier and offset; None if it mimics none.
     mimic: tuple[str, float, float] | None
-    line: int
-    start: int = field(repr=False)
-    first_child: int = field(repr=False)
+    line: int  #: Line of the tag, from 1.
+    start: int = field(repr=False)  #: Byte offset of the tag.
+    first_child: int = field(repr=False)  #: Byte offset of the first child element.
+    #: Byte offset of the <origin> tag; None if the file has none.
     origin_start: int | None = field(repr=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Urdf:
-    """URDF file that passed all checks: its links and joints form one tree.
+    """URDF file that passed all checks: its links and joints form one tree."""
 
-    Attributes:
-        source: Path of the file, or another name for messages.
-        data: Bytes of the file.
-        name: Name of the robot.
-        links: Names of the links in the order of the file.
-        joints: Joints in the order of the file.
-        root: Name of the link without a parent.
-        package_dirs: Folders in which packages with meshes are searched first, see `mesh_folders`.
-    """
-
-    source: str
-    data: bytes = field(repr=False)
-    name: str
-    links: tuple[str, ...]
-    joints: tuple[UrdfJoint, ...]
-    root: str
+    source: str  #: Path of the file, or another name for messages.
+    data: bytes = field(repr=False)  #: Bytes of the file.
+    name: str  #: Name of the robot.
+    links: tuple[str, ...]  #: Names of the links in the order of the file.
+    joints: tuple[UrdfJoint, ...]  #: Joints in the order of the file.
+    root: str  #: Name of the link without a parent.
+    #: Folders in which packages with meshes are searched first, see `mesh_folders`.
     package_dirs: tuple[str, ...] = ()
 
     @cached_property

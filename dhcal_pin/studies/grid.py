@@ -55,40 +55,25 @@ PLANNED = "planned"
 
 @dataclass(frozen=True)
 class Setting:
-    """One combination of the grid; every entry can be a list in the file.
+    """One combination of the grid; every entry can be a list in the file."""
 
-    Attributes:
-        robot: File of the nominal robot, in the folder of the study or part of the package, or
-            `example:NAME` for a robot of example-robot-data.
-        tip: Tip link of URDFs; by default the deepest leaf.
-        truth: File of the true robot; by default true robots are nominal robots with random errors.
-        error_std: Standard deviations of the random errors, length and angle.
-        error_parameters: Parameter sets of the random errors.
-        parameters: Parameter sets that are estimated.
-        kind: Measurement kind without instrument parameters.
-        noise: Standard deviations of the measurement noise per axis, length and angle.
-        poses: Number of measured poses.
-        pose_selection: Selection of the poses, one of `POSE_SELECTIONS`.
-        resample_each_iteration: Whether new poses are drawn for each iteration; not for planned poses.
-        method: "lm" or "gn".
-        priors: "default" or "none".
-        iterations: Maximum number of iterations.
-    """
-
+    #: File of the nominal robot, in the folder of the study or part of the package, or a robot of
+    #: example-robot-data, written as `example:NAME`.
     robot: str
-    tip: str = ""
-    truth: str = ""
-    error_std: str = "1mm,0.3deg"
-    error_parameters: str = "placement"
-    parameters: str = "minimal,base,tool"
-    kind: str = "position"
-    noise: str = "0.1mm,0.01deg"
-    poses: int = 30
-    pose_selection: str = "random"
+    tip: str = ""  #: Tip link of URDFs; by default the deepest leaf.
+    truth: str = ""  #: File of the true robot; by default true robots are nominal robots with random errors.
+    error_std: str = "1mm,0.3deg"  #: Standard deviations of the random errors, length and angle.
+    error_parameters: str = "placement"  #: Parameter sets of the random errors.
+    parameters: str = "minimal,base,tool"  #: Parameter sets that are estimated.
+    kind: str = "position"  #: Measurement kind without instrument parameters.
+    noise: str = "0.1mm,0.01deg"  #: Standard deviations of the measurement noise per axis, length and angle.
+    poses: int = 30  #: Number of measured poses.
+    pose_selection: str = "random"  #: Selection of the poses, one of `POSE_SELECTIONS`.
+    #: Whether new poses are drawn for each iteration; not for planned poses.
     resample_each_iteration: bool = False
-    method: str = "lm"
-    priors: str = "default"
-    iterations: int = 100
+    method: str = "lm"  #: "lm" or "gn".
+    priors: str = "default"  #: "default" or "none".
+    iterations: int = 100  #: Maximum number of iterations.
 
 
 def _setting_key(field: Field[Any]) -> Key:
@@ -132,18 +117,12 @@ POSE_SELECTIONS = (*SAMPLERS, PLANNED)
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Setting with its robots.
+    """Setting with its robots."""
 
-    Attributes:
-        setting: Setting to simulate.
-        nominal: Nominal robot.
-        truth: True robot; None if the errors of each robot are random.
-        poses: Joint positions that all robots take, shape (poses, n) [rad or m]; None if each draws its own.
-    """
-
-    setting: Setting
-    nominal: Chain
-    truth: Chain | None
+    setting: Setting  #: Setting to simulate.
+    nominal: Chain  #: Nominal robot.
+    truth: Chain | None  #: True robot; None if the errors of each robot are random.
+    #: Joint positions that all robots take, shape (poses, n) [rad or m]; None if each draws its own.
     poses: Array | None = None
 
     def plan_poses(self, count: int, candidates: int = _N_CANDIDATES) -> Array:
@@ -171,21 +150,13 @@ Task = tuple[Case, int, int]
 
 @dataclass(frozen=True, eq=False)
 class StudyGrid:
-    """Grid of settings with the number of calibrations of each.
+    """Grid of settings with the number of calibrations of each."""
 
-    Attributes:
-        title: Question that the study answers.
-        seeds: Number of calibrations of each setting, with the seeds 0, 1, ….
-        cases: Settings in the order of the lists in the file; the last list varies fastest.
-        digest: Hash of everything that determines the result.
-        robots: Paths of the robot files.
-    """
-
-    title: str
-    seeds: int
-    cases: tuple[Case, ...]
-    digest: str
-    robots: tuple[str, ...]
+    title: str  #: Question that the study answers.
+    seeds: int  #: Number of calibrations of each setting, with the seeds 0, 1, ….
+    cases: tuple[Case, ...]  #: Settings in the order of the lists in the file; the last list varies fastest.
+    digest: str  #: Hash of everything that determines the result.
+    robots: tuple[str, ...]  #: Paths of the robot files.
 
     def tasks(self) -> list[Task]:
         """Return the blocks of calibrations, in the order of the cases."""

@@ -62,33 +62,22 @@ _MAX_NORM_ERROR = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MeasurementFile:
-    """Content of a measurement file.
+    """Content of a measurement file."""
 
-    Attributes:
-        source: Name of the file.
-        data: Samples of all rows.
-        fit: Samples to be fitted: all, or those whose column `set` says so.
-        holdout: Samples that the column `set` holds out.
-        commanded: Positions that the controller was commanded to, shape (m, 3) [m]; None without the columns.
-        measured_after: Positions measured again with calibrated parameters, shape (m, 3) [m]; None without
-            the columns.
-        values: Columns of measured values, shape (m,) each, in SI units or as text.
-        units: Unit that each column was written in.
-        notes: Sentences on what of the file is not used: columns, skipped rows, sheets.
-        bad_rows: Reason why a row was skipped, by line.
-        other_moving_joints: Joints of the robot that move in the file, but not the tip of the chain.
-    """
-
-    source: str
-    data: Measurement
-    fit: Measurement
-    holdout: Measurement
+    source: str  #: Name of the file.
+    data: Measurement  #: Samples of all rows.
+    fit: Measurement  #: Samples to be fitted, which are all, or those whose column `set` says so.
+    holdout: Measurement  #: Samples that the column `set` holds out.
+    #: Positions that the controller was commanded to, shape (m, 3) [m]; None without the columns.
     commanded: Array | None
+    #: Positions measured again with calibrated parameters, shape (m, 3) [m]; None without the columns.
     measured_after: Array | None
+    #: Columns of measured values, shape (m,) each, in SI units or as text.
     values: Mapping[str, Any] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    bad_rows: Mapping[int, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)  #: Unit that each column was written in.
+    notes: tuple[str, ...] = ()  #: Sentences on columns, rows and sheets that are not used.
+    bad_rows: Mapping[int, str] = field(default_factory=dict)  #: Reason why a row was skipped, by line.
+    #: Joints of the robot that move in the file, but not the tip of the chain.
     other_moving_joints: tuple[str, ...] = ()
 
 

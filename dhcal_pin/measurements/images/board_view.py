@@ -12,21 +12,15 @@ from ..mounting import MountedRig
 
 @dataclass(frozen=True)
 class ViewLimits:
-    """Limits of a useful view of a board.
+    """Limits of a useful view of a board."""
 
-    Attributes:
-        min_distance: Smallest distance of the middle of the board from the camera [m]: nearer is not sharp.
-        max_distance: Largest distance [m].
-        max_angle: Largest angle between the normal of the board and the line of sight [rad].
-        min_share: Smallest share of the corners in the image.
-        margin: Distance of a corner from the edge of the image [px].
-    """
-
+    #: Smallest distance of the middle of the board from the camera [m]; nearer is not sharp.
     min_distance: float = 0.2
-    max_distance: float = 1.5
+    max_distance: float = 1.5  #: Largest distance [m].
+    #: Largest angle between the normal of the board and the line of sight [rad].
     max_angle: float = np.deg2rad(50.0)
-    min_share: float = 1.0
-    margin: float = 10.0
+    min_share: float = 1.0  #: Smallest share of the corners in the image.
+    margin: float = 10.0  #: Distance of a corner from the edge of the image [px].
 
 
 def project_board(rig: MountedRig, camera: int, board: int, poses: Array) -> tuple[Array, Array]:
