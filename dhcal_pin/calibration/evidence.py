@@ -52,6 +52,8 @@ class Evidence(FittedModel):
             images, and without images.
         board_size: Other size of the boards that makes the correction of the arm far smaller, if any.
         is_kept_nominal: Whether the correction was not applied because of the verdict.
+        earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
+            if they were.
     """
 
     region_comparison: Comparison | None = None
@@ -60,6 +62,7 @@ class Evidence(FittedModel):
     hand_eye_fit: HandEyeFit | None = None
     board_size: BoardSize | None = None
     is_kept_nominal: bool = False
+    earlier_diagnosis: Diagnosis | None = None
 
     @property
     def shrinkage_notes(self) -> list[str]:
@@ -99,7 +102,7 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
-        return diagnose_mixups(self.errors.chain, self.data)
+        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

@@ -231,7 +231,8 @@ def _calibrate_samples(
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = model_selection.extend(fit, families, max_iterations, progress)
-    return replace(make_result(fit, shrinkage_factor, holdout, "lm"), extension=extension)
+    extended = make_result(fit, shrinkage_factor, holdout, "lm")
+    return replace(extended, extension=extension, earlier_diagnosis=result.diagnosis)
 
 
 def _initialize(
