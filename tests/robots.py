@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dhcal_pin import se3
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.io import read_dh
 from dhcal_pin.robot import Chain, DHTable, parse_urdf
 
@@ -124,6 +125,12 @@ def with_random_frames(chain: Chain, rng: np.random.Generator) -> Chain:
     base = se3.transform(random_rotation(rng), offset(5.0))
     tool = se3.transform(random_rotation(rng), offset(0.5))
     return chain.perturbed_at({0: base, chain.tool_frame_index: tool})
+
+
+def with_small_errors(chain: Chain, rng: np.random.Generator, size: float = 1e-3) -> Chain:
+    """Return an arm with errors of a size [m] and [rad], which nobody takes for mixed-up measurements."""
+    errors = select_parameters(chain, chain.parameters)
+    return errors.at(size * rng.standard_normal(len(errors.parameters)))
 
 
 def measured_arm(name: str) -> Chain:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import json_of, stdout_of, unfolded
 from recordings import JOINTS, POSES, Recording, write_bag
-from robots import URDF, paper
+from robots import URDF, paper, with_small_errors
 from rosbags.rosbag1 import ReaderError
 
 from dhcal_pin import se3
@@ -24,7 +24,8 @@ NOMINAL = URDF / "sim_6dof.dh.toml"
 def arm():
     """Arm with errors, in front of a tracker."""
     base = se3.exp6(np.array([2.0, -1, 0.5, 0.1, 0.2, 2]))
-    return Chain.from_dh(paper("sim_6dof_actual")).with_base_and_tool(base, np.eye(4))
+    true = with_small_errors(Chain.from_dh(paper("sim_6dof")), np.random.default_rng(0))
+    return true.with_base_and_tool(base, np.eye(4))
 
 
 @pytest.fixture

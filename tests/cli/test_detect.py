@@ -63,9 +63,10 @@ def test_corners_of_photographs_with_joint_values(run, photographs):
 
 
 def test_exchanged_rows_and_columns_are_named(run, photographs):
-    stdout_of(run("detect", photographs, "--rig", "rig.toml", "-o", "right.csv"))
+    images = sorted(photographs.iterdir())[::3]
+    stdout_of(run("detect", *images, "--rig", "rig.toml", "-o", "right.csv"))
     Path("rig.toml").write_text(RIG.format(columns=7, rows=5))
-    status, _, err = run("detect", photographs, "--rig", "rig.toml", "-o", "corners.csv")
+    status, _, err = run("detect", *images, "--rig", "rig.toml", "-o", "corners.csv")
     assert status == 0
     assert "was printed with columns = 5, rows = 7" in unfolded(err)
     # The same corners, under the numbers of the other board.
@@ -73,7 +74,7 @@ def test_exchanged_rows_and_columns_are_named(run, photographs):
         np.array([[float(r["u[px]"]), float(r["v[px]"])] for r in rows_of(name)])
         for name in ("right.csv", "corners.csv")
     ]
-    assert len(pixels[1]) == 309
+    assert len(pixels[0]) == len(pixels[1]) > 100
     first, second = (each[np.lexsort(each.T)] for each in pixels)
     np.testing.assert_allclose(first, second)
 

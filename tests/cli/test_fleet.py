@@ -166,7 +166,8 @@ def test_killed_process_does_not_stop_the_others(cells):
 
 def test_interrupt_leaves_complete_files(cells):
     write_manifest(
-        cells, "".join(job("arm.dh.toml", f"{i}.urdf", 'parameters = "offset"') for i in range(12))
+        cells,
+        "".join(job("arm.dh.toml", f"{i}.urdf", 'parameters = "dh"', 'extend = "none"') for i in range(12)),
     )
     command = [sys.executable, "-m", "dhcal_pin.cli", *RUN, "--jobs", "1", "--verbose"]
     root = str(URDF.parent)

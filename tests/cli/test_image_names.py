@@ -41,11 +41,11 @@ def corners(robot_folder):
     return lines, names
 
 
-def calibrate(run):
+def calibrate(run, *outputs):
     """Calibrate the poses; return what the screen says, and the JSON."""
     result = run(
         *("calibrate", "example:ur10", "corners.csv", "--rig", "rig.toml", "--tip", "tool0", "--force"),
-        *("--parameters", "camera,board", "-o", "arm.urdf", "--report", "report.html"),
+        *("--parameters", "camera,board", "-o", "arm.urdf", *outputs),
         *("--residuals", "residuals.csv", "--json", "-"),
     )
     return unfolded(result[2]), json_of(result)
@@ -54,7 +54,7 @@ def calibrate(run):
 def test_photographs_are_named(run, corners):
     named = [f"{line},{name}" for line, name in zip(*corners, strict=True)]
     Path("corners.csv").write_text("\n".join(named))
-    screen, result = calibrate(run)
+    screen, result = calibrate(run, "--report", "report.html")
     n = len(corners[0]) - 1
     n_held = n * N_HELD_OUT // N_IMAGES
     assert f"{n} rows, camera, {N_IMAGES} images" in screen
