@@ -102,7 +102,7 @@ def examples(tmp_path_factory):
 
 
 def _write_images() -> None:
-    """Write the rig file of the guide to cameras, and 60 images of its board by a UR10 with errors."""
+    """Write the rig file of the guide to cameras, and 36 images of its board by a UR10 with errors."""
     texts = [text for _, text, _ in blocks(ROOT / "docs" / "howto" / "camera.md")]
     Path("charuco_rig.toml").write_text(next(text for text in texts if text.startswith("# file:")))
     rng = np.random.default_rng(0)
@@ -121,7 +121,7 @@ def _write_images() -> None:
         {board.name: replace(board, pose=tool @ mounted @ middle @ corner)},
     )
     rows = visible_corners(actual, mount_rig(placed, arm), home + 0.35 * rng.standard_normal((400, 6)))
-    q, _, _, corners, pixels = (np.concatenate(each) for each in zip(*rows[:60], strict=True))
+    q, _, _, corners, pixels = (np.concatenate(each) for each in zip(*rows[:36], strict=True))
     pixels = pixels + 0.1 * rng.standard_normal(pixels.shape)
     images = CameraCorners(q, pixels, corners, mount_rig(rig, arm))
     Path("corners.csv").write_text(measurement_text(images, arm))

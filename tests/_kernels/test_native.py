@@ -314,19 +314,25 @@ assert (_kernels.propagate_frames.__module__ == "dhcal_pin._kernels.native") == 
 nominal, actual = Chain.from_dh(paper("sim_6dof")), Chain.from_dh(paper("sim_6dof_actual"))
 rng = np.random.default_rng(0)
 data = Pose.simulate(actual, rng.uniform(-3, 3, (90, 6)), Noise(1e-4, 1e-4), rng)
-fit = calibrate(nominal, data, sys.argv[2])
+fit = calibrate(nominal, data, sys.argv[2], extend=sys.argv[3])
 print(json.dumps([fit.converged, fit.x.tolist(), fit.std.tolist()]))
 """
 
 
-@pytest.mark.parametrize("sets", some_slow(["dh", "dh,harmonics", "dh,harmonics,curves"], {1}))
-def test_calibration_without_compiled_kernels_gives_the_same_values(sets):
+@pytest.mark.parametrize(
+    ("sets", "extend"),
+    some_slow(
+        [("dh", "auto"), ("dh,harmonics", "none"), ("dh,harmonics", "auto"), ("dh,harmonics,curves", "auto")],
+        {1},
+    ),
+)
+def test_calibration_without_compiled_kernels_gives_the_same_values(sets, extend):
     places = Path(native.__file__).parents[2], ROOT / "tests"
     environ = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, map(Path.resolve, places)))}
     ends = [
         json.loads(
             subprocess.run(
-                [sys.executable, "-c", CALIBRATION, way, sets],
+                [sys.executable, "-c", CALIBRATION, way, sets, extend],
                 env=environ,
                 capture_output=True,
                 text=True,

@@ -110,13 +110,18 @@ NOTED_FORMS = {
 }
 
 
+# Parameters of the plain file, which are computed once.
+PLAIN = {}
+
+
 @pytest.fixture
 def expected(run, robot_folder):
-    """Return the parameters of the plain file, which is then removed."""
-    write("data.csv", TEXT)
-    parameters = json_of(run(*CALIBRATE, "--json", "-"))["parameters"]
+    """Return the parameters of the plain file; no measurement file is left."""
+    if not PLAIN:
+        write("data.csv", TEXT)
+        PLAIN["parameters"] = json_of(run(*CALIBRATE, "--json", "-"))["parameters"]
     Path("data.csv").unlink()
-    return parameters
+    return PLAIN["parameters"]
 
 
 def calibrate(run, *options):

@@ -71,7 +71,7 @@ MIXUPS = [
 @pytest.mark.parametrize(
     ("mixup", "key", "kind"),
     some_slow(
-        [(*mixup, kind) for mixup in MIXUPS for kind in (Pose, Position)], {0, 3, 4, *range(13, 34, 3)}
+        [(*mixup, kind) for mixup in MIXUPS for kind in (Pose, Position)], {0, 3, 13, 16, 19, 25, 28, 31}
     ),
     ids=[f"{key}-{kind.__name__}" for _, key in MIXUPS for kind in (Pose, Position)],
 )
