@@ -11,6 +11,7 @@ from .._typing import Array
 from ..estimation import robust
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
+from ..session import Session
 from .cameras.board_size import BoardSize
 from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
 from .cameras.stages import Stage
@@ -54,6 +55,7 @@ class Evidence(FittedModel):
         is_kept_nominal: Whether the correction was not applied because of the verdict.
         earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
             if they were.
+        session: What happened during the measurement; None if nobody looked.
     """
 
     region_comparison: Comparison | None = None
@@ -63,6 +65,7 @@ class Evidence(FittedModel):
     board_size: BoardSize | None = None
     is_kept_nominal: bool = False
     earlier_diagnosis: Diagnosis | None = None
+    session: Session | None = None
 
     @property
     def shrinkage_notes(self) -> list[str]:

@@ -4,6 +4,7 @@
 
 1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`).
 2. Initialize unknown base and tool frames and instrument parameters (`estimation.initialization`).
+   Find what happened during the measurement, such as a base that moved, and account for it (`session`).
 3. Minimize the cost (`estimation.minimize`)
 
        C(x) = Σ ‖r_i(x)‖² + ‖W·x‖²,
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -46,6 +47,7 @@ from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
+from ..session import can_have_session, find_scale, find_session
 from . import model_selection
 from .cameras import (
     default_sets,
@@ -67,6 +69,7 @@ from .shrinkage import compute_shrinkage_factor
 REFERENCE_DECIMALS = 1
 
 Method = Literal["lm", "gn"]
+SessionOption = Literal["auto", "unordered", "off"]
 
 
 def calibrate(
@@ -84,6 +87,7 @@ def calibrate(
     extend: str | Sequence[str] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
+    session: SessionOption = "auto",
     progress: Progress | None = None,
     executor: TaskExecutor = SERIAL,
 ) -> Result:
@@ -122,6 +126,9 @@ def calibrate(
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
+        session: "auto" looks for what happened during the measurement and accounts for it, see `session`;
+            "unordered" does so for samples that are not in the order of measurement, where only files may
+            differ; "off" does not. Method "gn" does not either.
         progress: Called with the name of the current phase, such as "robust weights", the number of its step
             and the largest number of steps.
         executor: Executor of the chunks of many samples.
@@ -144,6 +151,7 @@ def calibrate(
             extend=extend,
             bounds=bounds,
             max_iterations=max_iterations,
+            session=session,
             executor=executor,
         )
         result = recalibrate(data, progress=progress)
@@ -164,15 +172,17 @@ def calibrate(
     _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
         require_no_selection(extend, families)
-    is_robust = method == "lm" and loss != "linear"
-    errors, data, weights = _initialize(errors, data, known, max_iterations, is_robust)
-    data, distortion = with_stated_distortion(data)
-    problem = replace(make_problem(errors, data, prior_weights(errors, priors), known), executor=executor)
-    if priors == "none":
-        problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
-    if bounds:
-        problem = replace(problem, bounds=_bounds(problem, bounds))
-    fit = _solve(problem, _start(problem, distortion), weights, method, max_iterations, progress)
+    solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
+    start = partial(_first_fit, errors, priors=priors, known=known, bounds=bounds, options=solver)
+    fit = start(data)
+    found = None
+    if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
+        unweighted = replace(fit.problem, data=fit.data)
+        found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
+        if not found.changes.is_empty:
+            data, holdout = found.applied(data, holdout)
+            fit = start(data)
+    errors, problem, data = fit.problem.errors, fit.problem, fit.data
     if method != "lm":
         return make_result(fit, 1.0, holdout, method)
     groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
@@ -181,7 +191,42 @@ def calibrate(
         fitting = ImageFitting(groups, stages, max_iterations, progress)
         return calibrate_images(fitting, fit, chain, holdout, exchanges)
     fit = reweight(fit, stages, groups, max_iterations, progress)
-    return _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
+    if found and (scale := find_scale(fit.problem, fit.solution.x)):
+        found = replace(found, scales=(*found.scales, scale))
+    result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
+    return replace(result, session=found)
+
+
+@dataclass(frozen=True)
+class _SolverOptions:
+    """Options of the solver."""
+
+    method: Method
+    is_robust: bool
+    max_iterations: int
+    progress: Progress | None
+    executor: TaskExecutor
+
+
+def _first_fit(
+    errors: ErrorModel,
+    data: tuple[Measurement, ...],
+    priors: Priors,
+    known: Mapping[str, float],
+    bounds: Mapping[str, tuple[float, float]] | None,
+    options: _SolverOptions,
+) -> Fit:
+    """Initialize base, tool and instruments, and solve for the first time."""
+    errors, data, weights = _initialize(errors, data, known, options.max_iterations, options.is_robust)
+    data, distortion = with_stated_distortion(data)
+    problem = make_problem(errors, data, prior_weights(errors, priors), known)
+    problem = replace(problem, executor=options.executor)
+    if priors == "none":
+        problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
+    if bounds:
+        problem = replace(problem, bounds=_bounds(problem, bounds))
+    start = _start(problem, distortion)
+    return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:

@@ -109,7 +109,7 @@ def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
     findings = _unmoved_joints(fit)
     if not any(finding.status == "refused" for finding in findings):
-        findings += [*_mixups(fit.diagnosis), *_board_size(fit)]
+        findings += [*_mixups(fit.diagnosis), *_board_size(fit), *_two_robots(fit)]
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
@@ -117,6 +117,7 @@ def judge(fit: Evidence) -> Verdict:
         has_cause = bool(fit.hand_eye and fit.hand_eye.causes)
         findings += [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
+            *_session(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
             *_held_out_errors(fit),
@@ -159,6 +160,17 @@ def _board_size(fit: Evidence) -> list[Finding]:
     if fit.board_size is None:
         return []
     return [Finding("refused" if fit.board_size.is_decisive else "caution", fit.board_size.sentence)]
+
+
+def _two_robots(fit: Evidence) -> list[Finding]:
+    """Refuse samples of two robots."""
+    events = fit.session.events if fit.session else ()
+    return [Finding("refused", event.sentence) for event in events if event.kind == "robot"]
+
+
+def _session(fit: Evidence) -> list[Finding]:
+    """Advise caution if something happened during the measurement."""
+    return [Finding("caution", sentence) for sentence in (fit.session.sentences if fit.session else [])]
 
 
 def _convergence(fit: Evidence) -> list[Finding]:
@@ -251,6 +263,8 @@ def _plausible_cause(fit: Evidence) -> str:
             f"Check the links of cameras and boards in the rig file, {_configuration_checks(fit)}, and size, "
             "rows and columns of the boards."
         )
+    if fit.session and fit.session.lag:
+        return fit.session.lag.sentence
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"

@@ -88,6 +88,21 @@ class Job:
             "of joint space",
         },
     )
+    session: str = field(
+        default="auto",
+        metadata={
+            "choices": ("auto", "off"),
+            "help": "auto: look for what happened during the measurement, such as a base that moved, and "
+            "account for it (default); off: do not",
+        },
+    )
+    unordered: bool = field(
+        default=False,
+        metadata={
+            "action": "store_true",
+            "help": "the rows are not in the order of measurement; only files may differ",
+        },
+    )
     method: Method = field(
         default="lm",
         metadata={

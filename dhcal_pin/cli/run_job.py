@@ -113,6 +113,7 @@ def run_job(
         "known": read_instrument(job.instrument) if job.instrument else None,
         "loss": job.loss,
         "max_iterations": job.max_iterations,
+        "session": "unordered" if job.unordered and job.session == "auto" else job.session,
         "executor": executor,
     }
     measurements = list(data.fit.values())

@@ -88,6 +88,15 @@ def subsample(item: Measurement) -> Measurement:
     return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_MAX_SAMPLES]))
 
 
+def positions_at_end(item: Measurement) -> Array:
+    """Return the measured positions (m, 3) [m] as if the base had stood where it stands at the end."""
+    positions, conditions = item.positions(), item.conditions()
+    if conditions.base_motion is None or not len(positions):
+        return positions
+    back = se3.inverse(conditions.base_motion)
+    return (back[:, :3, :3] @ positions[..., None])[..., 0] + back[:, :3, 3]
+
+
 def candidate_frames(
     chain: Chain, data: Sequence[Measurement], is_base_unknown: bool, is_tool_unknown: bool
 ) -> Iterator[Chain]:
@@ -97,11 +106,11 @@ def candidate_frames(
     """
     with_positions = [item for item in data if len(item.positions())]
     bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
-    tips = [bare.poses(item.q) for item in with_positions]
+    tips = [bare.poses(item.conditions().of_arm) for item in with_positions]
     if sum(len(pose) for pose in tips) < 3 or not (is_base_unknown or is_tool_unknown):
         return
     tip = np.concatenate(tips)
-    measured = np.concatenate([item.positions() for item in with_positions])
+    measured = np.concatenate([positions_at_end(item) for item in with_positions])
     if not is_base_unknown:
         # With a known base the target is measured directly in the tip frame.
         local = se3.inverse(chain.base @ tip)
@@ -131,7 +140,7 @@ def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     """Compute the RMS position error relative to the RMS distance of the positions from their mean."""
     with_positions = [item for item in data if len(item.positions())]
     measured = np.concatenate([item.positions() for item in with_positions])
-    modelled = np.concatenate([chain.poses(item.q)[:, :3, 3] for item in with_positions])
+    modelled = np.concatenate([chain.poses(item.conditions())[:, :3, 3] for item in with_positions])
     spread = np.linalg.norm(measured - measured.mean(0))
     return float(np.linalg.norm(measured - modelled) / spread) if spread else np.inf
 
@@ -145,8 +154,8 @@ def agreeing_samples(
     if not with_positions or not (is_base_unknown or is_tool_unknown):
         return out
     bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
-    tip = np.concatenate([bare.poses(item.q) for _, item in with_positions])
-    measured = np.concatenate([item.positions() for _, item in with_positions])
+    tip = np.concatenate([bare.poses(item.conditions().of_arm) for _, item in with_positions])
+    measured = np.concatenate([positions_at_end(item) for _, item in with_positions])
     m, columns = len(tip), []
     right = tip[:, :3, 3]
     if is_base_unknown:
@@ -202,7 +211,7 @@ def gross_outliers(chain: Chain, data: Sequence[Measurement]) -> list[Array]:
     if with_positions:
         measured = [data[k].positions() for k in with_positions]
         distances = [
-            np.linalg.norm(chain.poses(data[k].q)[:, :3, 3] - each, axis=1)
+            np.linalg.norm(chain.poses(data[k].conditions())[:, :3, 3] - each, axis=1)
             for k, each in zip(with_positions, measured, strict=True)
         ]
         limit = _largest_distance(np.concatenate(distances), np.concatenate(measured))

@@ -10,7 +10,9 @@ nor another right-handed order of the axes of measured positions.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, Protocol
@@ -19,17 +21,20 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..exceptions import UnknownNameError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
+from ..robot.joint_path import joint_path
 from ..units import ANGLES, LENGTHS
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
+# Largest lag [rows or s] and change of a scale that can be undone.
+MAX_LAG, MAX_SCALE_CHANGE = 100.0, 0.5
 # Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
 _MAX_SMALL_ROTATION = np.pi / ANGLES["deg"]
 
@@ -111,6 +116,49 @@ class LengthChange:
         if isinstance(item, PointMeasurement) and item.has_length_scale:
             return item.replace(values=self.factor * item.values)
         return None
+
+
+@dataclass(frozen=True)
+class AxisScale:
+    """Measured coordinate that is too long by a factor.
+
+    Attributes:
+        axis: Number of the coordinate.
+        factor: Measured over true length.
+    """
+
+    axis: int
+    factor: float
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements with a scaled coordinate."""
+        if not isinstance(item, Pose | Position | MultiTargetPosition):
+            return None
+        factors = np.ones(3)
+        factors[self.axis] = 1 / self.factor
+        return _with_positions(item, item.positions() * factors)
+
+
+@dataclass(frozen=True)
+class LagChange:
+    """Joint positions that are earlier than the measured values.
+
+    Attributes:
+        lag: Time between them, in seconds if the samples have times, else in rows.
+    """
+
+    lag: float
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measured values with the joint positions at their time."""
+        if item.configurations_per_row != 1:
+            return None
+        order = np.argsort(item.rows, kind="stable")
+        times = np.empty(len(order))
+        times[order] = np.arange(len(order))
+        if item.recorded is not None and item.recorded.time is not None:
+            times = item.recorded.time
+        return item.resample(joint_path(times[order], item.q[order])(times + self.lag))
 
 
 @dataclass(frozen=True)
@@ -270,14 +318,37 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
     """Undo a mistake in measurements, such as the wrong sign of a joint."""
-    by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
-    if key not in by_key:
-        near = difflib.get_close_matches(key, by_key, 3, 0.0)
-        raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
-    changed = by_key[key].change.apply(data)
+    change = _change_of_size(key)
+    if change is None:
+        by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
+        if key not in by_key:
+            near = difflib.get_close_matches(key, by_key, 3, 0.0)
+            raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
+        change = by_key[key].change
+    changed = change.apply(data)
     if changed is None:
         raise UnknownNameError(f"--mend {key!r}: does not apply to measurements of kind {data.kind}")
     return changed
+
+
+def _change_of_size(key: str) -> Change | None:
+    """Return the change `lag:TIME`, `scale:FACTOR` or `scale:AXIS:FACTOR`; None for other keys."""
+    found = re.fullmatch(r"(?:(lag)|scale(?::([xyz]))?):([-+0-9.e]+)", key)
+    if found is None:
+        return None
+    is_lag, axis, number = found.groups()
+    with suppress(ValueError):
+        value = float(number)
+        if is_lag and abs(value) <= MAX_LAG:
+            return LagChange(value)
+        if not is_lag and abs(value - 1) <= MAX_SCALE_CHANGE:
+            return AxisScale("xyz".index(axis), value) if axis else LengthChange(1 / value)
+    expected = (
+        f"a time from -{MAX_LAG:g} to {MAX_LAG:g}"
+        if is_lag
+        else f"a factor from {1 - MAX_SCALE_CHANGE:g} to {1 + MAX_SCALE_CHANGE:g}"
+    )
+    raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
 
 
 def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:

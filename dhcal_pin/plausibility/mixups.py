@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..estimation.initialization import positions_at_end
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -169,10 +170,10 @@ def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     squares, counts = [0.0], [0]
     for item in data:
-        p = item.positions()
+        p = positions_at_end(item)
         if item.configurations_per_row != 1 or len(p) != len(item.rows):
             continue
-        tip = arm.poses(item.configurations())
+        tip = arm.poses(item.conditions().of_arm)
         directions = np.broadcast_to(np.eye(3), (len(p), 3, 3))
         rows = np.concatenate(
             [*(p[:, [i], None] * directions for i in range(3)), directions, -tip[:, :3, :3]], 2

@@ -19,6 +19,7 @@ from ..calibration.verdict import Verdict
 from ..estimation import qr
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
+from ..session import Session
 from .provenance import versions
 
 # Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
@@ -66,6 +67,7 @@ def result_to_dict(
         "parameters": parameter_rows(fit),
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "extension": fit.extension.to_dict() if fit.extension else None,
+        "session": session_to_dict(fit.session),
         "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
         "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
         "shrinkage_factor": fit.shrinkage_factor,
@@ -78,6 +80,13 @@ def result_to_dict(
         "versions": versions(),
         "inputs": dict(inputs),
     }
+
+
+def session_to_dict(session: Session | None) -> dict[str, Any]:
+    """Return what happened during the measurement; nothing if nobody looked."""
+    if session is None:
+        return {"events": [], "drift": [], "lag": None, "scale": None, "unordered": False}
+    return session.to_dict()
 
 
 def generalization_to_dict(known: Generalization | None) -> dict[str, Any]:
@@ -114,6 +123,7 @@ def validation_to_dict(
         "parameters": [],
         "unobservable": [],
         "extension": None,
+        "session": session_to_dict(None),
         "shrinkage_factor": 1.0,
         "shrinkage_notes": [],
         "weakly_observable": [],

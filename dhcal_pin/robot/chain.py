@@ -413,6 +413,8 @@ class Chain:
 
     def _joint_state(self, independent: Array, conditions: Conditions) -> SampleState:
         """Compute the joint state of actual positions of the independent joints, shape (n, m)."""
+        if conditions.zeros is not None:
+            independent = independent + conditions.zeros.T
         positions = self.mimic_matrix @ independent + self.mimic_offset[:, None]
         return SampleState(positions, *_kernels.cos_sin(positions), conditions)
 
@@ -434,15 +436,31 @@ class Chain:
             state = self._joint_state(actual, state.conditions)
         k, m = state.positions.shape
         frames = np.empty((k + 2, 7, 3, m)) if out is None else out
-        frames[0, :4] = self.base[:3].T[:, :, None]
+        base_motion, tool_motion = state.conditions.base_motion, state.conditions.tool_motion
+        if base_motion is None:
+            frames[0, :4] = self.base[:3].T[:, :, None]
+        else:
+            frames[0, :4] = (base_motion @ self.base)[:, :3].transpose(2, 1, 0)
         _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, state, frames)
+        if tool_motion is not None:
+            tool = np.einsum("acm,maj->jcm", frames[-1, :3], tool_motion[:, :3])
+            tool[3] += frames[-1, 3]
+            frames[-1, :4] = tool
         batch = FrameBatch(frames[:-1], frames[-1, :4], terms, state.conditions)
-        if terms is not None and self.transmission is not None and self.transmission.link_terms.any():
-            growth = self.transmission.growth(terms)[:, None]
-            shifts = np.cumsum(self.growth_motions(batch)[:, :3] * growth, 0)
+        growth = self._growth(terms, state.conditions)
+        if growth is not None:
+            shifts = np.cumsum(self.growth_motions(batch)[:, :3] * growth[:, None], 0)
             frames[1:-2, 3] += shifts[:-2]
             frames[-2:, 3] += shifts[-1]
         return batch
+
+    def _growth(self, terms: Array | None, conditions: Conditions) -> Array | None:
+        """Compute the relative growth of each link, shape (k+1, m); None if no link grows."""
+        growth = None if conditions.growth is None else conditions.growth.T
+        if terms is not None and self.transmission is not None and self.transmission.link_terms.any():
+            of_temperature = self.transmission.growth(terms)
+            return of_temperature if growth is None else growth + of_temperature
+        return growth
 
     def growth_motions(self, frames: FrameBatch) -> Array:
         """Compute the tool twist per relative growth of each link, shape (k+1, 6, m).
@@ -451,9 +469,9 @@ class Chain:
         behind a link along the link; it turns nothing. A link grows in front of the next joint, the last one
         behind the motion of the last joint, in front of all errors of its own.
         """
-        assert self.transmission is not None
         axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
-        vectors = (axes @ self.transmission.loads.link_vectors[..., None])[..., 0]
+        loads = self.loads if self.transmission is None else self.transmission.loads
+        vectors = (axes @ loads.link_vectors[..., None])[..., 0]
         linear = np.einsum("ja,jacm->jcm", vectors, frames.columns[:, :3])
         return np.concatenate([linear, np.zeros_like(linear)], 1)
 

@@ -4,7 +4,10 @@ The tool pose depends on the joint positions q and, for some joint errors, on th
 joint moved last, on the temperature and on the payload. A condition that is not known has no effect: a joint
 has no direction, the links have the lengths of the model, and the payload is that of the model.
 
-Shapes: m samples, n independent joints.
+Base, tool, joint zeros and links may also change during a measurement. A calibration finds such changes, and
+states for each sample how the robot differs from that at the end of the measurement.
+
+Shapes: m samples, n independent joints, k moving joints.
 """
 
 from __future__ import annotations
@@ -119,6 +122,12 @@ class Conditions:
         approach: Direction of the last motion of each joint, -1, 0 or 1, shape (m, n); 0 if it is not known.
         temperature: Temperature of the robot, shape (m,) [°C].
         payload: Mass at the tip, shape (m,) [kg].
+        base_motion: Motion C of the base in the measuring frame: its pose is C·B with the pose B of the
+            chain, shape (m, 4, 4) [m].
+        tool_motion: Motion D of the tool in its own frame: its pose is T·D with the pose T of the chain,
+            shape (m, 4, 4) [m].
+        zeros: Differences of the joint positions from q, shape (m, n) [rad or m].
+        growth: Relative growth of each link, shape (m, k+1).
     """
 
     q: Array
@@ -127,6 +136,10 @@ class Conditions:
     approach: Array | None = None
     temperature: Array | None = None
     payload: Array | None = None
+    base_motion: Array | None = None
+    tool_motion: Array | None = None
+    zeros: Array | None = None
+    growth: Array | None = None
 
     def __getitem__(self, index: Array | slice) -> Conditions:
         """Return the samples of an index, mask or slice."""
@@ -152,6 +165,11 @@ class Conditions:
             if condition.resolution and name in self._known
         ]
         return np.hstack([np.empty((len(self.q), 0)), *columns])
+
+    @property
+    def of_arm(self) -> Conditions:
+        """The conditions of the arm alone, as if base and tool had not moved."""
+        return replace(self, base_motion=None, tool_motion=None)
 
     def at(self, q: Array) -> Conditions:
         """Return the same conditions at other joint positions (c·m, n), all samples of each configuration."""

@@ -94,7 +94,7 @@ def _position_residuals(chain: Chain, item: Measurement, known: Mapping[str, flo
     """Return the vectors from modelled to measured points, (m, 3) [m]."""
     parameters = item.initialized(chain).instrument_parameters
     values = np.array([known.get(parameter.name, parameter.nominal) for parameter in parameters])
-    return item.errors(chain.forward_kinematics(item.q), values)["position"]
+    return item.errors(chain.forward_kinematics(item.conditions()), values)["position"]
 
 
 def drawn_samples(samples: MeasuredSamples, limit: int, n_largest: int) -> Array:

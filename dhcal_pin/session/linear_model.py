@@ -1,0 +1,181 @@
+"""Linear model of a session: whitened rows of the samples by all unknowns and by all possible causes.
+
+The columns are those of the parameters of the robot and of the instruments, then of base and tool, of the
+joint zeros, of the growth of each link, of a lag and of scales of the instrument, and last the residual r.
+
+Shapes: m samples of at most k residuals, c columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._kernels import apply_observation_matrix
+from .._typing import Array
+from ..estimation.parameters import base, tool
+from ..estimation.problem import Problem
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from ..robot.error_families import MIN_LINK_LENGTH
+from .causes import Block
+
+# Size of a change that is held at zero.
+HELD_SIZE = 1e-12
+# Largest entry of a column, relative to those of others, below which it is rounding.
+MIN_OBSERVED = 1e-9
+# Axes of a scale; empty for all axes.
+SCALE_AXES = ("", "x", "y", "z")
+
+
+def growing_links(chain: Chain) -> Array:
+    """Return which links have a length that can grow, (k+1,)."""
+    return np.linalg.norm(chain.loads.link_vectors, axis=1) > MIN_LINK_LENGTH
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Columns of the linear model.
+
+    Attributes:
+        problem: Problem whose errors contain all parameters of base and tool.
+        model: Columns of the unknowns of the calibration, (p,).
+        weights: Their prior weights, (p,).
+        blocks: Possible causes.
+        joints: Columns of the joint zeros, (n,).
+        links: Columns of the growth of each link, (k+1,).
+        scale: Column of a scale of all axes.
+        lag: Column of the lag.
+        n_columns: Number of columns, the residual included.
+    """
+
+    problem: Problem
+    model: Array
+    weights: Array
+    blocks: tuple[Block, ...]
+    joints: Array
+    links: Array
+    scale: int
+    lag: int
+    n_columns: int
+
+    @classmethod
+    def of(cls, problem: Problem) -> Layout:
+        """Lay out the columns of a problem."""
+        errors = problem.errors
+        own = [parameter.name for parameter in errors.parameters]
+        frames = [p for p in (*base(errors.chain), *tool(errors.chain)) if p.name not in own]
+        extended = errors.with_parameters(frames)
+        names = [parameter.name for parameter in extended.parameters]
+        p, s = len(names), len(problem.instrument_parameters)
+        model = np.array([*(names.index(name) for name in own), *range(p, p + s)], int)
+        chain = errors.chain
+        n, n_links = chain.n_joints, len(chain.moving_joints) + 1
+        joints = p + s + np.arange(n)
+        links = joints[-1] + 1 + np.arange(n_links)
+        all_links = int(links[-1]) + 1
+        scales = all_links + 1 + np.arange(len(SCALE_AXES))
+        lag = int(scales[-1]) + 1
+        grows = growing_links(chain)
+        size = float(np.linalg.norm(chain.loads.link_vectors, axis=1).sum())
+        of_frame = np.array([1.0] * 3 + [1 / size] * 3)
+        blocks = [
+            Block(kind, "", 0, np.array([names.index(q.name) for q in parameters]), of_frame)
+            for kind, parameters in (("base", base(chain)), ("tool", tool(chain)))
+        ]
+        for j, name in enumerate(chain.joint_names):
+            unit = 1.0 if chain.is_prismatic[j] else 1 / size
+            blocks.append(Block("joint", name, j, joints[j : j + 1], np.array([unit])))
+        # All links by one factor, or each by its own.
+        blocks.append(Block("links", "", 0, np.array([all_links]), np.array([1 / size])))
+        blocks.append(Block("links", "", 0, links[grows], np.full(grows.sum(), 1 / size)))
+        blocks += [
+            Block("scale", axis, i, scales[i : i + 1], np.array([1 / size]), is_constant=True)
+            for i, axis in enumerate(SCALE_AXES)
+            if axis  # the size of the robot imitates a scale of all axes
+        ]
+        blocks.append(Block("lag", "", 0, np.array([lag]), np.array([1.0]), is_constant=True))
+        return cls(
+            replace(problem, errors=extended),
+            model,
+            problem.weights,
+            tuple(blocks),
+            joints,
+            links,
+            int(scales[0]),
+            lag,
+            lag + 2,
+        )
+
+    def holding_unobserved(self, rows: Array) -> Layout:
+        """Return the layout with causes that do not change what the rows (m, k, c) do not show."""
+        largest = np.abs(rows).max((0, 1))
+        is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
+        blocks = [
+            replace(block, sizes=np.where(is_observed[block.columns], block.sizes, HELD_SIZE))
+            for block in self.blocks
+        ]
+        return replace(self, blocks=tuple(blocks))
+
+    def errors_at(self, x: Array) -> Array:
+        """Return the values of all parameters of `problem`, for unknowns x (p,) of the calibration."""
+        full = np.zeros(self.joints[0])
+        full[self.model] = x
+        return full
+
+
+def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: Array) -> Array:
+    """Compute the whitened rows of all samples, (m, k, c), for joint rates (m, n)."""
+    problem, full = layout.problem, layout.errors_at(x)
+    errors = problem.errors
+    chain, bodies, twists = errors.derivative(full[: len(errors.parameters)])
+    values = problem.instruments(full)
+    count, width = sum(len(item.rows) for item in data), max(item.residual_dim for item in data)
+    out, start = np.zeros((layout.n_columns, width, count)), 0
+    instrument_columns = {
+        u.name: len(errors.parameters) + i for i, u in enumerate(problem.instrument_parameters)
+    }
+    for item in data:
+        block = out[:, : item.residual_dim, start : start + len(item.rows)]
+        start += len(item.rows)
+        frames = chain.forward_kinematics(item.conditions())
+        u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
+        residual = item.residual(frames, u)
+        observation = item.observation_matrix(frames, u, residual)
+        block[-1] = residual
+        jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)
+        growth = chain.growth_motions(frames)
+        motions = np.concatenate(
+            [
+                jacobian,
+                chain.joint_jacobian(frames, observation.body),
+                growth,
+                growth.sum(0, keepdims=True),
+                _scale_motions(frames.tool[3]),
+            ]
+        )
+        rows = np.empty((len(motions), *residual.shape))
+        apply_observation_matrix(motions, observation, rows)
+        block[: len(bodies)] = rows[: len(bodies)]
+        block[layout.joints[0] : layout.lag] = rows[len(bodies) :]
+        for parameter, part in zip(
+            item.instrument_parameters,
+            item.instrument_jacobian(frames, u) if item.instrument_parameters else (),
+            strict=True,
+        ):
+            if parameter.name in instrument_columns:
+                block[instrument_columns[parameter.name]] = part
+    out[layout.lag] = np.einsum("nkm,mn->km", out[layout.joints], rates)
+    return np.ascontiguousarray(out.transpose(2, 1, 0))
+
+
+def _scale_motions(points: Array) -> Array:
+    """Return the twists of the tool point per unit of each scale, (4, 6, m), about the mean point."""
+    centred = points - points.mean(1, keepdims=True)
+    out = np.zeros((len(SCALE_AXES), 6, points.shape[1]))
+    out[0, :3] = centred
+    for axis in range(3):
+        out[1 + axis, axis] = centred[axis]
+    return out

@@ -1,0 +1,242 @@
+"""Changes of a robot during a session, as conditions of its samples.
+
+Base and tool have one motion per segment between two steps, and may drift in addition. With the motion C of
+the base in the measuring frame and D of the tool in its own frame, a measured pose is C·B·F(q)·T·D. The
+increments of both act as the parameters of base and tool do: B·exp(ξ) and T·exp(ξ). They have the same
+derivatives.
+
+Shapes: m samples, n joints, k moving joints, S segments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from ..robot.conditions import Conditions
+from ..robot.joint_path import joint_path
+from .causes import Cause, Drift, Step
+from .timeline import Timeline
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Motion of base or tool over time; the identity at the end.
+
+    Attributes:
+        steps: Numbers of the first samples of all segments but the first, ascending.
+        poses: Motion of each segment, (S, 4, 4) [m].
+        drifts: Drifts with their twists (6,), from the begin to the end.
+    """
+
+    steps: tuple[int, ...] = ()
+    poses: Array = field(default_factory=lambda: np.eye(4)[None])
+    drifts: tuple[tuple[Drift, Array], ...] = ()
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether there is no motion."""
+        return not self.steps and not self.drifts
+
+    def segments(self, numbers: Array) -> Array:
+        """Return the segment of each sample, (m,)."""
+        return np.searchsorted(self.steps, numbers, side="right")
+
+    def twists(self, numbers: Array, times: Array) -> Array:
+        """Return the twists of the drifts at samples, (m, 6)."""
+        parts = [drift.values(numbers, times)[:, None] * twist for drift, twist in self.drifts]
+        return sum(parts, np.zeros((len(numbers), 6)))
+
+    def with_steps(self, steps: Sequence[int]) -> Motion:
+        """Return the motion with other segments, each with the pose of the samples before its end."""
+        ordered = tuple(sorted(set(steps)))
+        last = np.array([*(step - 1 for step in ordered), np.iinfo(np.int64).max])
+        return replace(self, steps=ordered, poses=self.poses[self.segments(last)])
+
+
+@dataclass(frozen=True, eq=False)
+class RobotChanges:
+    """Changes of a robot during a session.
+
+    Attributes:
+        base: Motion of the base.
+        tool: Motion of the tool.
+        zeros: Changes of joint zeros: number of the joint, function of time, and amplitude [rad or m].
+        growth: Growth of the links: function of time, and amplitude of each link, (k+1,).
+        lag: Time by which the joint values are too early, in the unit of the timeline.
+    """
+
+    base: Motion = field(default_factory=Motion)
+    tool: Motion = field(default_factory=Motion)
+    zeros: tuple[tuple[int, Step | Drift, float], ...] = ()
+    growth: tuple[tuple[Step | Drift, Array], ...] = ()
+    lag: float = 0.0
+
+    @property
+    def without_lag(self) -> RobotChanges:
+        """The changes without a lag, which is a mistake of the recording and not of the robot."""
+        return replace(self, lag=0.0)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing changed."""
+        return self.base.is_identity and self.tool.is_identity and not (self.zeros or self.growth or self.lag)
+
+    def with_drift(self, old: Drift, new: Drift) -> RobotChanges:
+        """Return the changes with another time constant of a drift."""
+
+        def of_motion(motion: Motion) -> Motion:
+            drifts = [(new if shape == old else shape, twist) for shape, twist in motion.drifts]
+            return replace(motion, drifts=tuple(drifts))
+
+        return replace(
+            self,
+            base=of_motion(self.base),
+            tool=of_motion(self.tool),
+            zeros=tuple((i, new if shape == old else shape, value) for i, shape, value in self.zeros),
+            growth=tuple((new if shape == old else shape, values) for shape, values in self.growth),
+        )
+
+    def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:
+        """Return the changes with a step of base, tool or a joint at another sample."""
+        if kind == "joint":
+            moved = (i == joint and isinstance(f, Step) and f.number == old for i, f, _ in self.zeros)
+            zeros = [
+                (i, Step(new) if is_moved else f, value)
+                for is_moved, (i, f, value) in zip(moved, self.zeros, strict=True)
+            ]
+            return replace(self, zeros=tuple(zeros))
+        motion: Motion = getattr(self, kind)
+        steps = tuple(new if step == old else step for step in motion.steps)
+        return replace(self, **{kind: replace(motion, steps=steps)})
+
+    def conditions(
+        self, conditions: Conditions, chain: Chain, numbers: Array, times: Array, later: Array | None
+    ) -> Conditions:
+        """Return the conditions of samples with the changes.
+
+        Args:
+            conditions: Conditions of m samples without changes.
+            chain: Robot with the base frame in which the base drifts.
+            numbers: Numbers of the samples, (m,).
+            times: Times of the samples, (m,).
+            later: Joint positions by the lag later, (m, n); None without a lag.
+        """
+        values: dict[str, Any] = {}
+        if not self.base.is_identity:
+            drift = se3.exp6(self.base.twists(numbers, times))
+            values["base_motion"] = (
+                self.base.poses[self.base.segments(numbers)] @ chain.base @ drift @ se3.inverse(chain.base)
+            )
+        if not self.tool.is_identity:
+            drift = se3.exp6(self.tool.twists(numbers, times))
+            values["tool_motion"] = drift @ self.tool.poses[self.tool.segments(numbers)]
+        if self.zeros or later is not None:
+            zeros = np.zeros(conditions.q.shape)
+            for joint, shape, amplitude in self.zeros:
+                zeros[:, joint] += amplitude * shape.values(numbers, times)
+            if later is not None:
+                zeros += later - conditions.q
+            values["zeros"] = zeros
+        if self.growth:
+            parts = [shape.values(numbers, times)[:, None] * amplitudes for shape, amplitudes in self.growth]
+            values["growth"] = sum(parts[1:], parts[0])
+        return replace(conditions, **values)
+
+
+class JointPaths:
+    """Joint positions over time, as cubic splines through the samples of each file."""
+
+    def __init__(self, timeline: Timeline):
+        """Join the samples of fitted and held-out measurements."""
+        self._unit = timeline.unit
+        numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
+        order = np.argsort(numbers)
+        q = np.concatenate([item.q for item in timeline.data])[order]
+        times = times[order]
+        bounds = [0, *timeline.file_starts, len(q)]
+        self._starts = np.array(bounds[:-1])
+        self._splines = [joint_path(times[a:b], q[a:b]) for a, b in pairwise(bounds)]
+
+    def evaluate(self, numbers: Array, times: Array, lag: float) -> tuple[Array, Array]:
+        """Return the joint positions by a lag later, and their rates, (m, n) each."""
+        files = np.searchsorted(self._starts, numbers, side="right") - 1
+        n = self._splines[0](0.0).shape[-1]
+        positions, rates = np.zeros((len(numbers), n)), np.zeros((len(numbers), n))
+        for i, spline in enumerate(self._splines):
+            chosen = files == i
+            positions[chosen] = spline(times[chosen] + lag)
+            rates[chosen] = spline(times[chosen] + lag, 1)
+        return positions, rates
+
+
+def apply_changes(
+    changes: RobotChanges, chain: Chain, timeline: Timeline
+) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
+    """Return fitted and held-out measurements with the changes as conditions of their samples."""
+    paths = JointPaths(timeline) if changes.lag else None
+    out = []
+    for item, numbers, times in zip(timeline.data, timeline.numbers, timeline.times, strict=True):
+        later = paths.evaluate(numbers, times, changes.lag)[0] if paths else None
+        known = item.recorded or Conditions(item.q)
+        out.append(item.replace(recorded=changes.conditions(known, chain, numbers, times, later)))
+    return tuple(out[: timeline.n_fitted]), tuple(out[timeline.n_fitted :])
+
+
+def update(
+    changes: RobotChanges, causes: Sequence[Cause], steps: Sequence[Array], base: Array, links: Array
+) -> RobotChanges:
+    """Return the changes after increments of the coefficients of causes.
+
+    Args:
+        changes: Changes before.
+        causes: Causes.
+        steps: Increments of the coefficients of each cause, (c,) each.
+        base: Pose of the base (4, 4) at the end [m].
+        links: Columns of the growth of each link in the linear model, (k+1,).
+    """
+    motions = {"base": changes.base, "tool": changes.tool}
+    zeros: list[tuple[int, Step | Drift, float]] = []
+    growth: list[tuple[Step | Drift, Array]] = []
+    lag = changes.lag
+    for kind, motion in motions.items():
+        chosen = [(c.shape, d) for c, d in zip(causes, steps, strict=True) if c.block.kind == kind]
+        jumps = [(shape.number, d) for shape, d in chosen if isinstance(shape, Step)]
+        motion = motion.with_steps([number for number, _ in jumps])
+        # A step acts on all segments before it.
+        ends = [*motion.steps, np.inf]
+        twists = np.array([sum((-d for n, d in jumps if n >= end), np.zeros(6)) for end in ends])
+        increments = se3.exp6(twists)
+        if kind == "base":
+            poses = motion.poses @ base @ increments @ se3.inverse(base)
+        else:
+            poses = increments @ motion.poses
+        before = dict(motion.drifts)
+        drifts = [
+            (shape, before.get(shape, np.zeros(6)) + d) for shape, d in chosen if isinstance(shape, Drift)
+        ]
+        motions[kind] = replace(motion, poses=poses, drifts=tuple(drifts))
+    of_joints = {(joint, shape): value for joint, shape, value in changes.zeros}
+    of_links = dict(changes.growth)
+    for cause, d in zip(causes, steps, strict=True):
+        if isinstance(cause.shape, Step | Drift) and cause.block.kind == "joint":
+            joint = int(cause.block.index)
+            zeros.append((joint, cause.shape, of_joints.get((joint, cause.shape), 0.0) + float(d[0])))
+        if isinstance(cause.shape, Step | Drift) and cause.block.kind == "links":
+            each = np.isin(links, cause.block.columns) if len(d) > 1 else np.ones(len(links), bool)
+            amplitudes = of_links.get(cause.shape, np.zeros(len(links))).copy()
+            amplitudes[each] += d
+            growth.append((cause.shape, amplitudes))
+        if cause.block.kind == "lag":
+            lag += float(d[0])
+    if not any(cause.block.kind == "lag" for cause in causes):
+        lag = 0.0
+    return RobotChanges(motions["base"], motions["tool"], tuple(zeros), tuple(growth), lag)

@@ -1,0 +1,53 @@
+"""Scale of all measured lengths, which the size of the robot imitates.
+
+Positions and poses do not tell a scale of the instrument from the size of the robot. A wrong scale changes
+all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections of the
+lengths, in units of their prior standard deviations, have the RMS w, and w' without the part that one factor
+explains. For a common width of their normal distribution, each time of greatest likelihood, the logarithm of
+the ratio of the likelihoods is n·log(w/w') with the effective number n of lengths that are determined
+(MacKay 1992).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.problem import Problem
+from ..robot.chain import BASE_FRAME
+from .facts import Scale
+from .linear_model import Layout, whitened_rows
+
+# Smallest RMS correction in prior standard deviations, logarithm of the ratio of the likelihoods (very strong
+# evidence, see Kass and Raftery 1995) and relative change of lengths that are reported.
+MIN_CORRECTION, MIN_LOG_RATIO, MIN_CHANGE = 0.5, 5.5, 1e-3
+# Largest number of samples that are examined.
+MAX_SAMPLES = 300
+
+
+def find_scale(problem: Problem, x: Array) -> Scale | None:
+    """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
+    errors = problem.errors
+    outside = (BASE_FRAME, errors.chain.tool_frame_index)
+    is_length = np.array([p.unit == "m" and p.error_frame not in outside for p in errors.parameters], bool)
+    (lengths,) = np.nonzero(is_length)
+    priors = errors.priors[lengths]
+    corrections = x[lengths] / priors
+    if not lengths.size or np.sqrt(np.mean(corrections**2)) < MIN_CORRECTION:
+        return None
+    # Columns of unknowns without a prior, such as those of an undetermined tool, have an inverse with this.
+    weights = np.where(problem.weights > 0, problem.weights, 1e-6)
+    layout = Layout.of(problem)
+    data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_SAMPLES))]) for item in problem.data]
+    rates = np.zeros((sum(len(item.rows) for item in data), errors.chain.n_joints))
+    rows = whitened_rows(layout, x, data, rates).reshape(-1, layout.n_columns)
+    model = rows[:, layout.model]
+    covariance = np.linalg.inv(model.T @ model + np.diag(weights**2))
+    pattern = (covariance @ (model.T @ rows[:, layout.scale]))[lengths] / priors
+    change = float(pattern @ corrections / (pattern @ pattern))
+    remaining = float(np.sqrt(np.mean((corrections - change * pattern) ** 2)))
+    ratio = float(np.sqrt(np.mean(corrections**2))) / max(remaining, 1e-9)
+    count = float(np.sum(1 - np.diag(covariance)[lengths] / priors**2))
+    if abs(change) < MIN_CHANGE or count * np.log(ratio) < MIN_LOG_RATIO:
+        return None
+    return Scale(1 + change, remaining / float(np.linalg.norm(pattern)), "")

@@ -1,0 +1,689 @@
+"""Search for what happened during a session, from the residuals in the order of measurement.
+
+The search alternates between two steps until nothing more is found:
+
+1. A fit of the robot with all causes found so far. The weights of the samples have a bounded influence
+   (Huber), so that outliers do not look like a cause and a cause does not make half of the samples outliers.
+2. For all other causes, a score test from the inner products of the rows. With the columns A of a cause, of
+   which the fit explains the part A·β, and residuals r of unit variance, the coefficients have the estimate
+   M⁻¹·v with M = Aᵀ·A - Aᵀ·J·Q·Jᵀ·A and v = Aᵀ·r, where Q is the covariance of the unknowns of the fit. With
+   the prior N(0, s²) in units of a displacement of the tool, the logarithm of the ratio of the evidences is
+
+       ½·vᵀ·(M + s⁻²)⁻¹·v - ½·log det(1 + s²·M),
+
+   of which the greatest over a grid of s counts. Steps between all samples are tested at once with cumulative
+   sums of the inner products.
+
+A cause is kept only if it also predicts blocks of consecutive samples that are left out.
+
+Reference: P. J. Huber, Robust Estimation of a Location Parameter, Annals of Mathematical Statistics 35, 1964.
+
+Shapes: N samples in the order of measurement, K cells of consecutive samples, k residuals, c columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.problem import Problem
+from ..measurements.base import Measurement
+from .causes import Block, Cause, Constant, Drift, Shape, Step
+from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
+from .linear_model import Layout, whitened_rows
+from .robot_changes import JointPaths, RobotChanges, apply_changes, update
+from .timeline import Timeline, order_samples
+
+# Largest numbers of samples that are examined, and of cells between which steps are tested; the same for the
+# screening that decides whether to search.
+MAX_SAMPLES, MAX_CELLS = 4000, 400
+MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS = 300, 60
+# Logarithm of the ratio of the evidences from which the screening calls for a search.
+MIN_SCREENED_EVIDENCE = 2.0
+# Weight below which a sample is an outlier, and share of them that calls for a search as well.
+OUTLIER_WEIGHT, MAX_SCREENED_OUTLIERS = 0.5, 0.1
+# Residual in standard deviations from which the influence of a sample is bounded.
+HUBER_LIMIT = 2.0
+# Widths of the prior of a cause, as displacements of the tool [m].
+WIDTHS = 10.0 ** np.arange(-5.0, 0.5, 0.5)
+# Smallest logarithm of the ratio of the evidences of the score test, for a fit with the cause.
+MIN_PROPOSED_EVIDENCE = 2.0
+# Largest cost of a sample beyond its number of rows: that of an outlier.
+MAX_SAMPLE_COST = 16.0
+# Smallest logarithm of the ratio of the evidences, and smallest RMS effect in standard deviations.
+MIN_LOG_EVIDENCE, MIN_EFFECT = 12.0, 0.5
+# Smallest share of the gain of a cause that left-out blocks have to show.
+MIN_PREDICTED_SHARE = 0.4
+# Number of these blocks, fewest of them on either side of a step, and most of them.
+N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
+# Time constants of drifts, relative to the duration of the session.
+TIME_CONSTANTS = (np.inf, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
+# The same for causes that are found before the first fit.
+MIN_GROSS_EVIDENCE, MIN_GROSS_EFFECT = 60.0, 3.0
+# Gain in the logarithm of the likelihood from which a drift is exponential rather than linear.
+MIN_CURVATURE_GAIN = 3.0
+# Largest number of causes that are tried in vain.
+MAX_REJECTED = 2
+# Largest number of times that steps and time constants of drifts are changed.
+MAX_MOVES = 4
+# Largest number of causes, of iterations of a fit, and of passes of the weights in each iteration.
+MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
+# Passes end when no weight and no noise changes by more than this.
+PASS_TOL = 0.01
+# Share of the information about a cause that the fit leaves even if it can explain all of it.
+MIN_UNEXPLAINED = 1e-8
+# Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do.
+MIN_ROBOT_GAIN = 0.3
+# Smaller prior standard deviations are those of the arm, not of base and tool.
+MAX_ARM_PRIOR = 1.0
+# Fewer rows for each unknown show nothing but the unknowns.
+MIN_ROWS_PER_UNKNOWN = 1.5
+# Fewest samples on either side of a step.
+MIN_SIDE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Fit of the linear model with weights of bounded influence.
+
+    Attributes:
+        rows: Rows divided by the noise, with the residual after the fit as last column, (N, k, c).
+        columns: The same columns of the unknowns and causes of the fit, (N, k, p).
+        step: Step of the unknowns and causes, (p,).
+        covariance: Covariance of them with the weights of the samples, (p, p).
+        test_covariance: Covariance of them with equal weights, (p, p).
+        score: Remaining derivative of the cost with equal weights and bounded residuals, (p,).
+        weights: Weights of the samples, (N,).
+        noise: Noise of each row in whitened units, (N, k).
+    """
+
+    rows: Array
+    columns: Array
+    step: Array
+    covariance: Array
+    test_covariance: Array
+    score: Array
+    weights: Array
+    noise: Array
+
+
+class _Search:
+    """State of a search."""
+
+    def __init__(self, problem: Problem, timeline: Timeline, is_ordered: bool, n_samples: int, n_cells: int):
+        """Prepare the samples in the order of measurement."""
+        self.n_cells = n_cells
+        self.layout = Layout.of(problem)
+        self.is_ordered = is_ordered
+        self.timeline, self.chain = timeline, problem.errors.chain
+        numbers = timeline.fitted_numbers
+        order = np.argsort(numbers, kind="stable")
+        self.order = order[:: max(1, -(-len(order) // n_samples))]
+        self.numbers = numbers[self.order]
+        self.times = timeline.fitted_times[self.order]
+        self.edges = self._cell_edges(())
+        self.x = np.zeros(len(problem.weights))
+        self.changes = RobotChanges()
+        self.causes: list[Cause] = []
+        # Blocks and types of functions of time that were tried in vain.
+        self.rejected: set[tuple[Block, type[Shape]]] = set()
+        self.groups = self._noise_groups()
+        self.paths = JointPaths(timeline) if self._can_lag else None
+        self.layout = self.layout.holding_unobserved(self.linearize())
+
+    @property
+    def _can_lag(self) -> bool:
+        return self.is_ordered and all(item.configurations_per_row == 1 for item in self.timeline.data)
+
+    def _noise_groups(self) -> Array:
+        """Label the rows that have one noise, (N, k); -1 for rows that a kind does not have."""
+        items = self.timeline.data[: self.timeline.n_fitted]
+        width, units = max(item.residual_dim for item in items), []
+        labels = []
+        for item in items:
+            label = np.full((len(item.rows), width), -1)
+            for group in item.residual_groups.values():
+                key = (group.unit, item.has_stated_sigma)
+                if key not in units:
+                    units.append(key)
+                label[:, : item.residual_dim][:, group.rows] = units.index(key)
+            labels.append(label)
+        return np.concatenate(labels)[self.order]
+
+    def _cell_edges(self, near: Sequence[int]) -> Array:
+        """Return the first sample of each cell, and N; cells near some samples have one sample each."""
+        n = len(self.numbers)
+        edges = np.linspace(0, n, min(n, self.n_cells) + 1).astype(int)
+        width = int(np.diff(edges).max())
+        if width > 1:
+            single = [np.arange(max(0, s - 2 * width), min(n, s + 2 * width)) for s in near]
+            edges = np.unique(np.concatenate([edges, *single]))
+        return edges
+
+    # ------------------------------------------------------------------------------------------- fit
+    def linearize(self) -> Array:
+        """Return the whitened rows with the current unknowns and changes."""
+        data, _ = apply_changes(self.changes, self.chain, self.timeline)
+        if self.paths is None:
+            rates = np.zeros((len(self.timeline.fitted_numbers), self.chain.n_joints))
+        else:
+            rates = self.paths.evaluate(
+                self.timeline.fitted_numbers, self.timeline.fitted_times, self.changes.lag
+            )[1]
+        rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
+        for cause in self.causes:
+            if cause.block.kind == "scale":
+                rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
+        return rows
+
+    def _cause_columns(self, rows: Array, causes: Sequence[Cause]) -> Array:
+        """Return the columns of causes, (N, k, ·)."""
+        parts = [
+            rows[..., cause.block.columns] * cause.shape.values(self.numbers, self.times)[:, None, None]
+            for cause in causes
+        ]
+        return np.concatenate([rows[..., :0], *parts], -1)
+
+    def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
+        """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
+        layout = self.layout
+        columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
+        residual = rows[..., -1]
+        sizes = np.concatenate([np.ones(0), *(cause.block.sizes for cause in causes)])
+        held = np.concatenate([np.zeros(0), *(cause.values for cause in causes)])
+        # A prior of one metre decides what the measurements do not show, such as turns of a point.
+        prior = np.concatenate([layout.weights, 1 / sizes])
+        value = np.concatenate([self.x, held])
+        is_row = self.groups >= 0
+        noise, weights = np.ones(residual.shape), np.ones(len(rows))
+        after = residual
+        step = covariance = np.zeros(0)
+        for _ in range(N_PASSES):
+            scaled = np.sqrt(weights)[:, None] / noise
+            flat = (columns * scaled[..., None]).reshape(-1, columns.shape[-1])
+            right = (residual * scaled).ravel()
+            information = flat.T @ flat
+            information.flat[:: len(information) + 1] += prior**2
+            covariance = np.linalg.inv(information)
+            step = covariance @ (flat.T @ right - prior**2 * value)
+            after = residual - columns @ step
+            freedom = max(1 - float(np.sum(covariance * (flat.T @ flat))) / is_row.sum(), 0.05)
+            last_noise, noise = noise, np.ones(residual.shape)
+            for label in range(self.groups.max() + 1):
+                chosen = self.groups == label
+                scale = 1.4826 * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
+                noise[chosen] = max(scale, 1e-9)
+            size = np.sqrt(np.sum((after / noise) ** 2 * is_row, 1) / is_row.sum(1))
+            previous, weights = weights, np.minimum(1.0, HUBER_LIMIT / np.maximum(size, 1e-12))
+            if max(np.abs(weights - previous).max(), np.abs(noise / last_noise - 1).max()) < PASS_TOL:
+                break
+        # Variance of the bounded residuals, so that the score test keeps its level with outliers.
+        bounded = (after / noise) * weights[:, None]
+        variance = np.sum(bounded**2 * is_row) / (np.sum(is_row) * freedom)
+        noise = noise * np.sqrt(variance)
+        out = rows / noise[..., None]
+        out[..., -1] = after / noise
+        columns = columns / noise[..., None]
+        equal, weighted = (
+            np.linalg.inv(_information(columns, root) + np.diag(prior**2))
+            for root in (np.ones(len(rows)), np.sqrt(weights))
+        )
+        score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
+        return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
+
+    def iterate(self, max_iterations: int = MAX_ITERATIONS) -> LinearFit:
+        """Fit unknowns and causes until the steps are negligible."""
+        fit = self.solve(self.linearize(), self.causes)
+        for _ in range(max_iterations):
+            self._advance(fit)
+            change = np.sqrt(np.mean((fit.columns @ fit.step) ** 2 * fit.weights[:, None]))
+            fit = self.solve(self.linearize(), self.causes)
+            if change < 0.05:
+                break
+        return fit
+
+    def _advance(self, fit: LinearFit) -> None:
+        """Move unknowns and causes by the step of a fit."""
+        p = len(self.x)
+        base = self.layout.problem.errors.at(
+            self.layout.errors_at(self.x)[: len(self.layout.problem.errors.parameters)]
+        ).base
+        self.x = self.x + fit.step[:p]
+        steps, covariances, at = [], [], p
+        for cause in self.causes:
+            c = len(cause.values)
+            steps.append(fit.step[at : at + c])
+            covariances.append(fit.covariance[at : at + c, at : at + c])
+            at += c
+        self.changes = update(self.changes, self.causes, steps, base, self.layout.links)
+        self.causes = [
+            replace(cause, values=cause.values + step, covariance=covariance)
+            for cause, step, covariance in zip(self.causes, steps, covariances, strict=True)
+        ]
+
+    # ------------------------------------------------------------------------------------------- test
+    def best_cause(self, fit: LinearFit) -> Cause | None:
+        """Return the cause of greatest evidence that is not in a fit."""
+        cells, cross = self._products(fit)
+        found = [
+            self._score(fit, block, shapes, cells, cross)
+            for block in self.layout.blocks
+            for shapes in self._shapes(block)
+        ]
+        best = max(found, key=lambda cause: cause.log_evidence, default=None)
+        return best and replace(best, effect=self._effect(fit, best))
+
+    def _effect(self, fit: LinearFit, cause: Cause) -> float:
+        """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
+        f = cause.shape.values(self.numbers, self.times)
+        own = np.einsum("nkc,c->nk", fit.rows[..., cause.block.columns], cause.values) * f[:, None]
+        others = np.einsum("nkp,nk->p", fit.columns, own)
+        effect = own - fit.columns @ (fit.test_covariance @ others)
+        return float(np.sqrt(np.sum(effect**2) / (np.sum(self.groups >= 0) * self._concerned(cause))))
+
+    def _concerned(self, cause: Cause) -> float:
+        """Return the share of the samples that a cause tells apart from the others."""
+        if not isinstance(cause.shape, Step):
+            return 1.0
+        share = float(np.mean(self.numbers < cause.shape.number))
+        return min(share, 1 - share)
+
+    def _products(self, fit: LinearFit) -> tuple[Array, Array]:
+        """Return the inner products of each cell: of the rows, and of rows and columns of the fit."""
+        rows = fit.rows.copy()
+        rows[..., -1] *= fit.weights[:, None]
+        return _cell_products(rows, self.edges), _cell_products(rows, self.edges, fit.columns)
+
+    def _shapes(self, block: Block) -> list[list[Shape]]:
+        """Return the functions of time that are tested for a block; those of one list are equally likely."""
+        if block.is_constant:
+            if block.kind == "lag" and self.paths is None:
+                return []
+            return [] if (block, Constant) in self.rejected else [[Constant()]]
+        steps: list[Shape] = []
+        if block.kind != "links":
+            taken = [c.shape.number for c in self.causes if c.block is block and isinstance(c.shape, Step)]
+            n = len(self.numbers)
+            inner = self.edges
+            if not self.is_ordered:
+                inner = np.searchsorted(self.numbers, self.timeline.file_starts)
+            others = [0, n, *(int(np.searchsorted(self.numbers, number)) for number in taken)]
+            inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
+            steps = [Step(int(number)) for number in self.numbers[inner]]
+        drifts: list[Shape] = []
+        if self.is_ordered:
+            begin, end = float(self.times[0]), float(self.times[-1])
+            drifts = [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
+            used = {(c.block.kind, c.block.of) for c in self.causes if isinstance(c.shape, Drift)}
+            drifts = [] if (block.kind, block.of) in used else drifts
+        return [s for s in (steps, drifts) if s and (block, type(s[0])) not in self.rejected]
+
+    def _score(
+        self, fit: LinearFit, block: Block, shapes: Sequence[Shape], cells: Array, cross: Array
+    ) -> Cause:
+        """Return the cause of greatest evidence among functions of time of one block."""
+        own = block.columns
+        firsts = self.edges[:-1]
+        if isinstance(shapes[0], Step):
+            ends = np.searchsorted(self.numbers[firsts], [shape.number for shape in shapes])  # pyright: ignore
+            inner = -np.cumsum(cells[:, own][:, :, own], 0)[ends - 1]
+            right = -np.cumsum(cells[:, own, -1], 0)[ends - 1]
+            beside = -np.cumsum(cross[:, own], 0)[ends - 1]
+            inner = -inner
+        else:
+            f = np.array([shape.values(self.numbers[firsts], self.times[firsts]) for shape in shapes])
+            inner = np.tensordot(f**2, cells[:, own][:, :, own], 1)
+            right = np.tensordot(f, cells[:, own, -1], 1)
+            beside = np.tensordot(f, cross[:, own], 1)
+        sizes = block.sizes
+        explained = beside @ fit.test_covariance
+        matrix = inner - explained @ beside.swapaxes(1, 2)
+        matrix += MIN_UNEXPLAINED * inner * np.eye(len(own))
+        right = right - explained @ fit.score
+        matrix = matrix * sizes * sizes[:, None]
+        vector = right * sizes
+        values, vectors = np.linalg.eigh(matrix)
+        values = np.maximum(values, 0.0)
+        along = np.einsum("sij,si->sj", vectors, vector)
+        square = WIDTHS[:, None, None] ** 2
+        gain = 0.5 * np.sum(along**2 * square / (1 + square * values) - np.log1p(square * values), -1)
+        width, index = np.unravel_index(np.argmax(gain), gain.shape)
+        log_evidence = float(gain[width, index]) - np.log(len(shapes)) - np.log(len(self.layout.blocks))
+        estimate = vectors[index] @ (along[index] / (values[index] + WIDTHS[width] ** -2)) * sizes
+        return Cause(block, shapes[index], estimate, np.zeros((len(own),) * 2), log_evidence)
+
+    # ------------------------------------------------------------------------------------------- search
+    def run(self) -> None:
+        """Find all causes."""
+        fit = self.solve(self.linearize(), [])
+        gross = self.best_cause(fit)
+        if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and gross.effect > MIN_GROSS_EFFECT:
+            self._add(gross)
+        fit = self.iterate()
+        while len(self.causes) < MAX_CAUSES:
+            found = self.best_cause(fit)
+            if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
+                break
+            self._add(found)
+            fit = self._settle()
+            rows = self.linearize()
+            judged = self._judge(rows, self.solve(rows, self.causes), len(self.causes) - 1)
+            if judged.log_evidence < MIN_LOG_EVIDENCE:
+                self.rejected.add((judged.block, type(judged.shape)))
+                fit = self._remove(len(self.causes) - 1)
+                if len(self.rejected) > MAX_REJECTED:
+                    break
+        self._confirm()
+
+    def _remove(self, i: int) -> LinearFit:
+        """Remove a cause, and fit without it."""
+        del self.causes[i]
+        return self._settle()
+
+    def _add(self, cause: Cause) -> None:
+        """Add a cause, with coefficients of zero."""
+        self.causes.append(replace(cause, values=np.zeros_like(cause.values)))
+        steps = [
+            int(np.searchsorted(self.numbers, c.shape.number))
+            for c in self.causes
+            if isinstance(c.shape, Step)
+        ]
+        self.edges = self._cell_edges(steps)
+
+    def _settle(self) -> LinearFit:
+        """Fit, and move the steps to the samples where they fit best."""
+        fit = self.iterate()
+        for _ in range(MAX_MOVES):
+            if not (self._move_steps(fit) or self._change_drifts()):
+                break
+            fit = self.iterate()
+        return fit
+
+    def _change_drifts(self) -> bool:
+        """Give each drift the time constant that fits best; return whether one changed."""
+        has_changed = False
+        for i, cause in enumerate(self.causes):
+            if not isinstance(cause.shape, Drift):
+                continue
+            others = [*self.causes[:i], *self.causes[i + 1 :]]
+            rows = self._undone(self.linearize(), cause)
+            span = cause.shape.end - cause.shape.begin
+            shapes = [replace(cause.shape, time_constant=ratio * span) for ratio in TIME_CONSTANTS]
+            costs = [self._log_noise(self.solve(rows, [*others, replace(cause, shape=f)])) for f in shapes]
+            # A linear drift is the simplest one.
+            costs[0] -= MIN_CURVATURE_GAIN / np.sum(self.groups >= 0)
+            best = shapes[int(np.argmin(costs))]
+            if best != cause.shape:
+                self.causes[i] = replace(cause, shape=best)
+                self.changes = self.changes.with_drift(cause.shape, best)
+                has_changed = True
+        return has_changed
+
+    def _log_noise(self, fit: LinearFit) -> float:
+        """Return the mean logarithm of the noise of a fit."""
+        return float(np.mean(np.log(fit.noise[self.groups >= 0])))
+
+    def _undone(self, rows: Array, cause: Cause) -> Array:
+        """Return the rows as if a cause had been left out of the model."""
+        undone = rows.copy()
+        f = cause.shape.values(self.numbers, self.times)
+        undone[..., -1] += (rows[..., cause.block.columns] @ cause.values) * f[:, None]
+        return undone
+
+    def _move_steps(self, fit: LinearFit) -> bool:
+        """Move each step to where the samples before and after it fit best; return whether one moved."""
+        has_moved = False
+        for i, cause in enumerate(self.causes):
+            if not isinstance(cause.shape, Step):
+                continue
+            change = fit.rows[..., cause.block.columns] @ cause.values
+            is_after = self.numbers >= cause.shape.number
+            residual = fit.rows[..., -1]
+            after = np.where(is_after[:, None], residual, residual - change)
+            costs = [_bounded_cost(r) for r in (after + change, after)]
+            # Cost of a step before each sample: `before` for the samples in front of it, `after` behind.
+            total = np.concatenate([[0.0], np.cumsum(costs[0] - costs[1])])
+            inner = np.arange(MIN_SIDE, len(self.numbers) - MIN_SIDE + 1)
+            if not self.is_ordered or not inner.size:
+                continue
+            best = int(inner[np.argmin(total[inner])])
+            number = int(self.numbers[best])
+            if number != cause.shape.number:
+                self.causes[i] = replace(cause, shape=Step(number))
+                has_moved = True
+        return has_moved
+
+    def _confirm(self) -> None:
+        """Remove the causes that left-out blocks of samples do not show."""
+        while self.causes:
+            rows = self.linearize()
+            full = self.solve(rows, self.causes)
+            judged = [self._judge(rows, full, i) for i in range(len(self.causes))]
+            worst = min(range(len(judged)), key=lambda i: judged[i].log_evidence)
+            if judged[worst].log_evidence >= MIN_LOG_EVIDENCE:
+                self.causes = judged
+                break
+            self._remove(worst)
+
+    def _judge(self, rows: Array, full: LinearFit, i: int) -> Cause:
+        """Return a cause with the evidence for it, given all others."""
+        cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
+        undone = self._undone(rows, cause)
+        without = self.solve(undone, others)
+        # The same noise and weights for both.
+        scaled = np.sqrt(full.weights)[:, None] / full.noise
+        columns = [
+            rows[..., self.layout.model],
+            self._cause_columns(rows, [*others, cause]),
+            undone[..., -1:],
+        ]
+        stack = np.concatenate(columns, -1) * scaled[..., None]
+        sizes = [1 / c.block.sizes for c in (*others, cause)]
+        prior = np.concatenate([self.layout.weights, *sizes])
+        side = len(rows) * self._concerned(cause)
+        length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
+        inside, predicted = _predicted_gain(stack, len(prior) - len(sizes[-1]), prior, length)
+        effect = float(np.sqrt(inside / (np.sum(self.groups >= 0) * self._concerned(cause))))
+        is_predicted = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
+        evidence = self._log_evidence(cause, i, full, without) if is_predicted else -np.inf
+        return replace(cause, log_evidence=evidence, effect=effect)
+
+    def _log_evidence(self, cause: Cause, i: int, full: LinearFit, without: LinearFit) -> float:
+        """Return the logarithm of the ratio of the evidences with and without a cause.
+
+        A sample counts no more than an outlier does.
+        """
+        limit = np.sum(self.groups >= 0, 1) + MAX_SAMPLE_COST
+        costs = [
+            float(np.sum(np.minimum(np.sum((fit.rows[..., -1] * fit.noise / full.noise) ** 2, 1), limit)))
+            for fit in (without, full)
+        ]
+        start = len(self.x) + sum(len(c.values) for c in self.causes[:i])
+        own, sizes = slice(start, start + len(cause.values)), cause.block.sizes
+        information = np.linalg.inv(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
+        values = np.maximum(np.linalg.eigvalsh(information), 0.0)
+        square = WIDTHS[:, None] ** 2
+        width = np.sum(np.log1p(square * values) + (cause.values / sizes) ** 2 / square, 1)
+        n_places = len(self.edges) if isinstance(cause.shape, Step) else len(TIME_CONSTANTS)
+        prior = np.log(n_places) + np.log(len(self.layout.blocks))
+        return 0.5 * (costs[0] - costs[1] - float(width.min())) - float(prior)
+
+    # ------------------------------------------------------------------------------------------- after it
+    def place_steps(self) -> None:
+        """Move steps between two fitted samples to where the held-out samples between them fit best."""
+        timeline, layout = self.timeline, self.layout
+        full = layout.errors_at(self.x)
+        chain = layout.problem.errors.at(full[: len(layout.problem.errors.parameters)])
+        values = layout.problem.instruments(full)
+        held_out = np.concatenate([np.empty(0, int), *timeline.numbers[timeline.n_fitted :]])
+        for i, cause in enumerate(self.causes):
+            if not isinstance(cause.shape, Step):
+                continue
+            old = cause.shape.number
+            last = self.numbers[self.numbers < old].max(initial=-1)
+            between = np.sort(held_out[(held_out > last) & (held_out < old)])
+            costs = {}
+            for new in (old, *between.tolist()):
+                changes = self.changes.with_step(cause.block.kind, cause.block.index, old, new)
+                _, items = apply_changes(changes, self.chain, timeline)
+                costs[new] = 0.0
+                for item, numbers in zip(items, timeline.numbers[timeline.n_fitted :], strict=True):
+                    part = item.take(np.isin(numbers, between))
+                    if len(part.rows):
+                        u = np.array([values[parameter.name] for parameter in part.instrument_parameters])
+                        frames = chain.forward_kinematics(part.conditions())
+                        costs[new] += float(np.sum(np.abs(part.residual(frames, u))))
+            best = min(costs, key=lambda number: costs[number])
+            self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, best)
+            self.causes[i] = replace(cause, shape=Step(best))
+
+    def other_robot(self) -> Event | None:
+        """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
+        rows = self.linearize()
+        one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
+        geometric = [c for c in self.layout.model if c < len(names)]
+        # The prior is that of one robot, see `solve`.
+        sizes = np.array([names[c].prior for c in geometric])
+        best: tuple[float, int, LinearFit] | None = None
+        for number in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):
+            robot = Cause(
+                Block("robot", "", 0, np.array(geometric), sizes),
+                Step(number),
+                np.zeros(len(sizes)),
+                np.empty((0, 0)),
+            )
+            others = [c for c in self.causes if c.shape != Step(number)]
+            two = self.solve(rows, [*others, robot])
+            count = float(np.sum(self.groups >= 0))
+            gain = count * float(np.mean(np.log(one.noise / two.noise)))
+            needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
+            if gain > max(needed, best[0] if best else 0.0):
+                best = gain, number, two
+        if best is None:
+            return None
+        difference, std = best[2].step[-len(sizes) :], np.sqrt(np.diag(best[2].covariance)[-len(sizes) :])
+        # The most significant difference of the arm itself.
+        is_arm = np.array([names[c].prior < MAX_ARM_PRIOR for c in geometric])
+        worst = int(np.argmax(np.where(is_arm, np.abs(difference) / std, 0.0)))
+        (before, line_before), (file, line) = (self.timeline.place(best[1] + i) for i in (-1, 0))
+        name, unit = names[geometric[worst]].name, names[geometric[worst]].unit
+        size = abs(float(difference[worst]))
+        return Event("robot", name, file, line, before, line_before, size, float(std[worst]), unit)
+
+
+def _information(columns: Array, root: Array) -> Array:
+    """Return the inner products of columns (N, k, p) with square roots of weights (N,)."""
+    flat = (columns * root[:, None, None]).reshape(-1, columns.shape[-1])
+    return flat.T @ flat
+
+
+def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[float, float]:
+    """Return how much the columns from p on reduce the cost: of all samples, and of left-out blocks."""
+    count = int(np.clip(len(stack) / max(length, 1.0), 2, MAX_BLOCKS))
+    edges = np.unique(np.linspace(0, len(stack), count + 1).astype(int))
+    parts = _cell_products(stack, edges)
+    total = parts.sum(0)
+
+    def cost(kept: Array, out: Array, count: int) -> float:
+        matrix = kept[:count, :count] + np.diag(prior[:count] ** 2)
+        x = np.append(-np.linalg.solve(matrix, kept[:count, -1]), 1.0)
+        used = np.append(np.arange(count), len(kept) - 1)
+        return float(x @ out[np.ix_(used, used)] @ x)
+
+    n = len(prior)
+    inside = cost(total, total, p) - cost(total, total, n)
+    predicted = sum(cost(total - part, part, p) - cost(total - part, part, n) for part in parts)
+    return inside, predicted
+
+
+def _bounded_cost(residual: Array) -> Array:
+    """Return the cost of each sample, (N,), which grows linearly beyond the limit of influence."""
+    size = np.sqrt(np.mean(residual**2, 1))
+    return np.where(size < HUBER_LIMIT, size**2, HUBER_LIMIT * (2 * size - HUBER_LIMIT)) * residual.shape[1]
+
+
+def can_have_session(data: Sequence[Measurement]) -> bool:
+    """Return whether the samples of measurements can be put in order and examined together."""
+    return all(
+        item.configurations_per_row == 1
+        and item.has_length_scale
+        and item.rig is None
+        and item.has_joint_values
+        for item in data
+    )
+
+
+def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
+    """Find what happened during a session.
+
+    Args:
+        problem: Problem with initialized base and tool.
+        x: Approximate solution, (p,).
+        holdout: Held-out measurements, which only count for the timeline.
+        is_ordered: Whether the samples are in the order of measurement; else only files may differ.
+
+    Returns:
+        Causes and changes of the robot.
+    """
+    timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
+    nothing = Session(RobotChanges(), timeline, chain, is_ordered)
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    if n_rows < MIN_ROWS_PER_UNKNOWN * len(problem.weights):
+        return nothing
+    if not _is_suspicious(problem, x, timeline, is_ordered):
+        return nothing
+    search = _Search(problem, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
+    search.run()
+    other_robot = search.other_robot() if search.causes else None
+    search.place_steps()
+    causes = tuple(search.causes)
+    events = describe_events(causes, search.changes, chain, timeline)
+    return Session(
+        search.changes.without_lag,
+        timeline,
+        chain,
+        is_ordered,
+        causes,
+        (other_robot,) if other_robot else events,
+        tuple(describe_drifts(causes, chain, timeline)),
+        next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
+        tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
+    )
+
+
+def _lag(cause: Cause, timeline: Timeline) -> Lag:
+    """Describe a lag."""
+    return Lag(float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), timeline.unit)
+
+
+def _scale(cause: Cause) -> Scale:
+    """Describe the scale of one axis."""
+    return Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
+
+
+def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:
+    """Return whether a test of a part of the samples calls for a search."""
+    screening = _Search(problem, timeline, is_ordered, MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS)
+    screening.x = x
+    fit = screening.solve(screening.linearize(), [])
+    if np.mean(fit.weights < OUTLIER_WEIGHT) > MAX_SCREENED_OUTLIERS:
+        return True
+    found = screening.best_cause(fit)
+    return found is not None and found.log_evidence > MIN_SCREENED_EVIDENCE
+
+
+def _cell_products(rows: Array, edges: Array, columns: Array | None = None) -> Array:
+    """Return the inner products of the rows of each cell, (K, c, ·)."""
+    other = rows if columns is None else columns
+    if len(edges) == len(rows) + 1:
+        return rows.swapaxes(1, 2) @ other
+    return np.array(
+        [
+            rows[a:b].reshape(-1, rows.shape[-1]).T @ other[a:b].reshape(-1, other.shape[-1])
+            for a, b in pairwise(edges)
+        ]
+    )

@@ -1,0 +1,95 @@
+"""Timeline of a session: when each sample was measured, relative to the others.
+
+The samples are in the order of the files and of their lines, or of their times if all samples have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .._typing import Array
+from ..measurements.base import Measurement
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """Order of the samples of a session of N samples.
+
+    Attributes:
+        data: Fitted measurements, then held-out ones.
+        n_fitted: Number of fitted measurements.
+        numbers: Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
+        times: Time of each sample, one array per measurement: in seconds if known, else its number.
+        unit: "s" or "row", the unit of the times.
+        file_starts: Numbers of the first samples of all files but the first.
+    """
+
+    data: tuple[Measurement, ...]
+    n_fitted: int
+    numbers: tuple[Array, ...]
+    times: tuple[Array, ...]
+    unit: str
+    file_starts: tuple[int, ...]
+
+    @property
+    def fitted_numbers(self) -> Array:
+        """Numbers of all fitted samples, in the order of the measurements."""
+        return np.concatenate(self.numbers[: self.n_fitted])
+
+    @property
+    def fitted_times(self) -> Array:
+        """Times of all fitted samples, in the order of the measurements."""
+        return np.concatenate(self.times[: self.n_fitted])
+
+    def place(self, number: int) -> tuple[str, int]:
+        """Return file and line of a sample."""
+        for item, numbers in zip(self.data, self.numbers, strict=True):
+            found = np.flatnonzero(numbers == number)
+            if found.size:
+                return item.source, int(item.rows[found[0]])
+        raise IndexError(number)
+
+
+def order_samples(data: Sequence[Measurement], holdout: Sequence[Measurement]) -> Timeline:
+    """Put the samples of measurements into the order of measurement."""
+    items = (*data, *holdout)
+    files = _file_numbers(data, holdout)
+    clocks = [item.recorded.time if item.recorded is not None else None for item in items]
+    stated = [clock for clock in clocks if clock is not None]
+    has_times = len(stated) == len(items)
+    file = np.concatenate(
+        [np.full(len(item.rows), number) for item, number in zip(items, files, strict=True)]
+    )
+    rows = np.concatenate([item.rows for item in items])
+    keys = (rows, file, np.concatenate(stated)) if has_times else (rows, file)
+    order = np.lexsort(keys)
+    numbers = np.empty(len(order), int)
+    numbers[order] = np.arange(len(order))
+    times = np.concatenate(stated) if has_times else numbers.astype(float)
+    ends = np.cumsum([len(item.rows) for item in items])[:-1]
+    starts = np.flatnonzero(np.diff(file[order])) + 1
+    return Timeline(
+        items,
+        len(data),
+        tuple(np.split(numbers, ends)),
+        tuple(np.split(times, ends)),
+        "s" if has_times else "row",
+        tuple(starts.tolist()),
+    )
+
+
+def _file_numbers(data: Sequence[Measurement], holdout: Sequence[Measurement]) -> list[int]:
+    """Number the files of measurements; parts of one file have the same number."""
+    numbers = [i for i in range(len(data))]
+    for i, item in enumerate(data):
+        same = [j for j in range(i) if item.source and data[j].source == item.source]
+        numbers[i] = numbers[same[0]] if same else i
+    for i, item in enumerate(holdout):
+        parts = [j for j, other in enumerate(data) if other.source == item.source]
+        if not item.source:
+            parts = [i] if i < len(data) and not np.isin(item.rows, data[i].rows).any() else []
+        numbers.append(numbers[parts[0]] if parts else len(data) + i)
+    return numbers
