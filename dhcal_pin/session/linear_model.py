@@ -81,10 +81,10 @@ class Layout:
         grows = growing_links(chain)
         size = float(np.linalg.norm(chain.loads.link_vectors, axis=1).sum())
         of_frame = np.array([1.0] * 3 + [1 / size] * 3)
-        blocks = [
-            Block(kind, "", 0, np.array([names.index(q.name) for q in parameters]), of_frame)
-            for kind, parameters in (("base", base(chain)), ("tool", tool(chain)))
-        ]
+        of_base, of_tool = (
+            np.array([names.index(q.name) for q in parameters]) for parameters in (base(chain), tool(chain))
+        )
+        blocks = [Block("base", "", 0, of_base, of_frame), Block("tool", "", 0, of_tool, of_frame)]
         for j, name in enumerate(chain.joint_names):
             unit = 1.0 if chain.is_prismatic[j] else 1 / size
             blocks.append(Block("joint", name, j, joints[j : j + 1], np.array([unit])))

@@ -2,10 +2,9 @@
 
 Positions and poses do not tell a scale of the instrument from the size of the robot. A wrong scale changes
 all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections of the
-lengths, in units of their prior standard deviations, have the RMS w, and w' without the part that one factor
-explains. For a common width of their normal distribution, each time of greatest likelihood, the logarithm of
-the ratio of the likelihoods is n·log(w/w') with the effective number n of lengths that are determined
-(MacKay 1992).
+lengths, in units of their prior standard deviations, are those of one factor, and a normal distribution of
+unknown width. The factor is reported if Student's t test rejects that it is 1. The number of lengths in this
+test is the effective number of those that are determined (MacKay 1992).
 """
 
 from __future__ import annotations
@@ -18,15 +17,18 @@ from ..robot.chain import BASE_FRAME
 from .facts import Scale
 from .linear_model import Layout, whitened_rows
 
-# Smallest RMS correction in prior standard deviations, logarithm of the ratio of the likelihoods (very strong
-# evidence, see Kass and Raftery 1995) and relative change of lengths that are reported.
-MIN_CORRECTION, MIN_LOG_RATIO, MIN_CHANGE = 0.5, 5.5, 1e-3
+# Smallest RMS correction in prior standard deviations and relative change of lengths that are reported.
+MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
+# Probability that chance makes the correction of an arm look like a change of scale.
+MAX_CHANCE = 1e-3
 # Largest number of samples that are examined.
 MAX_SAMPLES = 300
 
 
 def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
+    from scipy.special import stdtr  # lazy import: slow
+
     errors = problem.errors
     outside = (BASE_FRAME, errors.chain.tool_frame_index)
     is_length = np.array([p.unit == "m" and p.error_frame not in outside for p in errors.parameters], bool)
@@ -45,9 +47,11 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     covariance = np.linalg.inv(model.T @ model + np.diag(weights**2))
     pattern = (covariance @ (model.T @ rows[:, layout.scale]))[lengths] / priors
     change = float(pattern @ corrections / (pattern @ pattern))
-    remaining = float(np.sqrt(np.mean((corrections - change * pattern) ** 2)))
-    ratio = float(np.sqrt(np.mean(corrections**2))) / max(remaining, 1e-9)
-    count = float(np.sum(1 - np.diag(covariance)[lengths] / priors**2))
-    if abs(change) < MIN_CHANGE or count * np.log(ratio) < MIN_LOG_RATIO:
+    freedom = float(np.sum(1 - np.diag(covariance)[lengths] / priors**2)) - 1
+    if freedom < 1 or abs(change) < MIN_CHANGE:
         return None
-    return Scale(1 + change, remaining / float(np.linalg.norm(pattern)), "")
+    remaining = float(np.linalg.norm(corrections - change * pattern)) / np.sqrt(freedom)
+    std = max(remaining, 1e-9) / float(np.linalg.norm(pattern))
+    if 2 * stdtr(freedom, -abs(change) / std) > MAX_CHANCE:
+        return None
+    return Scale(1 + change, std, "")

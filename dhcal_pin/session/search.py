@@ -202,6 +202,7 @@ class _Search:
         noise, weights = np.ones(residual.shape), np.ones(len(rows))
         after = residual
         step = covariance = np.zeros(0)
+        freedom = 1.0
         for _ in range(N_PASSES):
             scaled = np.sqrt(weights)[:, None] / noise
             flat = (columns * scaled[..., None]).reshape(-1, columns.shape[-1])
@@ -354,7 +355,7 @@ class _Search:
         width, index = np.unravel_index(np.argmax(gain), gain.shape)
         log_evidence = float(gain[width, index]) - np.log(len(shapes)) - np.log(len(self.layout.blocks))
         estimate = vectors[index] @ (along[index] / (values[index] + WIDTHS[width] ** -2)) * sizes
-        return Cause(block, shapes[index], estimate, np.zeros((len(own),) * 2), log_evidence)
+        return Cause(block, shapes[int(index)], estimate, np.zeros((len(own),) * 2), log_evidence)
 
     # ------------------------------------------------------------------------------------------- search
     def run(self) -> None:
