@@ -26,6 +26,8 @@ from .causes import Block
 HELD_SIZE = 1e-12
 # Largest entry of a column, relative to those of others, below which it is rounding.
 MIN_OBSERVED = 1e-9
+# Largest share of a constant error that the unknowns of the calibration may leave.
+MAX_UNEXPLAINED = 1e-3
 # Axes of a scale; empty for all axes.
 SCALE_AXES = ("", "x", "y", "z")
 
@@ -109,13 +111,24 @@ class Layout:
             lag + 2,
         )
 
-    def holding_unobserved(self, rows: Array) -> Layout:
-        """Return the layout with causes that do not change what the rows (m, k, c) do not show."""
+    def restricted_to(self, rows: Array) -> Layout:
+        """Return the layout with the causes that the rows (m, k, c) can show.
+
+        Changes that they do not show are held. A change over time is told from a constant error only if the
+        calibration estimates the constant error.
+        """
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
+        flat = rows.reshape(-1, rows.shape[-1])
+        changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))
+        model = flat[:, self.model] / np.where(largest > 0, largest, 1.0)[self.model]
+        left = flat[:, changing] - model @ np.linalg.lstsq(model, flat[:, changing], rcond=1e-9)[0]
+        share = np.sum(left**2, 0) / np.maximum(np.sum(flat[:, changing] ** 2, 0), 1e-300)
+        constant_only = set(changing[is_observed[changing] & (share > MAX_UNEXPLAINED)].tolist())
         blocks = [
             replace(block, sizes=np.where(is_observed[block.columns], block.sizes, HELD_SIZE))
             for block in self.blocks
+            if block.is_constant or not constant_only.intersection(block.columns.tolist())
         ]
         return replace(self, blocks=tuple(blocks))
 

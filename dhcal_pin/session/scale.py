@@ -19,6 +19,8 @@ from .linear_model import Layout, whitened_rows
 
 # Smallest RMS correction in prior standard deviations and relative change of lengths that are reported.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
+# Smallest norm of the corrections by a change of scale of 1, in prior standard deviations: a hundredth of 1 mm.
+MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
 MAX_CHANCE = 1e-3
 # Largest number of samples that are examined.
@@ -46,6 +48,8 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     model = rows[:, layout.model]
     covariance = np.linalg.inv(model.T @ model + np.diag(weights**2))
     pattern = (covariance @ (model.T @ rows[:, layout.scale]))[lengths] / priors
+    if not np.linalg.norm(pattern) > MIN_PATTERN:
+        return None
     change = float(pattern @ corrections / (pattern @ pattern))
     freedom = float(np.sum(1 - np.diag(covariance)[lengths] / priors**2)) - 1
     if freedom < 1 or abs(change) < MIN_CHANGE:

@@ -58,6 +58,8 @@ MAX_SAMPLE_COST = 16.0
 MIN_LOG_EVIDENCE, MIN_EFFECT = 12.0, 0.5
 # Smallest share of the gain of a cause that left-out blocks have to show.
 MIN_PREDICTED_SHARE = 0.4
+# Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
+MAX_OUTLIER_SHARE = 0.25
 # Number of these blocks, fewest of them on either side of a step, and most of them.
 N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 # Time constants of drifts, relative to the duration of the session.
@@ -72,6 +74,10 @@ MAX_REJECTED = 2
 MAX_MOVES = 4
 # Largest number of causes, of iterations of a fit, and of passes of the weights in each iteration.
 MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
+# Smallest noise in standard deviations of the measurements: a micrometre if they state none.
+MIN_NOISE = 1e-3
+# Added to the unit diagonal of information for directions that nothing determines.
+MIN_INFORMATION = 1e-12
 # Passes end when no weight and no noise changes by more than this.
 PASS_TOL = 0.01
 # Share of the information about a cause that the fit leaves even if it can explain all of it.
@@ -133,7 +139,7 @@ class _Search:
         self.rejected: set[tuple[Block, type[Shape]]] = set()
         self.groups = self._noise_groups()
         self.paths = JointPaths(timeline) if self._can_lag else None
-        self.layout = self.layout.holding_unobserved(self.linearize())
+        self.layout = self.layout.restricted_to(self.linearize())
 
     @property
     def _can_lag(self) -> bool:
@@ -209,7 +215,7 @@ class _Search:
             right = (residual * scaled).ravel()
             information = flat.T @ flat
             information.flat[:: len(information) + 1] += prior**2
-            covariance = np.linalg.inv(information)
+            covariance = _inverse(information)
             step = covariance @ (flat.T @ right - prior**2 * value)
             after = residual - columns @ step
             freedom = max(1 - float(np.sum(covariance * (flat.T @ flat))) / is_row.sum(), 0.05)
@@ -217,7 +223,7 @@ class _Search:
             for label in range(self.groups.max() + 1):
                 chosen = self.groups == label
                 scale = 1.4826 * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
-                noise[chosen] = max(scale, 1e-9)
+                noise[chosen] = max(scale, MIN_NOISE)
             size = np.sqrt(np.sum((after / noise) ** 2 * is_row, 1) / is_row.sum(1))
             previous, weights = weights, np.minimum(1.0, HUBER_LIMIT / np.maximum(size, 1e-12))
             if max(np.abs(weights - previous).max(), np.abs(noise / last_noise - 1).max()) < PASS_TOL:
@@ -230,7 +236,7 @@ class _Search:
         out[..., -1] = after / noise
         columns = columns / noise[..., None]
         equal, weighted = (
-            np.linalg.inv(_information(columns, root) + np.diag(prior**2))
+            _inverse(_information(columns, root) + np.diag(prior**2))
             for root in (np.ones(len(rows)), np.sqrt(weights))
         )
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
@@ -488,10 +494,20 @@ class _Search:
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
         inside, predicted = _predicted_gain(stack, len(prior) - len(sizes[-1]), prior, length)
-        effect = float(np.sqrt(inside / (np.sum(self.groups >= 0) * self._concerned(cause))))
-        is_predicted = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
-        evidence = self._log_evidence(cause, i, full, without) if is_predicted else -np.inf
+        effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
+        is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
+        is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
+        evidence = self._log_evidence(cause, i, full, without) if is_supported else -np.inf
         return replace(cause, log_evidence=evidence, effect=effect)
+
+    def _outlier_share(self, fit: LinearFit, cause: Cause) -> float:
+        """Return the share of outliers among the samples that a cause tells apart from the others."""
+        is_outlier = fit.weights < OUTLIER_WEIGHT
+        if not isinstance(cause.shape, Step):
+            return float(np.mean(is_outlier))
+        is_before = self.numbers < cause.shape.number
+        side = is_before if 2 * is_before.sum() < len(is_before) else ~is_before
+        return float(np.mean(is_outlier[side]))
 
     def _log_evidence(self, cause: Cause, i: int, full: LinearFit, without: LinearFit) -> float:
         """Return the logarithm of the ratio of the evidences with and without a cause.
@@ -505,7 +521,7 @@ class _Search:
         ]
         start = len(self.x) + sum(len(c.values) for c in self.causes[:i])
         own, sizes = slice(start, start + len(cause.values)), cause.block.sizes
-        information = np.linalg.inv(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
+        information = _inverse(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
         values = np.maximum(np.linalg.eigvalsh(information), 0.0)
         square = WIDTHS[:, None] ** 2
         width = np.sum(np.log1p(square * values) + (cause.values / sizes) ** 2 / square, 1)
@@ -582,6 +598,15 @@ def _information(columns: Array, root: Array) -> Array:
     return flat.T @ flat
 
 
+def _inverse(information: Array) -> Array:
+    """Return the inverse of a matrix of information, some directions of which may be undetermined."""
+    scale = np.sqrt(np.diag(information))
+    scale[scale == 0] = 1.0
+    unit = information / scale / scale[:, None]
+    unit.flat[:: len(unit) + 1] += MIN_INFORMATION
+    return np.linalg.inv(unit) / scale / scale[:, None]
+
+
 def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[float, float]:
     """Return how much the columns from p on reduce the cost: of all samples, and of left-out blocks."""
     count = int(np.clip(len(stack) / max(length, 1.0), 2, MAX_BLOCKS))
@@ -591,7 +616,7 @@ def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[
 
     def cost(kept: Array, out: Array, count: int) -> float:
         matrix = kept[:count, :count] + np.diag(prior[:count] ** 2)
-        x = np.append(-np.linalg.solve(matrix, kept[:count, -1]), 1.0)
+        x = np.append(-_inverse(matrix) @ kept[:count, -1], 1.0)
         used = np.append(np.arange(count), len(kept) - 1)
         return float(x @ out[np.ix_(used, used)] @ x)
 
