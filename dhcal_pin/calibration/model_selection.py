@@ -740,6 +740,8 @@ def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
 
 def is_restricted(sets: Sequence[str]) -> bool:
     """Check whether parameter sets describe the robot, but fewer of its errors than `FULL_SET`."""
-    frames = {"base", "tool"}
-    is_full = frames <= set(sets) and {"minimal", "placement"} & set(sets)
-    return not is_full and not set(sets) <= frames
+    chosen, frames = set(sets), {"base", "tool"}
+    # The poses of cameras and boards take the place of base and tool.
+    has_frames = frames <= chosen or {"camera", "board"} <= chosen
+    is_full = has_frames and {"minimal", "placement"} & chosen
+    return not is_full and not chosen <= frames

@@ -10,7 +10,12 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin.calibration import Extension, calibrate
-from dhcal_pin.calibration.model_selection import MAX_HINT_SAMPLES, families_by_stage, family_hint
+from dhcal_pin.calibration.model_selection import (
+    MAX_HINT_SAMPLES,
+    families_by_stage,
+    family_hint,
+    is_restricted,
+)
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.parameters import EXTENSIONS
@@ -251,3 +256,18 @@ def test_a_family_needs_a_rule_of_selection():
     first = ("harmonics", "compliance", "backlash", "thermal")
     assert families_by_stage(FAMILIES)[:2] == [first, ("gain", "coupling")]
     assert sorted(name for stage in families_by_stage(FAMILIES) for name in stage) == sorted(FAMILIES)
+
+
+@pytest.mark.parametrize(
+    ("sets", "expected"),
+    [
+        ("minimal,base,tool", False),
+        ("placement,offset,camera,board,intrinsics", False),
+        ("base,tool", False),
+        ("offset,base,tool", True),
+        ("minimal,camera", True),
+        ("camera,board", True),
+    ],
+)
+def test_sets_with_fewer_errors_than_the_full_set(sets, expected):
+    assert is_restricted(sets.split(",")) == expected
