@@ -223,10 +223,10 @@ def test_document_names_the_cause():
 
 
 def test_messages_speak_of_flange_poses_where_the_files_state_them():
-    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=12)
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=9)
     # One image is paired with the configuration of another one.
     q = images.q.copy()
-    q[images.image == 3] = images.q[images.image == 9][0] + 0.05
+    q[images.image == 3] = images.q[images.image == 7][0] + 0.05
     fit = dh.calibrate(chain, images.replace(q=q, has_joint_values=False), "camera,board")
     assert fit.hand_eye is not None
     assert fit.hand_eye.n_wrong_images == 1
