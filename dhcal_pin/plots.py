@@ -205,8 +205,9 @@ def plot_errors_by_sample(
     *,
     quantity: str = "position error",
     unit: str = "m",
+    marks: Sequence[float] = (),
 ) -> Axes:
-    """Plot the error of each sample over its number."""
+    """Plot the error of each sample over its number, with vertical lines at some numbers."""
     ax = _axes(ax)
     factor, unit_name = shown_unit(unit)
     n_samples = sum(len(numbers) for numbers, _ in samples.values())
@@ -218,8 +219,23 @@ def plot_errors_by_sample(
         chosen = evenly_spaced_indices(len(numbers), limit)
         color = COLORS[sample_color(role, has_holdout="hold-out" in samples)]
         plot_dots(ax, numbers[chosen], factor * errors[chosen], color, size, label=role)
+    for mark in marks:
+        ax.axvline(mark, color=COLORS["text"], linestyle="--", linewidth=1.2)
     ax.set(xlabel="sample", ylabel=f"{quantity}, {unit_name}")
     ax.set_ylim(bottom=0.0)
+    return ax
+
+
+def plot_change(
+    numbers: Array, values: Array, std: Array, ax: Axes | None = None, *, of: str, unit: str
+) -> Axes:
+    """Plot a change of a part of a robot over the numbers of the samples, with its 95 % band."""
+    ax = _axes(ax)
+    factor, unit_name = shown_unit(unit)
+    low, high = (factor * (values + sign * BAND_SIGMAS * std) for sign in (-1, 1))
+    ax.fill_between(numbers, low, high, color=COLORS["after"], alpha=0.3, linewidth=0, step="mid")
+    ax.step(numbers, factor * values, color=COLORS["after"], linewidth=1.6, where="mid")
+    ax.set(xlabel="sample", ylabel=f"{of}, {unit_name}")
     return ax
 
 

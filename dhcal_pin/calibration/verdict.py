@@ -164,8 +164,8 @@ def _board_size(fit: Evidence) -> list[Finding]:
 
 def _two_robots(fit: Evidence) -> list[Finding]:
     """Refuse samples of two robots."""
-    events = fit.session.events if fit.session else ()
-    return [Finding("refused", event.sentence) for event in events if event.kind == "robot"]
+    events = [event for event in (fit.session.events if fit.session else ()) if event.kind == "robot"]
+    return [Finding("refused", f"{event.finding} {event.consequence}") for event in events]
 
 
 def _session(fit: Evidence) -> list[Finding]:
@@ -264,7 +264,7 @@ def _plausible_cause(fit: Evidence) -> str:
             "rows and columns of the boards."
         )
     if fit.session and fit.session.lag:
-        return fit.session.lag.sentence
+        return f"{fit.session.lag.finding} {fit.session.lag.consequence}"
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"
@@ -329,7 +329,7 @@ def _outliers(fit: Evidence) -> list[Finding]:
         return []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
     text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers{_outlying_images(fit)}"
-    return [Finding("caution", f"{text}. Check the measurements; --loss tukey reduces their influence.")]
+    return [Finding("caution", f"{text}. Check the measurements.")]
 
 
 def _outlying_images(fit: Evidence) -> str:

@@ -32,6 +32,7 @@ from ..io.tables import Column, DataTable, read_table
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
+from ..session import examine
 from ..units import ANGLES, LENGTHS
 from .input_checks import find_input_warnings, first_equal_rows
 
@@ -103,8 +104,14 @@ def inspect_file(
         _inspect_table(table, chain),
         configurations=_count_configurations(file),
         bad_rows=file.bad_rows,
-        warnings=tuple(find_input_warnings(chain, file)),
+        warnings=(*find_input_warnings(chain, file), *_session_warnings(chain, file)),
     )
+
+
+def _session_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Describe what happened while the samples of a file were measured."""
+    session = examine(chain, file.data)
+    return [item.finding for item in session.found] if session else []
 
 
 def _names(table: DataTable) -> Mapping[str, Column]:

@@ -24,6 +24,7 @@ from ..formatting import Quantity, capitalized
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..robot.chain import Chain
+from ..session import histories
 from ..visualization import scene
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel
@@ -81,6 +82,40 @@ def residual_figures(context: ReportContext) -> list[FigureGroup]:
     """Draw the residual error of each joint, and the errors over the joint positions and over the samples."""
     group = _joint_offset_group(context)
     return [*([group] if group.panels else []), *sample_figures(context.samples)]
+
+
+def session_figures(context: ReportContext) -> list[FigureGroup]:
+    """Draw what changed over the samples, and their errors with the events."""
+    session, samples = context.fit.session, context.samples
+    if session is None:
+        return []
+    panels = []
+    for i, history in enumerate(histories(session)):
+        largest = Quantity.error(float(history.values.max()), history.unit)
+        text = f"Change of {history.of} relative to the end of the measurement; at most {largest}."
+        arrays = (history.numbers + 1, history.values, history.std)
+        plot = partial(plots.plot_change, *arrays, of=history.of, unit=history.unit)
+        panels.append(Panel(f"change-{i}", f"Change of {history.of}", text, plot, WIDE_PANEL))
+    items = zip(
+        (*context.data_names, *context.holdout_names), (*context.fit.data, *context.fit.holdout), strict=True
+    )
+    names = {item.source: name for name, item in items}
+    marks = []
+    for event in session.events:
+        is_first = (samples.file == names.get(event.file)) & (samples.line == event.line)
+        marks += [float(number) - 0.5 for number in samples.number[is_first][:1]]
+    group = next(iter(samples.errors))
+    quantity, unit = ERROR_GROUPS[group].label, ERROR_GROUPS[group].unit
+    plot = partial(
+        plots.plot_errors_by_sample,
+        _errors_by_role(samples, group),
+        quantity=quantity,
+        unit=unit,
+        marks=marks,
+    )
+    text = f"{capitalized(quantity)} of the samples after calibration; lines mark the events."
+    panels.append(Panel("session-errors", f"{capitalized(quantity)} by sample", text, plot, WIDE_PANEL))
+    return [FigureGroup(panels, layout="wide")]
 
 
 def sample_figures(samples: Samples) -> list[FigureGroup]:

@@ -90,6 +90,20 @@ def _region_sentence(generalization: Generalization) -> str:
     )
 
 
+def _session_section(context: ReportContext) -> Section | None:
+    """Return what happened during the measurement; None if nobody looked."""
+    session = context.fit.session
+    if session is None:
+        return None
+    if not session.sentences:
+        order = (
+            "the order of their lines" if session.is_ordered else "files alone, without an order of the lines"
+        )
+        text = f"The samples were examined in {order}. No event, drift, lag or wrong scale was found."
+        return Section("session", "Session", [text])
+    return Section("session", "Session", session.sentences, figures=partial(figures.session_figures, context))
+
+
 def _residual_section(context: ReportContext) -> Section:
     rows, sentences, profiles = [], [], context.joint_profiles
     for profile in profiles:
@@ -507,6 +521,7 @@ _REPORT: Sequence[Rendering] = ("html", "markdown")
 SECTIONS: Sequence[tuple[Callable[[ReportContext], Section | None], Sequence[Rendering]]] = (
     (_accuracy_section, _REPORT),
     (images.image_section, _REPORT),
+    (_session_section, _REPORT),
     (_residual_section, _REPORT),
     (_transmission_section, _REPORT),
     (_joint_section, _REPORT),

@@ -1,7 +1,7 @@
 """What happened during a session: events, drift, lag and scale, found from the order of the samples."""
 
-from .facts import Session
+from .facts import History, Session, histories
 from .scale import find_scale
-from .search import can_have_session, find_session
+from .search import can_have_session, examine, find_session
 
-__all__ = ["Session", "can_have_session", "find_scale", "find_session"]
+__all__ = ["History", "Session", "can_have_session", "examine", "find_scale", "find_session", "histories"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,24 +62,23 @@ class Event:
         return f"between lines {self.line_before} and {self.line}{where}"
 
     @property
-    def sentence(self) -> str:
-        """What happened, and what the calibration did."""
+    def finding(self) -> str:
+        """What happened."""
         size = format_quantity(self.size, self.unit, self.std, small=self.unit == "m")
         if self.kind == "robot":
-            return (
-                f"The samples before and after line {self.line} are of two robots: {self.of} differs by "
-                f"{size}. Calibrate each robot by itself."
-            )
+            return f"The samples before and after line {self.line} are of two robots: {self.of} differs by {size}."
         if self.kind == "joint":
-            return (
-                f"The zero of joint {self.of} changed by {size} {self.place}. The result is the arm after "
-                "the change."
-            )
-        verb = "turned" if self.unit == "rad" else "moved"
-        return (
-            f"The {self.kind} {verb} by {size} {self.place}. Both parts were fitted with their own "
-            f"{self.kind} pose."
-        )
+            return f"The zero of joint {self.of} changed by {size} {self.place}."
+        return f"The {self.kind} {'turned' if self.unit == 'rad' else 'moved'} by {size} {self.place}."
+
+    @property
+    def consequence(self) -> str:
+        """What the calibration did, or what to do."""
+        if self.kind == "robot":
+            return "Calibrate each robot by itself."
+        if self.kind == "joint":
+            return "The result is the arm after the change."
+        return f"Both parts were fitted with their own {self.kind} pose."
 
 
 @dataclass(frozen=True)
@@ -109,21 +107,24 @@ class SlowChange:
         return {key: getattr(self, key) for key in keys}
 
     @property
-    def sentence(self) -> str:
-        """What happened, and what the calibration did."""
+    def finding(self) -> str:
+        """What happened."""
         size = format_quantity(self.size, self.unit, self.std, small=self.unit == "m")
         how = "during the measurement"
         if self.time_constant is not None:
             unit = "s" if self.time_unit == "s" else "rows"
             how += f", with a time constant of {self.time_constant:.3g} {unit}"
-        if self.of in ("base", "tool"):
-            return f"The {self.of} drifted by {size} {how}. It was fitted with a pose that changes smoothly."
         if self.of == "links":
-            return (
-                f"The lengths of the links changed {how}, which moved the tool by {size}. The result is the "
-                "arm at the end: let it warm up before the measurement."
-            )
-        return f"The zero of joint {self.of} drifted by {size} {how}. The result is the arm at the end."
+            return f"The lengths of the links changed {how}, which moved the tool by {size}."
+        part = self.of if self.of in ("base", "tool") else f"zero of joint {self.of}"
+        return f"The {part} drifted by {size} {how}."
+
+    @property
+    def consequence(self) -> str:
+        """What the calibration did."""
+        if self.of in ("base", "tool"):
+            return "It was fitted with a pose that changes smoothly."
+        return "The result is the arm at the end."
 
 
 @dataclass(frozen=True)
@@ -141,15 +142,17 @@ class Lag:
     unit: str
 
     @property
-    def sentence(self) -> str:
-        """What was found, and what to do."""
+    def finding(self) -> str:
+        """What was found."""
         unit = {"row": "rows"}.get(self.unit, self.unit)
-        word = "earlier" if self.value > 0 else "later"
         size = f"{format_fixed(abs(self.value), 3)} {unit}"
-        return (
-            f"The joint values are {size} {word} than the measured values. Record both at the same time, or "
-            f"add --mend lag:{self.value:.4g}."
-        )
+        word = "earlier" if self.value > 0 else "later"
+        return f"The joint values are {size} {word} than the measured values."
+
+    @property
+    def consequence(self) -> str:
+        """What to do."""
+        return f"Record both at the same time, or add --mend lag:{self.value:.4g}."
 
 
 @dataclass(frozen=True)
@@ -167,17 +170,21 @@ class Scale:
     axis: str
 
     @property
-    def sentence(self) -> str:
-        """What was found, and what to do."""
+    def finding(self) -> str:
+        """What was found."""
         percent = f"{abs(100 * (self.factor - 1)):.2g} %"
-        word = "long" if self.factor > 1 else "short"
         if self.axis:
-            return (
-                f"Measured {self.axis} is {percent} too {word} compared with the other axes. Check the "
-                f"instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
-            )
+            word = "long" if self.factor > 1 else "short"
+            return f"Measured {self.axis} is {percent} too {word} compared with the other axes."
+        word = "longer" if self.factor > 1 else "shorter"
+        return f"The correction makes the whole robot {percent} {word}."
+
+    @property
+    def consequence(self) -> str:
+        """What to do."""
+        if self.axis:
+            return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
         return (
-            f"The correction makes the whole robot {percent} {'longer' if self.factor > 1 else 'shorter'}. "
             "Check the scale of the instrument: measurements alone cannot tell it from the size of the "
             f"robot. If the instrument is wrong, add --mend scale:{self.factor:.6g}."
         )
@@ -223,11 +230,15 @@ class Session:
         )
         return apply_changes(self.changes, self.chain, timeline)
 
-    @cached_property
+    @property
+    def found(self) -> tuple[Event | SlowChange | Lag | Scale, ...]:
+        """Everything that was found."""
+        return (*self.events, *self.drifts, *([self.lag] if self.lag else []), *self.scales)
+
+    @property
     def sentences(self) -> list[str]:
-        """One sentence or two about each finding."""
-        found = (*self.events, *self.drifts, *([self.lag] if self.lag else []), *self.scales)
-        return [item.sentence for item in found]
+        """Each finding with its consequence."""
+        return [f"{item.finding} {item.consequence}" for item in self.found]
 
     def to_dict(self) -> dict[str, Any]:
         """Return what happened for the JSON document."""
@@ -241,6 +252,37 @@ class Session:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class History:
+    """Change of one part of a robot over a session, relative to the end."""
+
+    # "base", "tool", "links", or the name of a joint.
+    of: str
+    # "m" or "rad".
+    unit: str
+    # Numbers of the samples, their change and its standard deviation, (N,) each.
+    numbers: Array
+    values: Array
+    std: Array
+
+
+def histories(session: Session) -> Iterator[History]:
+    """Yield the changes of base, tool, joint zeros and links over the samples."""
+    numbers = np.sort(np.concatenate(session.timeline.numbers))
+    by_number = np.argsort(np.concatenate(session.timeline.numbers))
+    times = np.concatenate(session.timeline.times)[by_number]
+    changes = [cause for cause in session.causes if not cause.block.is_constant]
+    for of in dict.fromkeys(cause.block.of or cause.block.kind for cause in changes):
+        causes = [cause for cause in changes if (cause.block.of or cause.block.kind) == of]
+        values, variance, unit = np.zeros(len(numbers)), np.zeros(len(numbers)), "m"
+        for cause in causes:
+            f = cause.shape.values(numbers, times)
+            size, std, unit = cause_size(cause, session.changes, session.chain, session.timeline)
+            values += np.abs(f) * size
+            variance += (f * std) ** 2
+        yield History(of, unit, numbers, values, np.sqrt(variance))
+
+
 def describe_events(
     causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> tuple[Event, ...]:
@@ -248,7 +290,7 @@ def describe_events(
     steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step)]
     events = []
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
-        size, std, unit = _step_size(cause, shape, changes, chain)
+        size, std, unit = cause_size(cause, changes, chain, timeline)
         (file_before, line_before), (file, line) = (timeline.place(shape.number + i) for i in (-1, 0))
         events.append(
             Event(cause.block.kind, cause.block.of, file, line, file_before, line_before, size, std, unit)
@@ -256,13 +298,14 @@ def describe_events(
     return tuple(events)
 
 
-def _step_size(cause: Cause, step: Step, changes: RobotChanges, chain: Chain) -> tuple[float, float, str]:
-    """Return the size of a step, its standard deviation and its unit."""
+def _step_size(cause: Cause, changes: RobotChanges, chain: Chain) -> tuple[float, float, str]:
+    """Return the size of a step or of a change of a joint zero, its standard deviation and its unit."""
     if cause.block.kind == "joint":
         unit = "m" if chain.is_prismatic[cause.block.index] else "rad"
         return abs(float(cause.values[0])), float(np.sqrt(cause.covariance[0, 0])), unit
     motion = getattr(changes, cause.block.kind)
-    before, after = motion.poses[motion.segments(np.array([step.number - 1, step.number]))]
+    number = cause.shape.number if isinstance(cause.shape, Step) else 0
+    before, after = motion.poses[motion.segments(np.array([number - 1, number]))]
     if cause.block.kind == "base":
         moved = (after - before)[:3] @ chain.base[:, 3]
         turned, arm, axes = after @ se3.inverse(before), np.zeros(3), chain.base[:3, :3]
@@ -284,24 +327,30 @@ def _motion_size(moved: Array, angles: Array, arm: Array, cause: Cause) -> tuple
     return distance, float(np.sqrt(along @ cause.covariance @ along)), "m"
 
 
-def describe_drifts(causes: tuple[Cause, ...], chain: Chain, timeline: Timeline) -> Iterator[SlowChange]:
+def cause_size(
+    cause: Cause, changes: RobotChanges, chain: Chain, timeline: Timeline
+) -> tuple[float, float, str]:
+    """Return the size of a change, its standard deviation and its unit."""
+    if isinstance(cause.shape, Step) or cause.block.kind == "joint":
+        return _step_size(cause, changes, chain)
+    if cause.block.kind == "links":
+        return *_growth_size(cause, chain, timeline), "m"
+    return _motion_size(cause.values[:3], cause.values[3:], np.zeros(3), cause)
+
+
+def describe_drifts(
+    causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
+) -> Iterator[SlowChange]:
     """Describe the slow changes."""
     for cause in causes:
-        if not isinstance(cause.shape, Drift):
-            continue
-        values, kind = cause.values, cause.block.kind
-        if kind in ("base", "tool"):
-            size, std, unit = _motion_size(values[:3], values[3:], np.zeros(3), cause)
-        elif kind == "joint":
-            size, std = abs(float(values[0])), float(np.sqrt(cause.covariance[0, 0]))
-            unit = "m" if chain.is_prismatic[cause.block.index] else "rad"
-        else:
-            size, std = _growth_size(cause, chain, timeline)
-            unit = "m"
-        constant = cause.shape.time_constant
-        yield SlowChange(
-            cause.block.of or kind, size, std, unit, None if np.isinf(constant) else constant, timeline.unit
-        )
+        if isinstance(cause.shape, Drift):
+            constant = cause.shape.time_constant
+            yield SlowChange(
+                cause.block.of or cause.block.kind,
+                *cause_size(cause, changes, chain, timeline),
+                None if np.isinf(constant) else constant,
+                timeline.unit,
+            )
 
 
 def _growth_size(cause: Cause, chain: Chain, timeline: Timeline) -> tuple[float, float]:

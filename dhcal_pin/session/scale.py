@@ -19,7 +19,7 @@ from .linear_model import Layout, whitened_rows
 
 # Smallest RMS correction in prior standard deviations and relative change of lengths that are reported.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
-# Smallest norm of the corrections by a change of scale of 1, in prior standard deviations: a hundredth of 1 mm.
+# Smallest norm of the corrections by a change of scale of 1, in prior standard deviations.
 MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
 MAX_CHANCE = 1e-3

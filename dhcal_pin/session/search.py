@@ -30,8 +30,12 @@ from itertools import pairwise
 import numpy as np
 
 from .._typing import Array
+from ..estimation.initialization import initialize_frames, make_problem
+from ..estimation.parameters import select_parameters
 from ..estimation.problem import Problem
+from ..estimation.solver import minimize
 from ..measurements.base import Measurement
+from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, Shape, Step
 from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
 from .linear_model import Layout, whitened_rows
@@ -74,6 +78,8 @@ MAX_REJECTED = 2
 MAX_MOVES = 4
 # Largest number of causes, of iterations of a fit, and of passes of the weights in each iteration.
 MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
+# Largest number of iterations of the fit of measurements alone.
+MAX_SOLVER_ITERATIONS = 50
 # Smallest noise in standard deviations of the measurements: a micrometre if they state none.
 MIN_NOISE = 1e-3
 # Added to the unit diagonal of information for directions that nothing determines.
@@ -675,7 +681,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         is_ordered,
         causes,
         (other_robot,) if other_robot else events,
-        tuple(describe_drifts(causes, chain, timeline)),
+        tuple(describe_drifts(causes, search.changes, chain, timeline)),
         next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
         tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
     )
@@ -689,6 +695,19 @@ def _lag(cause: Cause, timeline: Timeline) -> Lag:
 def _scale(cause: Cause) -> Scale:
     """Describe the scale of one axis."""
     return Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
+
+
+def examine(chain: Chain, data: Measurement) -> Session | None:
+    """Find what happened while measurements were made; None if their samples cannot be put in order."""
+    if not can_have_session([data]) or not len(data.positions()):
+        return None
+    started = initialize_frames(
+        select_parameters(chain, "minimal,base,tool"), (data,), {}, MAX_SOLVER_ITERATIONS
+    )
+    items = (data.initialized(started.chain),)
+    problem = make_problem(started, items, 1 / started.priors, {})
+    x = minimize(problem, max_iterations=MAX_SOLVER_ITERATIONS, loose=True).x
+    return find_session(problem, x, (), is_ordered=True)
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:
