@@ -63,6 +63,7 @@ from .cameras.procedure import ImageFitting, calibrate_images, require_no_select
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
+from .session_check import confirm_changes, without_changes
 from .shrinkage import compute_shrinkage_factor
 
 # Decimals of the reference temperature of a model [°C].
@@ -180,12 +181,18 @@ def calibrate(
         unweighted = replace(fit.problem, data=fit.data)
         found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
         if not found.changes.is_empty:
-            data, holdout = found.applied(data, holdout)
-            fit = start(data)
-    errors, problem, data = fit.problem.errors, fit.problem, fit.data
+            changed = found.applied(data, holdout)
+            refit = start(changed[0])
+            if found.has_two_robots or confirm_changes(
+                found, fit, refit, _prior_groups(refit, priors), max_iterations
+            ):
+                fit, holdout = refit, changed[1]
+            else:
+                found = without_changes(found)
+    data = fit.data
     if method != "lm":
         return make_result(fit, 1.0, holdout, method)
-    groups = PriorGroups.from_expected(errors, problem.weights, has_default_prior(errors, priors))
+    groups = _prior_groups(fit, priors)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress)
@@ -195,6 +202,12 @@ def calibrate(
         found = replace(found, scales=(*found.scales, scale))
     result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
     return replace(result, session=found)
+
+
+def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:
+    """Return the groups of parameters whose prior widths are estimated."""
+    errors = fit.problem.errors
+    return PriorGroups.from_expected(errors, fit.problem.weights, has_default_prior(errors, priors))
 
 
 @dataclass(frozen=True)

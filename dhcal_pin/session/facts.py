@@ -232,6 +232,11 @@ class Session:
         return apply_changes(self.changes, self.chain, timeline)
 
     @property
+    def has_two_robots(self) -> bool:
+        """Whether the samples are of two robots."""
+        return any(event.kind == "robot" for event in self.events)
+
+    @property
     def found(self) -> tuple[Event | SlowChange | Lag | Scale, ...]:
         """Everything that was found."""
         return (*self.events, *self.drifts, *([self.lag] if self.lag else []), *self.scales)

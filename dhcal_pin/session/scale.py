@@ -51,7 +51,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     if not np.linalg.norm(pattern) > MIN_PATTERN:
         return None
     change = float(pattern @ corrections / (pattern @ pattern))
-    freedom = float(np.sum(1 - np.diag(covariance)[lengths] / priors**2)) - 1
+    freedom = float(np.sum(1 - (np.diag(covariance) * weights**2)[lengths])) - 1
     if freedom < 1 or abs(change) < MIN_CHANGE:
         return None
     remaining = float(np.linalg.norm(corrections - change * pattern)) / np.sqrt(freedom)

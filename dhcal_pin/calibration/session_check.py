@@ -1,0 +1,70 @@
+"""Confirmation of changes during a session by a model with all joint errors.
+
+Errors that the geometry leaves, such as gear errors, differ between configurations. If the configurations at
+the begin of a session differ from those at its end, such errors look like a change. The changes are therefore
+kept only if the measurements support them beside all families of joint errors, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation import robust
+from ..estimation.parameters import EXTENSIONS
+from ..estimation.priors import PriorGroups
+from ..session import Session
+from ..session.causes import Step
+from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE
+from . import model_selection
+from .reweighting import Fit, reweight
+
+# Logarithm of the evidence that each coefficient of a change costs.
+COST_PER_COEFFICIENT = 5.0
+
+
+def confirm_changes(
+    session: Session, without: Fit, fit: Fit, groups: PriorGroups, max_iterations: int
+) -> bool:
+    """Return whether changes explain measurements beside all families of joint errors.
+
+    `without` and `fit` are the first fits without and with the changes.
+    """
+    residuals = [_residuals(each, groups, max_iterations) for each in (without, fit)]
+    noise = [1.4826 * np.median(np.abs(r), 1, keepdims=True) for r in residuals[1]]
+    costs = [
+        sum(
+            float(np.sum(np.minimum(np.sum((r / s) ** 2, 0), len(r) + MAX_SAMPLE_COST)))
+            for r, s in zip(each, noise, strict=True)
+        )
+        for each in residuals
+    ]
+    gain, n_rows = costs[0] - costs[1], sum(r.size for r in residuals[1])
+    changes = [cause for cause in session.causes if not cause.block.is_constant]
+    n_coefficients = sum(len(cause.values) for cause in changes)
+    numbers = session.timeline.fitted_numbers
+    shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]
+    share = min([1.0, *(min(each, 1 - each) for each in shares)])
+    needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
+    return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
+
+
+def _residuals(fit: Fit, groups: PriorGroups, max_iterations: int) -> Sequence[Array]:
+    """Return the residuals of a fit with all families of joint errors that are supported, (k, m) each."""
+    fit = reweight(fit, robust.LOSSES["auto"].stages, groups, max_iterations, None)
+    fit, _ = model_selection.extend(fit, EXTENSIONS, max_iterations, None)
+    problem, x = fit.problem, fit.solution.x
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    return [
+        item.residual(chain.forward_kinematics(item.conditions()), problem.instrument_values_of(item, x))
+        for item in fit.data
+    ]
+
+
+def without_changes(session: Session) -> Session:
+    """Return a session in which nothing changed."""
+    kept = tuple(cause for cause in session.causes if cause.block.is_constant)
+    return replace(session, changes=type(session.changes)(), causes=kept, events=(), drifts=())

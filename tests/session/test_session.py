@@ -1,0 +1,321 @@
+"""What happens during a session is found, named and accounted for, and nothing is found in clean sets."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from robots import DATA, MAPS, missing, robot_file
+from sessions import ARMS, Changes, Simulation, nominal_arm
+from slow_cases import some_slow
+
+from dhcal_pin import calibrate, se3
+from dhcal_pin.cli.main import main
+from dhcal_pin.estimation.initialization import make_problem
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.io import read_measurements
+from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.plausibility.hypotheses import mend
+from dhcal_pin.robot import Chain
+from dhcal_pin.robot.conditions import Conditions
+from dhcal_pin.session.linear_model import Layout, whitened_rows
+
+DEGREE = np.deg2rad(1.0)
+KINDS = (Position, Pose)
+
+
+def motions(rng, count, scale):
+    """Return random rigid motions."""
+    return se3.exp6(scale * rng.normal(size=(count, 6)))
+
+
+def test_frames_move_with_the_conditions_of_a_sample():
+    chain = nominal_arm("ur10").with_base_and_tool(*motions(np.random.default_rng(0), 2, 0.5))
+    rng, n = np.random.default_rng(1), chain.n_joints
+    q, zeros = rng.uniform(-2, 2, (5, n)), 0.01 * rng.normal(size=(5, n))
+    base, tool = motions(rng, 5, 0.1), motions(rng, 5, 0.1)
+    growth = 0.01 * rng.normal(size=(5, n + 1))
+    conditions = Conditions(q, base_motion=base, tool_motion=tool, zeros=zeros)
+    np.testing.assert_allclose(chain.poses(conditions), base @ chain.poses(q + zeros) @ tool, atol=1e-12)
+    # Links that grow: the vectors between the joints of the model of Pinocchio, without the tool.
+    bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
+    grown = bare.poses(Conditions(q, growth=growth))
+    for row, each, pose in zip(q, growth, grown, strict=True):
+        model = bare.model.copy()
+        for j, name in enumerate(bare.moving_joints):
+            placement = model.jointPlacements[model.getJointId(name)]
+            placement.translation = placement.translation * (1 + each[j])
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, bare.loads.configurations(row[:, None])[0])
+        tip = data.oMf[bare.frame_id]
+        last = model.frames[bare.frame_id].placement.translation
+        expected = tip.translation + tip.rotation @ bare.origins[-1][:3, :3].T @ last * each[-1]
+        np.testing.assert_allclose(pose[:3, 3], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_columns_of_causes_agree_with_finite_differences(kind):
+    chain = nominal_arm("ur5").with_base_and_tool(*motions(np.random.default_rng(0), 2, 0.5))
+    rng, n, step = np.random.default_rng(2), chain.n_joints, 1e-6
+    q = rng.uniform(-2, 2, (4, n))
+    exact = chain.poses(q)
+    data = Pose(q, exact) if kind is Pose else Position(q, exact[:, :3, 3])
+    errors = select_parameters(chain, "minimal,base,tool")
+    layout = Layout.of(make_problem(errors, (data,), 1 / errors.priors, {}))
+    rates = rng.normal(size=(4, n))
+    rows = whitened_rows(layout, np.zeros(len(errors.parameters)), (data,), rates)
+    to_base, twists = se3.inverse(chain.base), np.eye(6)
+    growth = np.eye(n + 1)
+
+    def moved(**changes):
+        changed = data.replace(recorded=Conditions(q, **changes))
+        frames = chain.forward_kinematics(changed.conditions())
+        return changed.residual(frames, np.array([])).T
+
+    by_kind = {
+        "base": [
+            {"base_motion": np.tile(chain.base @ se3.exp6(h) @ to_base, (4, 1, 1))} for h in step * twists
+        ],
+        "tool": [{"tool_motion": np.tile(se3.exp6(h), (4, 1, 1))} for h in step * twists],
+        "lag": [{"zeros": step * rates}],
+        "links": [{"growth": np.tile(step * h, (4, 1))} for h in growth],
+    }
+    for block in layout.blocks:
+        if block.kind == "joint":
+            changes = [{"zeros": np.tile(step * np.eye(n)[block.index], (4, 1))}]
+        elif block.kind == "links":
+            changes = by_kind["links"] if len(block.columns) > 1 else [{"growth": np.full((4, n + 1), step)}]
+            if len(block.columns) > 1:
+                changes = [changes[c - layout.links[0]] for c in block.columns]
+        elif block.kind == "scale":
+            continue
+        else:
+            changes = by_kind[block.kind]
+        for column, change in zip(block.columns, changes, strict=True):
+            # The rows are the derivative of the model, the residual is measured minus modelled.
+            np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
+
+
+EVENTS = {
+    **{
+        f"{of} {1e3 * size:g} mm at {at}": Changes(of, size, angle, at=at)
+        for of in ("base", "tool")
+        for size, angle in ((3e-4, 0.0), (5e-3, 0.2 * DEGREE), (30e-3, 0.5 * DEGREE))
+        for at in (0.1, 0.5, 0.9)
+    },
+    **{
+        f"joint {joint} at {at}": Changes(joint=(joint, size * DEGREE), at=at)
+        for joint, size in ((0, 0.2), (1, 0.1), (2, 0.3), (3, 0.5))
+        for at in (0.1, 0.5, 0.9)
+    },
+    **{
+        f"drift of {of}, {constant}": Changes(of, 1e-3, at=None, time_constant=constant)
+        for of in ("base", "tool")
+        for constant in (None, 0.2)
+    },
+    **{f"drift of joint {joint}": Changes(joint=(joint, 0.1 * DEGREE), at=None) for joint in (1, 2)},
+    "growth": Changes(growth=1e-3, at=None),
+}
+# Events of the fast suite: one of each type.
+FAST = [
+    list(EVENTS).index(name)
+    for name in ("base 5 mm at 0.9", "tool 0.3 mm at 0.5", "joint 2 at 0.1", "drift of base, 0.2", "growth")
+]
+
+
+def is_named(session, changes, simulation):
+    """Return whether an event or a drift is the only one found, with its part, place and size."""
+    size = changes.joint[1] if changes.joint else changes.length
+    of = simulation.chain.joint_names[changes.joint[0]] if changes.joint else changes.of or "links"
+    found = session.events if changes.at is not None else session.drifts
+    if len(session.found) != 1 or len(found) != 1:
+        return False
+    one = found[0]
+    if changes.at is not None:
+        # The lines of samples from Python begin with 1.
+        is_place = abs(one.line - 1 - round(changes.at * simulation.count)) <= 2
+        is_place = is_place and (one.of or one.kind) == of
+    else:
+        is_place = one.of == of
+    return is_place and (of == "links" or abs(one.size - size) <= max(0.2 * size, 2 * one.std))
+
+
+def true_ratio(simulation, fit, kind):
+    """Return the true error relative to that of the same arm and number of samples without an event."""
+    clean = Simulation(simulation.arm, simulation.count, simulation.seed)
+    alone = calibrate(clean.chain, clean.measure(kind), extend="none", session="off")
+    return simulation.true_error(fit.chain) / clean.true_error(alone.chain)
+
+
+@pytest.mark.parametrize("name", some_slow(list(EVENTS), FAST))
+def test_events_are_named_and_handled(name, request):
+    is_fast = request.node.get_closest_marker("slow") is None
+    settings = list(product(ARMS, KINDS, (60, 100, 300), range(5)))
+    if is_fast:
+        settings = [("ur10", Position, 100, 0), ("panda", Pose, 60, 1), ("xarm7", Position, 100, 2)]
+    named, ratios = [], []
+    for arm, kind, count, seed in settings:
+        simulation = Simulation(arm, count, seed)
+        fit = calibrate(simulation.chain, simulation.measure(kind, EVENTS[name]), extend="none")
+        named.append(is_named(fit.session, EVENTS[name], simulation))
+        ratios.append(true_ratio(simulation, fit, kind))
+        assert fit.verdict.status == "caution" or not fit.session.found
+    assert np.mean(named) >= (1.0 if is_fast else 0.95), np.round(ratios, 2)
+    assert np.median(ratios) <= (2.0 if is_fast else 1.3)
+
+
+@pytest.mark.parametrize("count", some_slow([20, 400], {0}))
+def test_nothing_is_found_where_nothing_happened(count):
+    """Clean sets, and sets of random samples with outliers only."""
+    found = []
+    for seed in range(count):
+        arm, kind, m = list(ARMS)[seed % 4], KINDS[seed // 4 % 2], (60, 100, 300)[seed // 8 % 3]
+        simulation = Simulation(arm, m, 1000 + seed)
+        fit = calibrate(simulation.chain, simulation.measure(kind), extend="none")
+        found.append(bool(fit.session.found))
+    assert sum(found) <= 0.01 * count
+    for seed in range(max(8, count // 4)):
+        simulation = Simulation(list(ARMS)[seed % 4], (60, 100)[seed % 2], 2000 + seed)
+        share, size = ((0.1, 0.02), (0.2, 5e-3), (0.05, 0.05))[seed % 3]
+        changes = Changes(n_outliers=int(share * simulation.count), outlier=size)
+        fit = calibrate(simulation.chain, simulation.measure(KINDS[seed % 2], changes), extend="none")
+        assert not fit.session.found, seed
+
+
+def test_an_event_is_found_beside_outliers():
+    simulation = Simulation("ur10", 100, 5)
+    changes = Changes("base", 2e-3, 0.1 * DEGREE, n_outliers=10)
+    fit = calibrate(simulation.chain, simulation.measure(Position, changes), extend="none")
+    assert is_named(fit.session, changes, simulation)
+    assert len(fit.outliers[0]) >= 9
+
+
+def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side():
+    simulation = Simulation("ur10", 100, 0)
+    data = simulation.measure(Position, Changes("base", 5e-3))
+    is_held_out = np.isin(np.arange(100), [47, 48, 49, 50, 51, *range(0, 40, 3)])
+    fit = calibrate(simulation.chain, data.take(~is_held_out), holdout=data.take(is_held_out), extend="none")
+    assert fit.session.events[0].line == 51
+    assert fit.comparisons[0].after.groups["position"].rms < 2e-4
+
+
+def test_two_robots_are_refused():
+    simulation = Simulation("ur10", 100, 3)
+    fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
+    assert fit.verdict.is_refused
+    assert "are of two robots" in fit.verdict.reasons[0]
+
+
+def test_a_lag_is_found_and_mended():
+    simulation = Simulation("ur10", 200, 4, is_path=True)
+    data = simulation.measure(Position, Changes(lag=0.4))
+    fit = calibrate(simulation.chain, data, extend="none")
+    assert fit.session.lag.value == pytest.approx(0.4, abs=0.01)
+    assert fit.verdict.status != "ok"
+    key = fit.session.lag.consequence.rsplit(" ", 1)[1].rstrip(".")
+    mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
+    assert mended.session.lag is None
+    clean = Simulation("ur10", 200, 4, is_path=True)
+    expected = calibrate(clean.chain, clean.measure(Position), extend="none")
+    assert simulation.true_error(mended.chain) <= 1.5 * clean.true_error(expected.chain)
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.0, 1.003), (1.015, 1.015, 1.015)])
+def test_a_wrong_scale_is_found_and_mended(scales):
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position, Changes(scales=scales))
+    fit = calibrate(simulation.chain, data, extend="none")
+    (scale,) = fit.session.scales
+    assert scale.axis == ("z" if scales[0] == 1 else "")
+    assert scale.factor == pytest.approx(scales[2], abs=3 * scale.std)
+    assert fit.verdict.status == "caution"
+    before = simulation.true_error(fit.chain)
+    key = fit.session.scales[0].consequence.rsplit(" ", 1)[1].rstrip(".")
+    mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
+    assert not mended.session.scales
+    assert simulation.true_error(mended.chain) < 0.3 * before
+
+
+def test_files_are_segments_even_without_an_order():
+    simulation = Simulation("ur10", 100, 7)
+    changes = Changes("tool", 5e-3)
+    data = simulation.measure(Position, changes)
+    parts = [data.take(np.s_[:50]).replace(source="a.csv"), data.take(np.s_[50:]).replace(source="b.csv")]
+    rng = np.random.default_rng(0)
+    shuffled = [part.take(rng.permutation(50)) for part in parts]
+    shuffled = [part.replace(rows=np.arange(2, 52)) for part in shuffled]
+    fit = calibrate(simulation.chain, shuffled, extend="none", session="unordered")
+    (event,) = fit.session.events
+    assert (event.kind, event.file_before, event.file) == ("tool", "a.csv", "b.csv")
+    assert "between a.csv and b.csv" in fit.verdict.reasons[0]
+    assert simulation.true_error(fit.chain) < 1e-4
+    whole = data.take(rng.permutation(100)).replace(rows=np.arange(2, 102))
+    assert not calibrate(simulation.chain, whole, extend="none", session="unordered").session.events
+
+
+def test_times_order_the_samples():
+    simulation = Simulation("ur10", 100, 8)
+    data = simulation.measure(Position, Changes("base", 2e-3, at=None, time_constant=0.2))
+    shuffled = data.with_conditions(time=10.0 * np.arange(100))
+    fit = calibrate(simulation.chain, shuffled, extend="none")
+    (drift,) = fit.session.drifts
+    assert drift.time_unit == "s"
+    assert drift.time_constant == pytest.approx(200, rel=0.3)
+
+
+@pytest.mark.parametrize("series", ["B/measurements_joint_configurations", "D/measurements_iso_cubes"])
+def test_nothing_happened_in_the_public_series_of_a_ur10(series):
+    """Left-out blocks of time of these series are not predicted better by any event or drift."""
+    if not DATA.exists():
+        missing(f"measurements at {DATA}")
+    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    data = read_measurements(DATA / f"ipa_ur10/Series_{series}.csv", chain, MAPS / "ipa_ur10.toml")
+    assert not calibrate(chain, data, extend="none").session.found
+
+
+def test_few_rows_are_not_examined():
+    simulation = Simulation("ur10", 8, 0)
+    fit = calibrate(simulation.chain, simulation.measure(Pose), extend="none")
+    assert fit.session.found == ()
+
+
+def write_csv(path, simulation, data):
+    """Write positions as a measurement file."""
+    header = ",".join([*(f"{name}[rad]" for name in simulation.chain.joint_names), "x[m],y[m],z[m]"])
+    np.savetxt(path, np.hstack([data.q, data.positions()]), "%.9f", ",", header=header, comments="")
+
+
+def test_commands_state_what_happened(tmp_path, capsys):
+    simulation = Simulation("ur10", 100, 9)
+    robot, file = robot_file(ARMS["ur10"][0]), tmp_path / "bump.csv"
+    write_csv(file, simulation, simulation.measure(Position, Changes("base", 5e-3)))
+    words = ["calibrate", robot, file, "--tip", "tool0", "-o", tmp_path / "out.urdf"]
+    outputs = ["--json", tmp_path / "out.json", "--report", tmp_path / "out.html"]
+    assert main([*map(str, words), *map(str, outputs)]) == 0
+    document = json.loads((tmp_path / "out.json").read_text())
+    (event,) = document["session"]["events"]
+    assert (event["kind"], event["line"], event["unit"]) == ("base", 52, "m")
+    assert event["file"] == str(file)
+    assert event["size"] == pytest.approx(5e-3, abs=3 * event["std"])
+    assert document["verdict"]["status"] == "caution"
+    assert "Change of base" in (tmp_path / "out.html").read_text()
+    assert "The base moved by" in capsys.readouterr().err
+    assert main(["inspect", str(file), "--robot", str(robot), "--tip", "tool0"]) in (0, 1)
+    assert "The base moved by" in " ".join(capsys.readouterr().err.split())
+    assert main([*map(str, words), *map(str, outputs), "--session", "off"]) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["session"]["events"] == []
+
+
+@pytest.mark.parametrize("key", ["lag:1e9", "lag:-", "scale:0", "scale:z:7"])
+def test_impossible_changes_are_refused(tmp_path, capsys, key):
+    simulation = Simulation("ur10", 20, 9)
+    file = tmp_path / "data.csv"
+    write_csv(file, simulation, simulation.measure(Position))
+    robot = str(robot_file(ARMS["ur10"][0]))
+    words = ["calibrate", robot, str(file), "--tip", "tool0", "-o", str(tmp_path / "out.urdf"), "--mend", key]
+    assert main(words) == 2
+    assert key in capsys.readouterr().err
+    assert not (tmp_path / "out.urdf").exists()

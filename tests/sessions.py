@@ -1,0 +1,187 @@
+"""Independent simulator of measuring sessions: Pinocchio and NumPy only, without the model of the project.
+
+The true arm has errors of every joint origin. During a session the base, the tool, a joint zero or the links
+change, joint values are late, or lengths are too long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+from robots import robot_file
+from scipy.interpolate import CubicSpline
+
+from dhcal_pin.measurements import Measurement, Pose, Position
+from dhcal_pin.robot import Chain
+from dhcal_pin.se3 import nearest_rotation
+
+ARMS = {
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
+}
+NOISE, ANGLE_NOISE = 5e-5, 1e-4
+ERRORS = 1e-3, np.deg2rad(0.2)
+
+
+def nominal_arm(name: str) -> Chain:
+    """Return the nominal robot."""
+    path, tip = ARMS[name]
+    return Chain.from_urdf(robot_file(path), tip)
+
+
+@dataclass
+class Simulation:
+    """Arm with errors and samples of it; `measure` returns measurements of one session."""
+
+    arm: str
+    count: int
+    seed: int
+    is_path: bool = False
+    errors: tuple[float, float] = ERRORS
+    q: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        """Draw the true arm, its frames and the configurations."""
+        rng = self.rng = np.random.default_rng([self.seed, self.count])
+        self.chain = nominal_arm(self.arm)
+        self.model = pin.buildModelFromUrdf(str(robot_file(ARMS[self.arm][0])))
+        self.ids = [self.model.getJointId(name) for name in self.chain.moving_joints]
+        self.nominal = [self.model.jointPlacements[i].copy() for i in self.ids]
+        self.disturb(self.model)
+        self.base = _motion(rng.uniform(-2, 2, 3), rng.uniform(-1, 1, 3))
+        self.tool = _motion(rng.uniform(-0.1, 0.1, 3), rng.uniform(-0.5, 0.5, 3))
+        low, high = np.maximum(self.chain.lower, -2.8), np.minimum(self.chain.upper, 2.8)
+        if self.is_path:
+            knots = self.count // 12 + 2
+            path = CubicSpline(np.arange(knots), rng.uniform(0.2 * low, 0.2 * high, (knots, len(low))))
+            self.q = path(np.linspace(0, knots - 1, self.count))
+        else:
+            self.q = rng.uniform(low, high, (self.count, len(low)))
+        self.test_q = np.random.default_rng(1).uniform(low, high, (200, len(low)))
+
+    def disturb(self, model: pin.Model) -> None:
+        """Give a model errors of every joint origin."""
+        for i, placement in zip(self.ids, self.nominal, strict=True):
+            draw = [self.rng.normal(0, std, 3) for std in self.errors]
+            model.jointPlacements[i] = placement * _motion(*draw)
+
+    def poses(self, q: np.ndarray, model: pin.Model | None = None) -> list[pin.SE3]:
+        """Return the tip poses in the base frame."""
+        model = model or self.model
+        data, out = model.createData(), []
+        frame = model.getFrameId(self.chain.tip, pin.FrameType.BODY)
+        for row in q:
+            configuration = pin.neutral(model)
+            for i, value in zip(self.ids, row, strict=True):
+                joint = model.joints[i]
+                is_unbounded = joint.nq == 2
+                values = (np.cos(value), np.sin(value)) if is_unbounded else (value,)
+                configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+            pin.framesForwardKinematics(model, data, configuration)
+            out.append(data.oMf[frame].copy())
+        return out
+
+    def direction(self) -> np.ndarray:
+        """Draw a unit vector."""
+        vector = self.rng.normal(size=3)
+        return vector / np.linalg.norm(vector)
+
+    def measure(self, kind: type[Measurement] = Position, changes: Changes | None = None) -> Measurement:
+        """Return the measurements of a session in which something changes."""
+        changes = changes or Changes()
+        m, share = self.count, np.arange(self.count) / (self.count - 1)
+        f = changes.shape(share)
+        q, models = self.q.copy(), [self.model] * m
+        if changes.joint is not None:
+            q[:, changes.joint[0]] += changes.joint[1] * f
+        if changes.lag:
+            q = CubicSpline(np.arange(m), self.q)(np.arange(m) + changes.lag)
+        if changes.growth:
+            models = [self._grown(changes.growth * value) for value in f]
+        along, about = self.direction(), self.direction()
+        still = _motion(np.zeros(3), np.zeros(3))
+        moved = [_motion(changes.length * v * along, changes.angle * v * about) for v in f]
+        base = moved if changes.of == "base" else [still] * m
+        tool = moved if changes.of == "tool" else [still] * m
+        arms = [self.poses(row[None], model)[0] for row, model in zip(q, models, strict=True)]
+        if changes.has_second_robot:
+            other = self.model.copy()
+            self.disturb(other)
+            arms = [
+                self.poses(row[None], other)[0] if v else pose
+                for row, v, pose in zip(q, f, arms, strict=True)
+            ]
+        poses = [self.base * b * arm * self.tool * t for b, arm, t in zip(base, arms, tool, strict=True)]
+        positions = np.array([pose.translation for pose in poses]) * np.array(changes.scales)
+        positions += self.rng.normal(0, NOISE, (m, 3))
+        for i in self.rng.permutation(m)[: changes.n_outliers]:
+            positions[i] += changes.outlier * self.direction()
+        self.end_model, self.end_zeros = models[-1], q[-1] - self.q[-1] if changes.joint else 0.0
+        if kind is Position:
+            return Position(self.q, positions)
+        matrices = np.tile(np.eye(4), (m, 1, 1))
+        matrices[:, :3, 3] = positions
+        noise = self.rng.normal(0, ANGLE_NOISE, (m, 3))
+        matrices[:, :3, :3] = [pose.rotation @ pin.exp3(w) for pose, w in zip(poses, noise, strict=True)]
+        return Pose(self.q, matrices)
+
+    def _grown(self, growth: float) -> pin.Model:
+        """Return the arm with longer links."""
+        model = self.model.copy()
+        for i in self.ids:
+            placement = model.jointPlacements[i].copy()
+            placement.translation = placement.translation * (1 + growth)
+            model.jointPlacements[i] = placement
+        return model
+
+    def true_error(self, chain: Chain) -> float:
+        """Return the RMS error of an arm [m] at the end of the session, with the best base and tool point."""
+        true = np.array(
+            [
+                (pose * self.tool).translation
+                for pose in self.poses(self.test_q + self.end_zeros, self.end_model)
+            ]
+        )
+        arm = chain.with_base_and_tool(np.eye(4), np.eye(4)).poses(self.test_q)
+        tool = chain.tool[:3, 3].copy()
+        for _ in range(100):
+            points = arm[:, :3, 3] + arm[:, :3, :3] @ tool
+            turned = nearest_rotation((true - true.mean(0)).T @ (points - points.mean(0)))
+            errors = true - true.mean(0) - (points - points.mean(0)) @ turned.T
+            tool += 1.5 * np.einsum("mij,mi->j", arm[:, :3, :3], errors @ turned) / len(true)
+        return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What happens in a session: a step at a share of it, a linear or an exponential drift."""
+
+    of: str = ""
+    length: float = 0.0
+    angle: float = 0.0
+    joint: tuple[int, float] | None = None
+    growth: float = 0.0
+    lag: float = 0.0
+    scales: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    n_outliers: int = 0
+    outlier: float = 0.02
+    has_second_robot: bool = False
+    at: float | None = 0.5
+    time_constant: float | None = None
+
+    def shape(self, share: np.ndarray) -> np.ndarray:
+        """Return the change over the session, from 0 to about 1."""
+        if self.at is not None:
+            return (np.arange(len(share)) >= round(self.at * len(share))).astype(float)
+        if self.time_constant is None:
+            return share
+        return 1 - np.exp(-share / self.time_constant)
+
+
+def _motion(v: np.ndarray, w: np.ndarray) -> pin.SE3:
+    """Return the rigid motion of a twist."""
+    return pin.exp6(np.concatenate([v, w]))
