@@ -71,7 +71,8 @@ class Simulation:
 
     def poses(self, q: np.ndarray, model: pin.Model | None = None) -> list[pin.SE3]:
         """Return the tip poses in the base frame."""
-        model = model or self.model
+        model = self.model if model is None else model
+        assert model is not None
         data, out = model.createData(), []
         frame = model.getFrameId(self.chain.tip, pin.FrameType.BODY)
         for row in q:
@@ -148,6 +149,7 @@ class Simulation:
         )
         arm = chain.with_base_and_tool(np.eye(4), np.eye(4)).poses(self.test_q)
         tool = chain.tool[:3, 3].copy()
+        errors = np.empty((0, 3))
         for _ in range(100):
             points = arm[:, :3, 3] + arm[:, :3, :3] @ tool
             turned = nearest_rotation((true - true.mean(0)).T @ (points - points.mean(0)))

@@ -14,9 +14,9 @@ from .partition import blocked_folds as blocked_folds
 from .partition import k_fold as k_fold
 from .partition import leave_one_group_out as leave_one_group_out
 from .partition import split as split
+from .presentation.residual_table import ResidualTable as ResidualTable
 from .procedure import Method as Method
 from .procedure import calibrate as calibrate
-from .residual_table import ResidualTable as ResidualTable
 from .result import Result as Result
 from .streaming import StreamResult as StreamResult
 from .streaming import calibrate_stream as calibrate_stream

@@ -24,7 +24,7 @@ from .estimates import Estimate, make_estimates
 from .evaluation import Accuracy, accuracy, compute_errors
 from .evidence import Evidence
 from .presentation import ResultPlots
-from .residual_table import ResidualTable, residual_table
+from .presentation.residual_table import ResidualTable, residual_table
 from .reweighting import Fit
 from .verdict import Verdict, judge
 

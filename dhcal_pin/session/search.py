@@ -454,21 +454,24 @@ class _Search:
             if not isinstance(cause.shape, Step):
                 continue
             change = fit.rows[..., cause.block.columns] @ cause.values
-            is_after = self.numbers >= cause.shape.number
-            residual = fit.rows[..., -1]
-            after = np.where(is_after[:, None], residual, residual - change)
-            costs = [_bounded_cost(r) for r in (after + change, after)]
-            # Cost of a step before each sample: `before` for the samples in front of it, `after` behind.
-            total = np.concatenate([[0.0], np.cumsum(costs[0] - costs[1])])
-            inner = np.arange(MIN_SIDE, len(self.numbers) - MIN_SIDE + 1)
-            if not self.is_ordered or not inner.size:
-                continue
-            best = int(inner[np.argmin(total[inner])])
-            number = int(self.numbers[best])
+            number = self._best_place(fit, change, cause.shape.number)
             if number != cause.shape.number:
                 self.causes[i] = replace(cause, shape=Step(number))
                 has_moved = True
         return has_moved
+
+    def _best_place(self, fit: LinearFit, change: Array, number: int) -> int:
+        """Return the number of a sample before which a step with a change (N, k) fits best."""
+        inner = np.arange(MIN_SIDE, len(self.numbers) - MIN_SIDE + 1)
+        if not self.is_ordered or not inner.size:
+            return number
+        is_after = self.numbers >= number
+        residual = fit.rows[..., -1]
+        after = np.where(is_after[:, None], residual, residual - change)
+        costs = [_bounded_cost(r) for r in (after + change, after)]
+        # Cost of a step before each sample: `before` for the samples in front of it, `after` behind.
+        total = np.concatenate([[0.0], np.cumsum(costs[0] - costs[1])])
+        return int(self.numbers[int(inner[np.argmin(total[inner])])])
 
     def _confirm(self) -> None:
         """Remove the causes that left-out blocks of samples do not show."""
@@ -564,6 +567,24 @@ class _Search:
             self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, best)
             self.causes[i] = replace(cause, shape=Step(best))
 
+    def _second_robot(
+        self, rows: Array, others: Sequence[Cause], block: Block, number: int
+    ) -> tuple[int, LinearFit]:
+        """Fit two robots, one after the other, and find the first sample of the second one."""
+
+        def solve(number: int) -> LinearFit:
+            robot = Cause(block, Step(number), np.zeros(len(block.sizes)), np.empty((0, 0)))
+            return self.solve(rows, [*others, robot])
+
+        fit = solve(number)
+        for _ in range(MAX_MOVES):
+            change = fit.rows[..., block.columns] @ fit.step[-len(block.sizes) :]
+            place = self._best_place(fit, change, number)
+            if place == number:
+                break
+            number, fit = place, solve(place)
+        return number, fit
+
     def other_robot(self) -> Event | None:
         """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
         rows = self.linearize()
@@ -571,19 +592,14 @@ class _Search:
         geometric = [c for c in self.layout.model if c < len(names)]
         # The prior is that of one robot, see `solve`.
         sizes = np.array([names[c].prior for c in geometric])
+        block = Block("robot", "", 0, np.array(geometric), sizes)
+        count = float(np.sum(self.groups >= 0))
+        needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
-        for number in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):
-            robot = Cause(
-                Block("robot", "", 0, np.array(geometric), sizes),
-                Step(number),
-                np.zeros(len(sizes)),
-                np.empty((0, 0)),
-            )
-            others = [c for c in self.causes if c.shape != Step(number)]
-            two = self.solve(rows, [*others, robot])
-            count = float(np.sum(self.groups >= 0))
+        for first in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):
+            others = [c for c in self.causes if c.shape != Step(first)]
+            number, two = self._second_robot(rows, others, block, first)
             gain = count * float(np.mean(np.log(one.noise / two.noise)))
-            needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
             if gain > max(needed, best[0] if best else 0.0):
                 best = gain, number, two
         if best is None:

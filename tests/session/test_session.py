@@ -12,7 +12,7 @@ from robots import DATA, MAPS, missing, robot_file
 from sessions import ARMS, Changes, Simulation, nominal_arm
 from slow_cases import some_slow
 
-from dhcal_pin import calibrate, se3
+from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.parameters import select_parameters
@@ -21,6 +21,7 @@ from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
+from dhcal_pin.session import Session
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 
 DEGREE = np.deg2rad(1.0)
@@ -99,6 +100,12 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
 
 
+def session_of(fit: Result) -> Session:
+    """Return what was found in a calibration."""
+    assert fit.session is not None
+    return fit.session
+
+
 EVENTS = {
     **{
         f"{of} {1e3 * size:g} mm at {at}": Changes(of, size, angle, at=at)
@@ -160,9 +167,9 @@ def test_events_are_named_and_handled(name, request):
     for arm, kind, count, seed in settings:
         simulation = Simulation(arm, count, seed)
         fit = calibrate(simulation.chain, simulation.measure(kind, EVENTS[name]), extend="none")
-        named.append(is_named(fit.session, EVENTS[name], simulation))
+        named.append(is_named(session_of(fit), EVENTS[name], simulation))
         ratios.append(true_ratio(simulation, fit, kind))
-        assert fit.verdict.status == "caution" or not fit.session.found
+        assert fit.verdict.status == "caution" or not session_of(fit).found
     assert np.mean(named) >= (1.0 if is_fast else 0.95), np.round(ratios, 2)
     assert np.median(ratios) <= (2.0 if is_fast else 1.3)
 
@@ -175,21 +182,21 @@ def test_nothing_is_found_where_nothing_happened(count):
         arm, kind, m = list(ARMS)[seed % 4], KINDS[seed // 4 % 2], (60, 100, 300)[seed // 8 % 3]
         simulation = Simulation(arm, m, 1000 + seed)
         fit = calibrate(simulation.chain, simulation.measure(kind), extend="none")
-        found.append(bool(fit.session.found))
+        found.append(bool(session_of(fit).found))
     assert sum(found) <= 0.01 * count
     for seed in range(max(8, count // 4)):
         simulation = Simulation(list(ARMS)[seed % 4], (60, 100)[seed % 2], 2000 + seed)
         share, size = ((0.1, 0.02), (0.2, 5e-3), (0.05, 0.05))[seed % 3]
         changes = Changes(n_outliers=int(share * simulation.count), outlier=size)
         fit = calibrate(simulation.chain, simulation.measure(KINDS[seed % 2], changes), extend="none")
-        assert not fit.session.found, seed
+        assert not session_of(fit).found, seed
 
 
 def test_an_event_is_found_beside_outliers():
     simulation = Simulation("ur10", 100, 5)
     changes = Changes("base", 2e-3, 0.1 * DEGREE, n_outliers=10)
     fit = calibrate(simulation.chain, simulation.measure(Position, changes), extend="none")
-    assert is_named(fit.session, changes, simulation)
+    assert is_named(session_of(fit), changes, simulation)
     assert len(fit.outliers[0]) >= 9
 
 
@@ -198,7 +205,7 @@ def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side():
     data = simulation.measure(Position, Changes("base", 5e-3))
     is_held_out = np.isin(np.arange(100), [47, 48, 49, 50, 51, *range(0, 40, 3)])
     fit = calibrate(simulation.chain, data.take(~is_held_out), holdout=data.take(is_held_out), extend="none")
-    assert fit.session.events[0].line == 51
+    assert session_of(fit).events[0].line == 51
     assert fit.comparisons[0].after.groups["position"].rms < 2e-4
 
 
@@ -213,11 +220,13 @@ def test_a_lag_is_found_and_mended():
     simulation = Simulation("ur10", 200, 4, is_path=True)
     data = simulation.measure(Position, Changes(lag=0.4))
     fit = calibrate(simulation.chain, data, extend="none")
-    assert fit.session.lag.value == pytest.approx(0.4, abs=0.01)
+    lag = session_of(fit).lag
+    assert lag is not None
+    assert lag.value == pytest.approx(0.4, abs=0.01)
     assert fit.verdict.status != "ok"
-    key = fit.session.lag.consequence.rsplit(" ", 1)[1].rstrip(".")
+    key = lag.consequence.rsplit(" ", 1)[1].rstrip(".")
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
-    assert mended.session.lag is None
+    assert session_of(mended).lag is None
     clean = Simulation("ur10", 200, 4, is_path=True)
     expected = calibrate(clean.chain, clean.measure(Position), extend="none")
     assert simulation.true_error(mended.chain) <= 1.5 * clean.true_error(expected.chain)
@@ -228,14 +237,14 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     simulation = Simulation("ur10", 100, 6)
     data = simulation.measure(Position, Changes(scales=scales))
     fit = calibrate(simulation.chain, data, extend="none")
-    (scale,) = fit.session.scales
+    (scale,) = session_of(fit).scales
     assert scale.axis == ("z" if scales[0] == 1 else "")
     assert scale.factor == pytest.approx(scales[2], abs=3 * scale.std)
     assert fit.verdict.status == "caution"
     before = simulation.true_error(fit.chain)
-    key = fit.session.scales[0].consequence.rsplit(" ", 1)[1].rstrip(".")
+    key = session_of(fit).scales[0].consequence.rsplit(" ", 1)[1].rstrip(".")
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
-    assert not mended.session.scales
+    assert not session_of(mended).scales
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
@@ -248,12 +257,12 @@ def test_files_are_segments_even_without_an_order():
     shuffled = [part.take(rng.permutation(50)) for part in parts]
     shuffled = [part.replace(rows=np.arange(2, 52)) for part in shuffled]
     fit = calibrate(simulation.chain, shuffled, extend="none", session="unordered")
-    (event,) = fit.session.events
+    (event,) = session_of(fit).events
     assert (event.kind, event.file_before, event.file) == ("tool", "a.csv", "b.csv")
     assert "between a.csv and b.csv" in fit.verdict.reasons[0]
     assert simulation.true_error(fit.chain) < 1e-4
     whole = data.take(rng.permutation(100)).replace(rows=np.arange(2, 102))
-    assert not calibrate(simulation.chain, whole, extend="none", session="unordered").session.events
+    assert not session_of(calibrate(simulation.chain, whole, extend="none", session="unordered")).events
 
 
 def test_times_order_the_samples():
@@ -261,7 +270,7 @@ def test_times_order_the_samples():
     data = simulation.measure(Position, Changes("base", 2e-3, at=None, time_constant=0.2))
     shuffled = data.with_conditions(time=10.0 * np.arange(100))
     fit = calibrate(simulation.chain, shuffled, extend="none")
-    (drift,) = fit.session.drifts
+    (drift,) = session_of(fit).drifts
     assert drift.time_unit == "s"
     assert drift.time_constant == pytest.approx(200, rel=0.3)
 
@@ -273,13 +282,13 @@ def test_nothing_happened_in_the_public_series_of_a_ur10(series):
         missing(f"measurements at {DATA}")
     chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     data = read_measurements(DATA / f"ipa_ur10/Series_{series}.csv", chain, MAPS / "ipa_ur10.toml")
-    assert not calibrate(chain, data, extend="none").session.found
+    assert not session_of(calibrate(chain, data, extend="none")).found
 
 
 def test_few_rows_are_not_examined():
     simulation = Simulation("ur10", 8, 0)
     fit = calibrate(simulation.chain, simulation.measure(Pose), extend="none")
-    assert fit.session.found == ()
+    assert session_of(fit).found == ()
 
 
 def write_csv(path, simulation, data):

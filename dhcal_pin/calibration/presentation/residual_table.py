@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from .._typing import Array
-from ..estimation.robust import ZERO_WEIGHT
-from ..measurements.base import Measurement
-from .evaluation import fit_instrument_parameters
-from .evidence import Evidence
+from ..._typing import Array
+from ...estimation.robust import ZERO_WEIGHT
+from ...measurements.base import Measurement
+from ..evaluation import fit_instrument_parameters
+from ..evidence import Evidence
 
 
 @dataclass(frozen=True, eq=False)
