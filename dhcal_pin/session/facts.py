@@ -66,8 +66,8 @@ class Event:
         """What happened."""
         size = format_quantity(self.size, self.unit, self.std, small=self.unit == "m")
         if self.kind == "robot":
-            samples = self.place.removeprefix("between ")
-            return f"{samples[0].upper()}{samples[1:]} are of two robots: {self.of} differs by {size}."
+            where = f"line {self.line}{f' of {self.file}' if self.file else ''}"
+            return f"Two robots were measured: from {where} on, {self.of} differs by {size}."
         if self.kind == "joint":
             return f"The zero of joint {self.of} changed by {size} {self.place}."
         return f"The {self.kind} {'turned' if self.unit == 'rad' else 'moved'} by {size} {self.place}."

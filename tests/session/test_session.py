@@ -213,7 +213,7 @@ def test_two_robots_are_refused():
     simulation = Simulation("ur10", 100, 3)
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
     assert fit.verdict.is_refused
-    assert "are of two robots" in fit.verdict.reasons[0]
+    assert "Two robots were measured" in fit.verdict.reasons[0]
 
 
 def test_a_lag_is_found_and_mended():
