@@ -18,7 +18,7 @@ from ..estimation.parameters import EXTENSIONS
 from ..estimation.priors import PriorGroups
 from ..session import Session
 from ..session.causes import Step
-from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE
+from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
 from . import model_selection
 from .reweighting import Fit, reweight
 
@@ -34,7 +34,7 @@ def confirm_changes(
     `without` and `fit` are the first fits without and with the changes.
     """
     residuals = [_residuals(each, groups, max_iterations) for each in (without, fit)]
-    noise = [1.4826 * np.median(np.abs(r), 1, keepdims=True) for r in residuals[1]]
+    noise = [np.maximum(1.4826 * np.median(np.abs(r), 1, keepdims=True), MIN_NOISE) for r in residuals[1]]
     costs = [
         sum(
             float(np.sum(np.minimum(np.sum((r / s) ** 2, 0), len(r) + MAX_SAMPLE_COST)))

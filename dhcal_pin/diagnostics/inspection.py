@@ -32,12 +32,13 @@ from ..io.tables import Column, DataTable, read_table
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
-from ..session import examine
 from ..units import ANGLES, LENGTHS
 from .input_checks import find_input_warnings, first_equal_rows
 
 # Decimals to which joint positions of one configuration are equal [rad or m].
 _CONFIGURATION_DECIMALS = 3
+# What is estimated to find what happened during a measurement.
+SESSION_PARAMETERS = "minimal,base,tool"
 # A column is numeric if at least this share of its cells are numbers.
 _MIN_NUMERIC_SHARE = 0.5
 
@@ -110,7 +111,12 @@ def inspect_file(
 
 def _session_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     """Describe what happened while the samples of a file were measured."""
-    session = examine(chain, file.data)
+    from ..calibration import calibrate  # lazy import: slow
+
+    try:
+        session = calibrate(chain, file.data, SESSION_PARAMETERS, extend="none").session
+    except DhcalError:
+        return []
     return [item.finding for item in session.found] if session else []
 
 

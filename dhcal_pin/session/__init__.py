@@ -2,6 +2,6 @@
 
 from .facts import History, Session, histories
 from .scale import find_scale
-from .search import can_have_session, examine, find_session
+from .search import can_have_session, find_session
 
-__all__ = ["History", "Session", "can_have_session", "examine", "find_scale", "find_session", "histories"]
+__all__ = ["History", "Session", "can_have_session", "find_scale", "find_session", "histories"]

@@ -81,7 +81,8 @@ class Layout:
         scales = all_links + 1 + np.arange(len(SCALE_AXES))
         lag = int(scales[-1]) + 1
         grows = growing_links(chain)
-        size = float(np.linalg.norm(chain.loads.link_vectors, axis=1).sum())
+        # A robot without lengths only turns.
+        size = float(np.linalg.norm(chain.loads.link_vectors, axis=1).sum()) or 1.0
         of_frame = np.array([1.0] * 3 + [1 / size] * 3)
         of_base, of_tool = (
             np.array([names.index(q.name) for q in parameters]) for parameters in (base(chain), tool(chain))
@@ -91,8 +92,9 @@ class Layout:
             unit = 1.0 if chain.is_prismatic[j] else 1 / size
             blocks.append(Block("joint", name, j, joints[j : j + 1], np.array([unit])))
         # All links by one factor, or each by its own.
-        blocks.append(Block("links", "", 0, np.array([all_links]), np.array([1 / size])))
-        blocks.append(Block("links", "", 0, links[grows], np.full(grows.sum(), 1 / size)))
+        if grows.any():
+            blocks.append(Block("links", "", 0, np.array([all_links]), np.array([1 / size])))
+            blocks.append(Block("links", "", 0, links[grows], np.full(grows.sum(), 1 / size)))
         blocks += [
             Block("scale", axis, i, scales[i : i + 1], np.array([1 / size]), is_constant=True)
             for i, axis in enumerate(SCALE_AXES)

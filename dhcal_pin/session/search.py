@@ -30,12 +30,8 @@ from itertools import pairwise
 import numpy as np
 
 from .._typing import Array
-from ..estimation.initialization import initialize_frames, make_problem
-from ..estimation.parameters import select_parameters
 from ..estimation.problem import Problem
-from ..estimation.solver import minimize
 from ..measurements.base import Measurement
-from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, Shape, Step
 from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
 from .linear_model import Layout, whitened_rows
@@ -78,8 +74,6 @@ MAX_REJECTED = 2
 MAX_MOVES = 4
 # Largest number of causes, of iterations of a fit, and of passes of the weights in each iteration.
 MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
-# Largest number of iterations of the fit of measurements alone.
-MAX_SOLVER_ITERATIONS = 50
 # Smallest noise in standard deviations of the measurements: a micrometre if they state none.
 MIN_NOISE = 1e-3
 # Added to the unit diagonal of information for directions that nothing determines.
@@ -237,7 +231,7 @@ class _Search:
         # Variance of the bounded residuals, so that the score test keeps its level with outliers.
         bounded = (after / noise) * weights[:, None]
         variance = np.sum(bounded**2 * is_row) / (np.sum(is_row) * freedom)
-        noise = noise * np.sqrt(variance)
+        noise = np.maximum(noise * np.sqrt(variance), MIN_NOISE)
         out = rows / noise[..., None]
         out[..., -1] = after / noise
         columns = columns / noise[..., None]
@@ -655,12 +649,9 @@ def _bounded_cost(residual: Array) -> Array:
 
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
-    """Return whether the samples of measurements can be put in order and examined together."""
+    """Return whether all samples are positions or poses of the tool, which show where base and tool are."""
     return all(
-        item.configurations_per_row == 1
-        and item.has_length_scale
-        and item.rig is None
-        and item.has_joint_values
+        item.configurations_per_row == 1 and item.has_joint_values and len(item.positions()) == len(item.rows)
         for item in data
     )
 
@@ -711,19 +702,6 @@ def _lag(cause: Cause, timeline: Timeline) -> Lag:
 def _scale(cause: Cause) -> Scale:
     """Describe the scale of one axis."""
     return Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
-
-
-def examine(chain: Chain, data: Measurement) -> Session | None:
-    """Find what happened while measurements were made; None if their samples cannot be put in order."""
-    if not can_have_session([data]) or not len(data.positions()):
-        return None
-    started = initialize_frames(
-        select_parameters(chain, "minimal,base,tool"), (data,), {}, MAX_SOLVER_ITERATIONS
-    )
-    items = (data.initialized(started.chain),)
-    problem = make_problem(started, items, 1 / started.priors, {})
-    x = minimize(problem, max_iterations=MAX_SOLVER_ITERATIONS, loose=True).x
-    return find_session(problem, x, (), is_ordered=True)
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:

@@ -29,6 +29,8 @@ VALUES = {
     "fix": '"d2"',
     "free": '"d3"',
     "holdout": "0.3",
+    "session": '"off"',
+    "unordered": "true",
     "method": '"gn"',
     "loss": '"tukey"',
     "priors": '"none"',
@@ -55,7 +57,8 @@ VALUES = {
 ARGUMENTS = (
     "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --root link0 --package-dir meshes "
     "--package-dir more --columns map.toml --rig rig.toml --skip-bad-rows --mend sign:a --mend rows:above "
-    "--parameters dh --extend gain --fix d2 --free d3 --holdout 0.3 --method gn --loss tukey "
+    "--parameters dh --extend gain --fix d2 --free d3 --holdout 0.3 --session off --unordered --method gn "
+    "--loss tukey "
     "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "
     "--in-place --world-joint --tool-frame tcp --camera-frame eye --camera-files cam --force "
     "--report r.html --report r.md --certificate c.html --meta meta.toml --json r.json "
