@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -221,15 +221,8 @@ class Session:
         self, data: tuple[Measurement, ...], holdout: tuple[Measurement, ...]
     ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
         """Return fitted and held-out measurements with the changes as conditions of their samples."""
-        timeline = Timeline(
-            (*data, *holdout),
-            len(data),
-            self.timeline.numbers,
-            self.timeline.times,
-            self.timeline.unit,
-            self.timeline.file_starts,
-        )
-        return apply_changes(self.changes, self.chain, timeline)
+        timeline = replace(self.timeline, data=(*data, *holdout))
+        return apply_changes(self.changes, self.chain, timeline, None)
 
     @property
     def has_two_robots(self) -> bool:

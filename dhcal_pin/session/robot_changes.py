@@ -179,13 +179,15 @@ class JointPaths:
 
 
 def apply_changes(
-    changes: RobotChanges, chain: Chain, timeline: Timeline
+    changes: RobotChanges, chain: Chain, timeline: Timeline, paths: JointPaths | None
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
-    """Return fitted and held-out measurements with the changes as conditions of their samples."""
-    paths = JointPaths(timeline) if changes.lag else None
+    """Return fitted and held-out measurements with the changes as conditions of their samples.
+
+    A lag needs the paths of the joints.
+    """
     out = []
     for item, numbers, times in zip(timeline.data, timeline.numbers, timeline.times, strict=True):
-        later = paths.evaluate(numbers, times, changes.lag)[0] if paths else None
+        later = paths.evaluate(numbers, times, changes.lag)[0] if paths and changes.lag else None
         known = item.recorded or Conditions(item.q)
         out.append(item.replace(recorded=changes.conditions(known, chain, numbers, times, later)))
     return tuple(out[: timeline.n_fitted]), tuple(out[timeline.n_fitted :])

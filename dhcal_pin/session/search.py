@@ -42,6 +42,8 @@ from .timeline import Timeline, order_samples
 # screening that decides whether to search.
 MAX_SAMPLES, MAX_CELLS = 4000, 400
 MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS = 300, 60
+# Largest number of samples among which a lag is looked for.
+MAX_PATH_SAMPLES = 20_000
 # Logarithm of the ratio of the evidences from which the screening calls for a search.
 MIN_SCREENED_EVIDENCE = 2.0
 # Weight below which a sample is an outlier, and share of them that calls for a search as well.
@@ -58,13 +60,13 @@ MAX_SAMPLE_COST = 16.0
 MIN_LOG_EVIDENCE, MIN_EFFECT = 12.0, 0.5
 # Smallest share of the gain of a cause that left-out blocks have to show.
 MIN_PREDICTED_SHARE = 0.4
-# Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
-MAX_OUTLIER_SHARE = 0.25
 # Number of these blocks, fewest of them on either side of a step, and most of them.
 N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
+# Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
+MAX_OUTLIER_SHARE = 0.25
 # Time constants of drifts, relative to the duration of the session.
 TIME_CONSTANTS = (np.inf, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
-# The same for causes that are found before the first fit.
+# Smallest logarithm of the evidence and RMS effect of a cause that is accepted before the first fit.
 MIN_GROSS_EVIDENCE, MIN_GROSS_EFFECT = 60.0, 3.0
 # Gain in the logarithm of the likelihood from which a drift is exponential rather than linear.
 MIN_CURVATURE_GAIN = 3.0
@@ -126,11 +128,10 @@ class _Search:
         self.layout = Layout.of(problem)
         self.is_ordered = is_ordered
         self.timeline, self.chain = timeline, problem.errors.chain
-        numbers = timeline.fitted_numbers
-        order = np.argsort(numbers, kind="stable")
-        self.order = order[:: max(1, -(-len(order) // n_samples))]
-        self.numbers = numbers[self.order]
-        self.times = timeline.fitted_times[self.order]
+        self.part = timeline.thinned(n_samples)
+        self.order = np.argsort(self.part.fitted_numbers, kind="stable")
+        self.numbers = self.part.fitted_numbers[self.order]
+        self.times = self.part.fitted_times[self.order]
         self.edges = self._cell_edges(())
         self.x = np.zeros(len(problem.weights))
         self.changes = RobotChanges()
@@ -138,16 +139,13 @@ class _Search:
         # Blocks and types of functions of time that were tried in vain.
         self.rejected: set[tuple[Block, type[Shape]]] = set()
         self.groups = self._noise_groups()
-        self.paths = JointPaths(timeline) if self._can_lag else None
+        can_lag = is_ordered and sum(map(len, timeline.numbers)) <= MAX_PATH_SAMPLES
+        self.paths = JointPaths(timeline) if can_lag else None
         self.layout = self.layout.restricted_to(self.linearize())
-
-    @property
-    def _can_lag(self) -> bool:
-        return self.is_ordered and all(item.configurations_per_row == 1 for item in self.timeline.data)
 
     def _noise_groups(self) -> Array:
         """Label the rows that have one noise, (N, k); -1 for rows that a kind does not have."""
-        items = self.timeline.data[: self.timeline.n_fitted]
+        items = self.part.data
         width, units = max(item.residual_dim for item in items), []
         labels = []
         for item in items:
@@ -173,13 +171,11 @@ class _Search:
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:
         """Return the whitened rows with the current unknowns and changes."""
-        data, _ = apply_changes(self.changes, self.chain, self.timeline)
-        if self.paths is None:
-            rates = np.zeros((len(self.timeline.fitted_numbers), self.chain.n_joints))
-        else:
-            rates = self.paths.evaluate(
-                self.timeline.fitted_numbers, self.timeline.fitted_times, self.changes.lag
-            )[1]
+        data, _ = apply_changes(self.changes, self.chain, self.part, self.paths)
+        rates = np.zeros((len(self.order), self.chain.n_joints))
+        if self.paths is not None:
+            numbers, times = self.part.fitted_numbers, self.part.fitted_times
+            rates = self.paths.evaluate(numbers, times, self.changes.lag)[1]
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
         for cause in self.causes:
             if cause.block.kind == "scale":
@@ -336,11 +332,12 @@ class _Search:
         own = block.columns
         firsts = self.edges[:-1]
         if isinstance(shapes[0], Step):
-            ends = np.searchsorted(self.numbers[firsts], [shape.number for shape in shapes])  # pyright: ignore
-            inner = -np.cumsum(cells[:, own][:, :, own], 0)[ends - 1]
+            steps = [shape.number for shape in shapes if isinstance(shape, Step)]
+            ends = np.searchsorted(self.numbers[firsts], steps)
+            # f is -1 before the step.
+            inner = np.cumsum(cells[:, own][:, :, own], 0)[ends - 1]
             right = -np.cumsum(cells[:, own, -1], 0)[ends - 1]
             beside = -np.cumsum(cross[:, own], 0)[ends - 1]
-            inner = -inner
         else:
             f = np.array([shape.values(self.numbers[firsts], self.times[firsts]) for shape in shapes])
             inner = np.tensordot(f**2, cells[:, own][:, :, own], 1)
@@ -549,7 +546,7 @@ class _Search:
             costs = {}
             for new in (old, *between.tolist()):
                 changes = self.changes.with_step(cause.block.kind, cause.block.index, old, new)
-                _, items = apply_changes(changes, self.chain, timeline)
+                _, items = apply_changes(changes, self.chain, timeline, self.paths)
                 costs[new] = 0.0
                 for item, numbers in zip(items, timeline.numbers[timeline.n_fitted :], strict=True):
                     part = item.take(np.isin(numbers, between))

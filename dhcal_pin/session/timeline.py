@@ -6,7 +6,7 @@ The samples are in the order of the files and of their lines, or of their times 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,21 @@ class Timeline:
     def fitted_times(self) -> Array:
         """Times of all fitted samples, in the order of the measurements."""
         return np.concatenate(self.times[: self.n_fitted])
+
+    def thinned(self, count: int) -> Timeline:
+        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""
+        numbers = self.fitted_numbers
+        order = np.argsort(numbers, kind="stable")
+        kept = np.zeros(len(numbers), bool)
+        kept[order[:: max(1, -(-len(order) // count))]] = True
+        ends = np.cumsum([len(each) for each in self.numbers[: self.n_fitted]])[:-1]
+        masks = np.split(kept, ends)
+        data = tuple(item.take(mask) for item, mask in zip(self.data, masks, strict=False))
+        parts = [
+            tuple(each[mask] for each, mask in zip(values, masks, strict=False))
+            for values in (self.numbers, self.times)
+        ]
+        return replace(self, data=data, numbers=parts[0], times=parts[1])
 
     def place(self, number: int) -> tuple[str, int]:
         """Return file and line of a sample."""
