@@ -24,7 +24,7 @@ MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
 MAX_CHANCE = 1e-3
 # Largest number of samples that are examined.
-MAX_SAMPLES = 300
+MAX_SAMPLES = 200
 
 
 def find_scale(problem: Problem, x: Array) -> Scale | None:

@@ -41,7 +41,7 @@ from .timeline import Timeline, order_samples
 # Largest numbers of samples that are examined, and of cells between which steps are tested; the same for the
 # screening that decides whether to search.
 MAX_SAMPLES, MAX_CELLS = 4000, 400
-MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS = 300, 60
+MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS = 200, 40
 # Largest number of samples among which a lag is looked for.
 MAX_PATH_SAMPLES = 20_000
 # Logarithm of the ratio of the evidences from which the screening calls for a search.
@@ -122,8 +122,10 @@ class LinearFit:
 class _Search:
     """State of a search."""
 
-    def __init__(self, problem: Problem, timeline: Timeline, is_ordered: bool, n_samples: int, n_cells: int):
-        """Prepare the samples in the order of measurement."""
+    def __init__(
+        self, problem: Problem, x: Array, timeline: Timeline, is_ordered: bool, n_samples: int, n_cells: int
+    ):
+        """Prepare the samples in the order of measurement, and linearize the model at x."""
         self.n_cells = n_cells
         self.layout = Layout.of(problem)
         self.is_ordered = is_ordered
@@ -133,7 +135,7 @@ class _Search:
         self.numbers = self.part.fitted_numbers[self.order]
         self.times = self.part.fitted_times[self.order]
         self.edges = self._cell_edges(())
-        self.x = np.zeros(len(problem.weights))
+        self.x = x
         self.changes = RobotChanges()
         self.causes: list[Cause] = []
         # Blocks and types of functions of time that were tried in vain.
@@ -141,7 +143,8 @@ class _Search:
         self.groups = self._noise_groups()
         can_lag = is_ordered and sum(map(len, timeline.numbers)) <= MAX_PATH_SAMPLES
         self.paths = JointPaths(timeline) if can_lag else None
-        self.layout = self.layout.restricted_to(self.linearize())
+        self.first_rows = self.linearize()
+        self.layout = self.layout.restricted_to(self.first_rows)
 
     def _noise_groups(self) -> Array:
         """Label the rows that have one noise, (N, k); -1 for rows that a kind does not have."""
@@ -363,7 +366,7 @@ class _Search:
     # ------------------------------------------------------------------------------------------- search
     def run(self) -> None:
         """Find all causes."""
-        fit = self.solve(self.linearize(), [])
+        fit = self.solve(self.first_rows, [])
         gross = self.best_cause(fit)
         if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and gross.effect > MIN_GROSS_EFFECT:
             self._add(gross)
@@ -672,7 +675,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):
         return nothing
-    search = _Search(problem, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
+    search = _Search(problem, np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
     search.run()
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
@@ -703,9 +706,8 @@ def _scale(cause: Cause) -> Scale:
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:
     """Return whether a test of a part of the samples calls for a search."""
-    screening = _Search(problem, timeline, is_ordered, MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS)
-    screening.x = x
-    fit = screening.solve(screening.linearize(), [])
+    screening = _Search(problem, x, timeline, is_ordered, MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS)
+    fit = screening.solve(screening.first_rows, [])
     if np.mean(fit.weights < OUTLIER_WEIGHT) > MAX_SCREENED_OUTLIERS:
         return True
     found = screening.best_cause(fit)
