@@ -22,6 +22,8 @@ from ..robot.chain import Chain
 from ..robot.error_families import MIN_LINK_LENGTH
 from .causes import Block
 
+# Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
+PRIOR_FACTOR = 10.0
 # Size of a change that is held at zero.
 HELD_SIZE = 1e-12
 # Largest entry of a column, relative to those of others, below which it is rounding.
@@ -104,7 +106,7 @@ class Layout:
         return cls(
             replace(problem, errors=extended),
             model,
-            problem.weights,
+            problem.weights / PRIOR_FACTOR,
             tuple(blocks),
             joints,
             links,

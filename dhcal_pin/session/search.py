@@ -430,6 +430,10 @@ class _Search:
                 has_changed = True
         return has_changed
 
+    def log_noise(self) -> float:
+        """Return the mean logarithm of the noise of the fit at the current unknowns."""
+        return self._log_noise(self.solve(self.linearize(), self.causes))
+
     def _log_noise(self, fit: LinearFit) -> float:
         """Return the mean logarithm of the noise of a fit."""
         return float(np.mean(np.log(fit.noise[self.groups >= 0])))
@@ -675,8 +679,17 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):
         return nothing
-    search = _Search(problem, np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
+    # The solution may be bent by a large event, and the nominal robot may be far from the measurements.
+    starts = [
+        _Search(problem, start, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
+        for start in (np.zeros_like(x), x)
+    ]
+    noises = [search.log_noise() for search in starts]
+    search = starts[int(np.argmin(noises))]
     search.run()
+    # A search that ends in a wrong minimum says nothing.
+    if search.log_noise() > min(noises):
+        return nothing
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
     causes = tuple(search.causes)
