@@ -674,7 +674,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     """
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(RobotChanges(), timeline, chain, is_ordered)
-    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
     if n_rows < MIN_ROWS_PER_UNKNOWN * len(problem.weights):
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):

@@ -45,9 +45,14 @@ class Timeline:
         return np.concatenate(self.times[: self.n_fitted])
 
     def thinned(self, count: int) -> Timeline:
-        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""
+        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones.
+
+        Of consecutive samples at one configuration, the first counts: they share the error of the model.
+        """
         numbers = self.fitted_numbers
         order = np.argsort(numbers, kind="stable")
+        q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
+        order = order[np.concatenate([[True], np.any(q[1:] != q[:-1], 1)])]
         kept = np.zeros(len(numbers), bool)
         kept[order[:: max(1, -(-len(order) // count))]] = True
         ends = np.cumsum([len(each) for each in self.numbers[: self.n_fitted]])[:-1]

@@ -285,6 +285,19 @@ def test_nothing_happened_in_the_public_series_of_a_ur10(series):
     assert not session_of(calibrate(chain, data, extend="none")).found
 
 
+def test_repeated_samples_count_once():
+    """Samples of one stop share the error of the model; repeating them is no evidence of an event."""
+    simulation = Simulation("ur10", 60, 11)
+    data = simulation.measure(Position)
+    repeated = Position(np.repeat(data.q, 4, 0), np.repeat(data.positions(), 4, 0))
+    assert not session_of(calibrate(simulation.chain, repeated, extend="none")).found
+    moved = Simulation("ur10", 60, 11)
+    data = moved.measure(Position, Changes("base", 2e-3))
+    repeated = Position(np.repeat(data.q, 4, 0), np.repeat(data.positions(), 4, 0))
+    (event,) = session_of(calibrate(moved.chain, repeated, extend="none")).events
+    assert event.line == 4 * 30 + 1
+
+
 def test_few_rows_are_not_examined():
     simulation = Simulation("ur10", 8, 0)
     fit = calibrate(simulation.chain, simulation.measure(Pose), extend="none")
