@@ -55,7 +55,7 @@ class Evidence(FittedModel):
         is_kept_nominal: Whether the correction was not applied because of the verdict.
         earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
             if they were.
-        session: What happened during the measurement; None if nobody looked.
+        session: What happened during the measurement; None if this was not examined.
     """
 
     region_comparison: Comparison | None = None

@@ -18,6 +18,7 @@ from ..estimation.parameters import EXTENSIONS
 from ..estimation.priors import PriorGroups
 from ..session import Session
 from ..session.causes import Step
+from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
 from . import model_selection
 from .reweighting import Fit, reweight
@@ -67,4 +68,4 @@ def _residuals(fit: Fit, groups: PriorGroups, max_iterations: int) -> Sequence[A
 def without_changes(session: Session) -> Session:
     """Return a session in which nothing changed."""
     kept = tuple(cause for cause in session.causes if cause.block.is_constant)
-    return replace(session, changes=type(session.changes)(), causes=kept, events=(), drifts=())
+    return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=())

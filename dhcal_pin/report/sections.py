@@ -91,7 +91,7 @@ def _region_sentence(generalization: Generalization) -> str:
 
 
 def _session_section(context: ReportContext) -> Section | None:
-    """Return what happened during the measurement; None if nobody looked."""
+    """Return what happened during the measurement; None if this was not examined."""
     session = context.fit.session
     if session is None:
         return None

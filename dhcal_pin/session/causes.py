@@ -100,7 +100,7 @@ class Cause:
     Attributes:
         block: What changed.
         shape: How it changed over time.
-        values: Its c coefficients, (c,); zero where a motion of base or tool holds the value.
+        values: Its c coefficients, (c,).
         covariance: Their covariance, (c, c).
         log_evidence: Logarithm of the ratio of the evidence with and without it.
         effect: RMS of its effect on the residuals of the samples that it concerns, in standard deviations.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..formatting import format_fixed, format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .causes import Cause, Drift, Step
-from .linear_model import growing_links
+from .linear_model import HELD_SIZE, growing_links
 from .robot_changes import RobotChanges, apply_changes
 from .timeline import Timeline
 
@@ -215,7 +215,7 @@ class Session:
     events: tuple[Event, ...] = ()
     drifts: tuple[SlowChange, ...] = ()
     lag: Lag | None = None
-    scales: tuple[Scale, ...] = field(default=())
+    scales: tuple[Scale, ...] = ()
 
     def applied(
         self, data: tuple[Measurement, ...], holdout: tuple[Measurement, ...]
@@ -317,7 +317,9 @@ def _step_size(cause: Cause, changes: RobotChanges, chain: Chain) -> tuple[float
 def _motion_size(moved: Array, angles: Array, arm: Array, cause: Cause) -> tuple[float, float, str]:
     """Return the size of a motion: of its translation, unless it mostly turns."""
     distance, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(angles))
-    reach = 1 / float(cause.block.sizes[3:].max())
+    size = float(cause.block.sizes[3:].max())
+    # Turns that the measurements do not show are held at zero.
+    reach = 1 / size if size > HELD_SIZE else 0.0
     if angle * reach > MIN_ANGLE_RATIO * distance:
         along = np.concatenate([np.zeros(3), angles / angle])
         return angle, float(np.sqrt(along @ cause.covariance @ along)), "rad"

@@ -75,6 +75,8 @@ class Layout:
         names = [parameter.name for parameter in extended.parameters]
         p, s = len(names), len(problem.instrument_parameters)
         model = np.array([*(names.index(name) for name in own), *range(p, p + s)], int)
+        # A calibration without priors leaves redundant unknowns undetermined; the search does not.
+        expected = np.array([*errors.priors, *(u.prior for u in problem.instrument_parameters)])
         chain = errors.chain
         n, n_links = chain.n_joints, len(chain.moving_joints) + 1
         joints = p + s + np.arange(n)
@@ -106,7 +108,7 @@ class Layout:
         return cls(
             replace(problem, errors=extended),
             model,
-            problem.weights / PRIOR_FACTOR,
+            np.where(problem.weights > 0, problem.weights, 1 / expected) / PRIOR_FACTOR,
             tuple(blocks),
             joints,
             links,
@@ -118,8 +120,8 @@ class Layout:
     def restricted_to(self, rows: Array) -> Layout:
         """Return the layout with the causes that the rows (m, k, c) can show.
 
-        Changes that they do not show are held. A change over time is told from a constant error only if the
-        calibration estimates the constant error.
+        Columns without an effect on the rows are held at zero. A change over time is only looked for if the
+        calibration also estimates a constant error of the same kind.
         """
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()

@@ -157,7 +157,6 @@ class JointPaths:
 
     def __init__(self, timeline: Timeline):
         """Join the samples of fitted and held-out measurements."""
-        self._unit = timeline.unit
         numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
         order = np.argsort(numbers)
         q = np.concatenate([item.q for item in timeline.data])[order]

@@ -241,10 +241,10 @@ class _Search:
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
         return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
 
-    def iterate(self, max_iterations: int = MAX_ITERATIONS) -> LinearFit:
+    def iterate(self) -> LinearFit:
         """Fit unknowns and causes until the steps are negligible."""
         fit = self.solve(self.linearize(), self.causes)
-        for _ in range(max_iterations):
+        for _ in range(MAX_ITERATIONS):
             self._advance(fit)
             change = np.sqrt(np.mean((fit.columns @ fit.step) ** 2 * fit.weights[:, None]))
             fit = self.solve(self.linearize(), self.causes)
@@ -292,7 +292,7 @@ class _Search:
         return float(np.sqrt(np.sum(effect**2) / (np.sum(self.groups >= 0) * self._concerned(cause))))
 
     def _concerned(self, cause: Cause) -> float:
-        """Return the share of the samples that a cause tells apart from the others."""
+        """Return the share of the samples on the shorter side of a step; 1 for other causes."""
         if not isinstance(cause.shape, Step):
             return 1.0
         share = float(np.mean(self.numbers < cause.shape.number))
@@ -508,7 +508,7 @@ class _Search:
         return replace(cause, log_evidence=evidence, effect=effect)
 
     def _outlier_share(self, fit: LinearFit, cause: Cause) -> float:
-        """Return the share of outliers among the samples that a cause tells apart from the others."""
+        """Return the share of outliers on the shorter side of a step, or among all samples."""
         is_outlier = fit.weights < OUTLIER_WEIGHT
         if not isinstance(cause.shape, Step):
             return float(np.mean(is_outlier))

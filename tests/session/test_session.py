@@ -192,6 +192,14 @@ def test_nothing_is_found_where_nothing_happened(count):
         assert not session_of(fit).found, seed
 
 
+@pytest.mark.parametrize("sets", ["minimal,base,tool", "placement,base,tool"])
+def test_an_event_is_found_without_priors_and_with_redundant_parameters(sets):
+    simulation = Simulation("ur10", 100, 3)
+    changes = Changes("base", 5e-3)
+    fit = calibrate(simulation.chain, simulation.measure(Position, changes), sets, priors="none")
+    assert is_named(session_of(fit), changes, simulation)
+
+
 def test_an_event_is_found_beside_outliers():
     simulation = Simulation("ur10", 100, 5)
     changes = Changes("base", 2e-3, 0.1 * DEGREE, n_outliers=10)
