@@ -24,6 +24,7 @@ import numpy as np
 
 from .._typing import Array, Progress
 from ..estimation import robust
+from ..estimation.bare_geometry import BareGeometry
 from ..estimation.folds import Fold, Refit, factor_folds, solve_fold
 from ..estimation.problem import Problem
 from ..estimation.solver import minimize, next_iterate
@@ -54,6 +55,7 @@ class FoldErrors:
 
     # Errors of each measurement with held-out samples, as from `compute_errors`.
     errors: list[dict[str, Array]]
+    errors_alone: list[dict[str, Array]]  # The same of the URDF alone; empty without joint errors
     rms: float  # RMS of the held-out rows in standard deviations
     prediction_std: float  # RMS of these rows that the uncertainty of the fold's fit causes
 
@@ -65,6 +67,7 @@ def cross_validate_folds(
     folds: Sequence[Fold],
     refit: Refit,
     shrinkage_factor: float = 1.0,
+    bare: BareGeometry | None = None,
 ) -> Iterator[FoldErrors]:
     """Generate the errors of the held-out samples of each fold."""
     sizes = [len(item.rows) for item in data]
@@ -84,9 +87,11 @@ def cross_validate_folds(
         }
         known = {name: v for name, v in problem.instruments(solution).items() if name not in unobserved}
         held_out = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
-        errors = compute_errors(problem.errors.at(solution[:robot]), held_out, known)
+        chain = problem.errors.at(solution[:robot])
+        alone = bare.refitted(chain) if bare else None
         yield FoldErrors(
-            errors,
+            compute_errors(chain, held_out, known),
+            compute_errors(alone.chain, held_out, known) if alone else [],
             systems.error(problem.weights, x, columns),
             systems.prediction_std(problem.weights, columns),
         )
@@ -181,11 +186,13 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
         chain, instruments = fit_nominal(nominal, fitted, fit.problem.known)
         before += compute_errors(chain, held_out, instruments)
     after: list[dict[str, Array]] = []
+    alone: list[dict[str, Array]] = []
     largest_std = 0.0
     for fold_after in cross_validate_folds(
-        fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor
+        fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor, fit.bare
     ):
         after += fold_after.errors
+        alone += fold_after.errors_alone
         largest_std = max(largest_std, fold_after.prediction_std)
     if not fit.shrinkage_factor:
         # Without a correction the calibrated robot is the nominal one.
@@ -193,7 +200,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
     labels = configuration_groups(data)
     held_out_labels = np.concatenate([labels[np.concatenate(fold)] for fold in folds])
     return FoldComparison(
-        _comparison(fit, title, before, after),
+        _comparison(fit, title, before, after, alone),
         largest_std,
         PairedErrors.from_errors(before, after, held_out_labels),
     )
@@ -215,6 +222,7 @@ def leave_regions_out(
         return None
     before: list[dict[str, Array]] = []
     after: list[dict[str, Array]] = []
+    alone: list[dict[str, Array]] = []
     for number, fold in enumerate(folds, 1):
         if progress:
             progress("left-out regions", number, len(folds))
@@ -225,7 +233,8 @@ def leave_regions_out(
         held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
         before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
         after += compute_errors(part.chain, held_out, part.instruments)
-    return _comparison(fit, "region hold-out", before, after)
+        alone += compute_errors(part.urdf_alone, held_out, part.instruments)
+    return _comparison(fit, "region hold-out", before, after, alone if fit.bare else [])
 
 
 def _comparison(
@@ -233,12 +242,19 @@ def _comparison(
     title: Title,
     before: Sequence[Mapping[str, Array]],
     after: Sequence[Mapping[str, Array]],
+    alone: Sequence[Mapping[str, Array]],
 ) -> Comparison:
     """Compare the errors of held-out samples before and after a calibration."""
-    accuracy_before, accuracy_after = map(Accuracy.from_errors, (before, after))
     n_samples = sum(len(next(iter(item.values()))) for item in after)
     n_rejected = fit.n_samples - sum(len(item.rows) for item in fit.inliers)
-    return Comparison(title, n_samples, accuracy_before, accuracy_after, n_rejected)
+    return Comparison(
+        title,
+        n_samples,
+        Accuracy.from_errors(before),
+        Accuracy.from_errors(after),
+        n_rejected,
+        after_alone=Accuracy.from_errors(alone) if alone else None,
+    )
 
 
 @dataclass(frozen=True, eq=False)

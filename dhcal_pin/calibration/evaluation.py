@@ -318,6 +318,8 @@ class Comparison:
         n_rejected: Number of fitted samples with zero weight; they are not in the figures.
         n_outliers: Number of outliers among hold-out samples; they are in the figures.
         after_without_outliers: `after` without these; empty if there are none.
+        after_alone: Accuracy of the calibrated URDF without its sidecar, with the base and the tool that fit
+            it best; None if the sidecar has no errors of the arm.
     """
 
     title: Title
@@ -327,6 +329,7 @@ class Comparison:
     n_rejected: int = 0
     n_outliers: int = 0
     after_without_outliers: Accuracy = field(default_factory=Accuracy)
+    after_alone: Accuracy | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the attributes for the JSON document, the accuracies by their flat keys."""

@@ -119,7 +119,8 @@ class Evidence(FittedModel):
         count = sum(len(item.rows) for item in inliers)
         before = accuracy(nominal, inliers, instruments)
         after = accuracy(self.chain, inliers, self.instruments)
-        fitted = Comparison("fitted", count, before, after, self.n_samples - count)
+        alone = accuracy(self.urdf_alone, inliers, self.instruments) if self.bare else None
+        fitted = Comparison("fitted", count, before, after, self.n_samples - count, after_alone=alone)
         found = [self._compare_holdout()] if self.holdout else []
         if self.region_comparison and self.generalization.region_holdout:
             found.append(self.region_comparison)
@@ -179,4 +180,5 @@ class Evidence(FittedModel):
             Accuracy.from_errors(errors),
             n_outliers=n_outliers,
             after_without_outliers=Accuracy.from_errors(inliers) if n_outliers else Accuracy(),
+            after_alone=accuracy(self.urdf_alone, self.holdout, self.instruments) if self.bare else None,
         )

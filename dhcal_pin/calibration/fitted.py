@@ -29,6 +29,7 @@ import pinocchio as pin
 
 from .._typing import Array
 from ..estimation import qr, robust
+from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
 from ..estimation.problem import Problem, linearize_and_factor
@@ -77,6 +78,7 @@ class FittedModel:
             `shrinkage`.
         extension: Families of joint errors that were added, and how much the samples count; None if nothing
             was tried.
+        bare: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
     """
 
     errors: ErrorModel
@@ -90,11 +92,17 @@ class FittedModel:
     weights: tuple[Array, ...]
     shrinkage_factor: float = 1.0
     extension: Extension | None = None
+    bare: BareGeometry | None = None
+
+    @property
+    def urdf_alone(self) -> Chain:
+        """The robot that the URDF describes without its sidecar, with the base and the tool that fit best."""
+        return self.bare.chain if self.bare else self.chain
 
     @property
     def model(self) -> pin.Model:
-        """Pinocchio model with the calibrated joint placements."""
-        return self.chain.model
+        """Pinocchio model of the calibrated URDF."""
+        return self.chain.urdf_alone.model
 
     @cached_property
     def nominal_refitted(self) -> Chain:

@@ -10,10 +10,12 @@ import numpy as np
 
 from .. import formatting
 from .._typing import Array
+from ..estimation.bare_geometry import fit_bare_geometry
 from ..estimation.initialization import fit_frames
 from ..estimation.problem import Problem, UnfactoredSystem, uses_normal_equations
 from ..estimation.solver import remaining_change
 from ..identifiability import explanations
+from ..io.origins_file import without_negligible_moves
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group
@@ -70,6 +72,7 @@ class Result(Evidence, ResultPlots):
             x=np.zeros_like(self.x),
             chain=self.nominal_refitted,
             shrinkage_factor=0.0,
+            bare=None,
             is_kept_nominal=True,
             decision=self.verdict,
         )
@@ -194,8 +197,13 @@ def make_result(
         # Rank and null space need the R factor of the rows.
         solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
     x = shrinkage_factor * fit.solution.x
+    bare = None
     if shrinkage_factor:
         calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
+        bare = fit_bare_geometry(errors, x, calibrated, fit.without_rejected().data)
+        if bare:
+            origins = without_negligible_moves(bare.chain).origins
+            calibrated = replace(calibrated, urdf_origins=origins).with_current_loads()
     else:
         calibrated = fit_frames(errors, fit.data, problem.known)
     return Result(
@@ -209,4 +217,5 @@ def make_result(
         method=method,
         weights=fit.weights,
         shrinkage_factor=shrinkage_factor,
+        bare=bare,
     )

@@ -88,13 +88,20 @@ def before_and_after(comparison: Comparison, group: str) -> tuple[Quantity, Quan
     return statistic(comparison.before.groups[group]), statistic(comparison.after.groups[group])
 
 
+def urdf_alone(comparison: Comparison, group: str) -> Quantity | None:
+    """Return the RMS error of a group with the URDF alone; None if the sidecar has no errors of the arm."""
+    return statistic(comparison.after_alone.groups[group]) if comparison.after_alone else None
+
+
 def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
     """Make a table of the error statistics before and after a calibration, in mm and mrad."""
     rows = []
     for c in comparisons:
         for group, after in c.after.groups.items():
             error = f"{ERROR_GROUPS[group].label},{SMALL_UNITS[after.unit][1]}"
-            for state, side in (("before", c.before), ("after", c.after)):
+            for state, side in (("before", c.before), ("after", c.after), ("URDF alone", c.after_alone)):
+                if side is None:
+                    continue
                 errors = side.groups[group]
                 values = [getattr(errors, key) for key in STATISTIC_LABELS]
                 axes_rms = errors.axes_rms or ()
@@ -142,6 +149,8 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     clean = best.after_without_outliers.groups.get(group)
     if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
         text += f", {statistic(clean)} without {_count_outliers(best.n_outliers)}"
+    if alone := urdf_alone(best, group):
+        text += f", {alone} with the URDF alone"
     text += f". {_count_outliers(best.n_rejected).capitalize()} rejected." if best.n_rejected else "."
     if best.title == "fitted":
         text = f"No hold-out samples. {text}"
@@ -180,8 +189,10 @@ def generalization_lines(
     def describe(comparison: Comparison | None, reason: str, rest: str = "") -> str:
         if comparison is None:
             return f"cannot be said, {reason}."
-        before, after = before_and_after(comparison, next(iter(comparison.after.groups)))
-        return f"{before} before, {after} after{rest}."
+        group = next(iter(comparison.after.groups))
+        before, after = before_and_after(comparison, group)
+        alone = urdf_alone(comparison, group)
+        return f"{before} before, {after} after{f', {alone} with the URDF alone' if alone else ''}{rest}."
 
     return (
         f"{region}: {describe(*inside)}",

@@ -94,8 +94,8 @@ def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> 
 
 
 def origin_table(chain: Chain) -> Table:
-    """Make a table of the origins of all joints that moved, before and after, as in the URDF."""
-    changed, _ = joint_origins(without_negligible_moves(chain))
+    """Make a table of the origins of all joints that moved, before and after, as the URDF has them."""
+    changed, _ = joint_origins(without_negligible_moves(chain.urdf_alone))
     rows = []
     for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
         if joint.name not in changed:
@@ -122,7 +122,7 @@ def _numbers(values: Array) -> str:
 
 def origins_text(chain: Chain) -> str:
     """Return the CSV text of the origins of all joints on the path to the tip."""
-    changed, _ = joint_origins(without_negligible_moves(chain))
+    changed, _ = joint_origins(without_negligible_moves(chain.urdf_alone))
     lines = ["joint," + ",".join(f"{key}[{'m' if key in 'xyz' else 'rad'}]" for key in ORIGIN_KEYS)]
     for joint, _ in path_between(chain.urdf, chain.root, chain.tip):
         origin = changed.get(joint.name, joint.origin)

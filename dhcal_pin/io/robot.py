@@ -15,6 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
+from .. import se3
 from .._typing import PathLike
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
@@ -31,9 +32,11 @@ from .dh_file import convert_to_dh, read_dh
 from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
+from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_additions, with_sidecar
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
+# Smaller entries of an addition to a joint origin are rounding errors [m or rad].
+ADDITION_TOL = 1e-14
 # Largest difference between the poses of a chain and of its written URDF, relative to the largest entry of
 # the poses or 1.
 READ_BACK_TOL = 1e-12
@@ -182,7 +185,7 @@ def convert_robot(
         if source_format is None or source_format.read_urdf is not None:
             return _copy_of_urdf(source, target)
     chain, table = _read(source, tip, None)
-    return robot_format.convert(RobotSource(os.fspath(source), chain, table, convention), target)
+    return robot_format.convert(RobotSource(os.fspath(source), chain.urdf_alone, table, convention), target)
 
 
 def urdf_files(
@@ -196,26 +199,36 @@ def urdf_files(
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
-    An origin that moved by less than `origins_file.MIN_MOVE` keeps its text. The URDF is parsed again and
+    The URDF has the origins that are best without the sidecar, which has what the complete model adds to
+    them. An origin that moved by less than `origins_file.MIN_MOVE` keeps its text. Both are read again and
     compared with the chain. A sidecar is needed only for a base, a tool, a payload, joint errors, instrument
     parameters, an uncertainty or a measured region. One that exists already is always replaced, because it
     would be read with the new URDF.
     """
-    chain = without_negligible_moves(chain)
-    origins, tool = joint_origins(chain)
-    data = with_origins(chain.urdf, origins)
-    parsed = Chain.from_urdf(parse_urdf(data, os.fspath(path)), chain.tip, chain.root)
+    alone = without_negligible_moves(chain.urdf_alone)
+    complete = chain if chain.urdf_origins is not None else replace(chain, origins=alone.origins)
+    data = with_origins(chain.urdf, joint_origins(alone)[0])
+    urdf = parse_urdf(data, os.fspath(path))
+    moved, tool = joint_origins(replace(complete, urdf=urdf))
+    added = {
+        urdf.joint(name).child: se3.inverse(urdf.joint(name).origin) @ origin
+        for name, origin in (moved if chain.urdf_origins is not None else {}).items()
+    }
+    additions = {name: pose for name, pose in added.items() if np.abs(pose - np.eye(4)).max() > ADDITION_TOL}
     written = replace(
-        parsed,
+        Chain.from_urdf(urdf, chain.tip, chain.root),
         base=chain.base,
         tool=tool,
         payload=chain.payload,
         reference_temperature=chain.reference_temperature,
     )
+    chain = complete
     if chain.transmission is not None:
         # The torque of gravity on the joints follows from the masses of the written URDF.
         transmission = replace(chain.transmission, loads=written.loads)
         chain, written = chain.with_transmission(transmission), written.with_transmission(transmission)
+    if additions:
+        written = with_additions(written, additions, os.fspath(path))
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_READ_BACK_SAMPLES, chain.n_joints))
     poses = chain.poses(q)
     difference = np.abs(written.poses(q) - poses).max()
@@ -228,7 +241,7 @@ def urdf_files(
     contents: dict[PathLike, str | bytes] = {path: data}
     is_replaced = existing_sidecar(path) is not None
     sidecar = sidecar_text(
-        chain, tool, data, instrument, uncertainty, measured_region, rig, required=is_replaced
+        chain, tool, data, instrument, uncertainty, measured_region, rig, additions, required=is_replaced
     )
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar

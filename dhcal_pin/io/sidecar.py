@@ -10,6 +10,10 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
 
     [tool]                             # pose of the measured point in the tip frame; keys as in [base]
 
+    [link.forearm_link]                # what the complete model adds to the origin of the joint
+    xyz_m = [1e-4, 0.0, 0.0]           # before the link, in the frame of that origin
+    rotvec_rad = [0.0, 0.0, 2e-4]
+
     [payload]                          # point mass at the tip
     mass_kg = 5.0
     centre_m = [0.0, 0.0, 0.08]
@@ -100,6 +104,7 @@ from ..robot.transmission import (
     split_coefficients,
 )
 from ..robot.urdf import Urdf, parse_urdf, suggest_names
+from ..robot.urdf_edit import with_origins
 from ..saving import complete_interrupted_save
 from . import toml_table as toml
 from .rig_file import rig_content
@@ -171,6 +176,7 @@ _FRAME_KEYS = {
     "tip": toml.text(is_optional=True),
     "base": toml.table_of(toml.POSE_KEYS),
     "tool": toml.table_of(toml.POSE_KEYS),
+    "link": toml.table_by_name(toml.table_of(toml.POSE_KEYS)),
     "payload": toml.table_of(_PAYLOAD_KEYS),
     "manifest": toml.table_of(_MANIFEST_KEYS),
 }
@@ -199,6 +205,10 @@ _LINE_LENGTH = 76
 _HEADER = """\
 # What the URDF cannot hold. base: pose of the robot's base link in the measuring frame.
 # tool: pose of the measured point in the tip frame. Metres; rotation vectors in radians.
+"""
+_LINK_HEADER = """\
+# link: what the complete model adds to the origin of the joint before each link, in the frame of that origin.
+# The URDF alone is the best robot without this file; with it, robot and file are the calibrated model.
 """
 _JOINT_HEADER = """\
 # joint: what is added to the commanded position q of a joint, by q and the torque of gravity. harmonics:
@@ -267,7 +277,23 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
         chain = replace(chain, reference_temperature=_REFERENCE.read(links[THERMAL], "reference_degc"))
     if joints is not None or links:
         chain = chain.with_transmission(_read_transmission(chain, joints, links))
-    return chain
+    additions = {name: toml.pose_of(pose) for name, pose in read["link"].items()}
+    return with_additions(chain, additions, table.where) if additions else chain
+
+
+def with_additions(chain: Chain, additions: Mapping[str, Array], where: str) -> Chain:
+    """Return the complete model of a chain as its URDF describes it, from the table [link]."""
+    urdf = chain.urdf
+    before = {joint.child: joint for joint in urdf.joints}
+    for name in additions:
+        if name not in before:
+            raise UnknownNameError(
+                f"{where}: [link] has {quote(name)}, no link with a joint before it; "
+                f"{suggest_names(name, before)}"
+            )
+    origins = {before[name].name: before[name].origin @ pose for name, pose in additions.items()}
+    complete = Chain.from_urdf(parse_urdf(with_origins(urdf, origins), urdf.source), chain.tip, chain.root)
+    return replace(chain, origins=complete.origins, urdf_origins=chain.origins)
 
 
 def read_tool(path: PathLike) -> Array:
@@ -475,11 +501,13 @@ def sidecar_text(
     uncertainty: Uncertainty | None = None,
     measured_region: MeasuredRegion | None = None,
     rig: MountedRig | None = None,
+    additions: Mapping[str, Array] | None = None,
     *,
     required: bool = False,
 ) -> str | None:
     """Return the text of the sidecar of a calibrated robot."""
     tables = {
+        "link": {name: toml.pose_content(pose) for name, pose in (additions or {}).items()},
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),
         **_link_content(chain),
@@ -493,6 +521,7 @@ def sidecar_text(
     if not (required or tables or has_frames):
         return None
     header = _HEADER
+    header += _LINK_HEADER if "link" in tables else ""
     header += _JOINT_HEADER if "joint" in tables else ""
     header += _THERMAL_HEADER if THERMAL in tables else ""
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""

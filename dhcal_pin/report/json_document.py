@@ -10,10 +10,10 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from ..calibration.cross_validation import Generalization
-from ..calibration.evaluation import Comparison, accuracy
+from ..calibration.evaluation import Accuracy, Comparison, accuracy
 from ..calibration.result import Result
 from ..calibration.verdict import Verdict
 from ..estimation import qr
@@ -22,6 +22,8 @@ from ..robot.chain import Chain
 from ..session import Session
 from .provenance import versions
 
+# Model that an accuracy after a calibration holds for: the complete one, or the URDF without its sidecar.
+_Model = Literal["after", "alone"]
 # Keys of an accuracy and of a parameter; further values are under `comparisons` and `priors`.
 _ACCURACY = re.compile("(?!.*_axes_).+_(rms_m|max_m|rms_rad)|residual_(rms|max)|unit")
 _PARAMETER = "name unit nominal value std observability posterior_to_prior_std fixed frame direction".split()
@@ -58,11 +60,10 @@ def result_to_dict(
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
         "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
-        "before": main_statistics(fitted.before),
-        "after": main_statistics(fitted.after),
-        "holdout_before": main_statistics(holdout.before) if holdout else {},
-        "holdout_after": main_statistics(holdout.after) if holdout else {},
+        **_accuracies(fitted, holdout, "after"),
         **generalization_to_dict(fit.generalization if is_calibration else None),
+        "urdf_alone": _accuracies(fitted, holdout, "alone")
+        | _generalization_accuracies(fit.generalization if is_calibration else None, "alone"),
         "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
         "parameters": parameter_rows(fit),
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
@@ -89,15 +90,39 @@ def session_to_dict(session: Session | None) -> dict[str, Any]:
     return session.to_dict()
 
 
-def generalization_to_dict(known: Generalization | None) -> dict[str, Any]:
-    """Return the accuracy on configurations that are not fitted."""
+def _accuracies(fitted: Comparison, holdout: Comparison | None, model: _Model) -> dict[str, Any]:
+    """Return the accuracy on fitted and held-out samples, of the complete model or of the URDF alone."""
+    return {
+        "before": main_statistics(fitted.before),
+        "after": main_statistics(_after(fitted, model)),
+        "holdout_before": main_statistics(holdout.before) if holdout else {},
+        "holdout_after": main_statistics(_after(holdout, model)) if holdout else {},
+    }
+
+
+def _after(comparison: Comparison, model: _Model) -> Accuracy:
+    """Return the accuracy after a calibration; without joint errors the URDF alone is the complete model."""
+    return (comparison.after_alone if model == "alone" else None) or comparison.after
+
+
+def _generalization_accuracies(known: Generalization | None, model: _Model) -> dict[str, Any]:
+    """Return the accuracy on configurations that are not fitted, of the complete model or the URDF alone."""
     out: dict[str, Any] = {}
     for key, name in (("cross_validated", "cross_validated"), ("holdout_region", "region_holdout")):
         comparison: Comparison | None = getattr(known, name, None)
         out[f"{key}_before"] = main_statistics(comparison.before) if comparison else None
-        out[f"{key}_after"] = main_statistics(comparison.after) if comparison else None
-        out[f"{key}_reason"] = getattr(known, f"{name}_reason", "")
-    return out | {name: getattr(known, name, None) for name in ("covered_share", "reached_share")}
+        out[f"{key}_after"] = main_statistics(_after(comparison, model)) if comparison else None
+    return out
+
+
+def generalization_to_dict(known: Generalization | None) -> dict[str, Any]:
+    """Return the accuracy on configurations that are not fitted, and what it says about joint space."""
+    return {
+        **_generalization_accuracies(known, "after"),
+        "cross_validated_reason": getattr(known, "cross_validated_reason", ""),
+        "holdout_region_reason": getattr(known, "region_holdout_reason", ""),
+        **{name: getattr(known, name, None) for name in ("covered_share", "reached_share")},
+    }
 
 
 def validation_to_dict(

@@ -107,6 +107,8 @@ class Chain:
         reference_temperature: Temperature at which the links have their lengths [°C].
         first_link: Name of the link where the chain begins; empty for the root of the URDF.
         n_reversed: Number of joints at the begin of the chain that are passed from child to parent.
+        urdf_origins: Origins, shaped like `origins`, that describe the robot best without its transmission
+            errors, and that its URDF has; None if they are `origins`.
     """
 
     urdf: Urdf
@@ -128,6 +130,7 @@ class Chain:
     reference_temperature: float = REFERENCE_TEMPERATURE
     first_link: str = ""
     n_reversed: int = 0
+    urdf_origins: Array | None = None
 
     @classmethod
     def from_urdf(
@@ -216,6 +219,12 @@ class Chain:
     def nominal(self) -> Chain:
         """Return the chain between the same links as the URDF describes it, with identity base and tool."""
         return Chain.from_urdf(self.urdf, self.tip, self.root)
+
+    @property
+    def urdf_alone(self) -> Chain:
+        """The chain that the URDF describes without its sidecar, with the base and the tool of this chain."""
+        origins = self.origins if self.urdf_origins is None else self.urdf_origins
+        return replace(self, origins=origins, transmission=None, urdf_origins=None)
 
     def origin_frame(self, j: int) -> int:
         """Return the index of the error frame at the URDF origin of the moving joint j, 1 to k.
@@ -367,10 +376,10 @@ class Chain:
         return replace(self, payload=payload).with_current_loads()
 
     def with_current_loads(self) -> Chain:
-        """Return a copy whose transmission uses the gravity loads of its joint origins and payload."""
+        """Return a copy whose transmission uses the gravity loads of its URDF and payload."""
         if self.transmission is None:
             return self
-        return self.with_transmission(replace(self.transmission, loads=self.loads))
+        return self.with_transmission(replace(self.transmission, loads=self.urdf_alone.loads))
 
     @cached_property
     def axis_frames(self) -> Array:
@@ -695,6 +704,8 @@ class Chain:
             "_urdf_from_body": self._urdf_from_body,
         }
         vars(chain).update(self.__getstate__(), **cached, **frames)
+        if "origins" in frames:
+            vars(chain)["urdf_origins"] = None
         return chain
 
 

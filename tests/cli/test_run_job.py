@@ -180,8 +180,8 @@ def test_accuracy_within_and_beyond_the_measured_region(run, robot_folder):
     shown = [float(row[i]) for row in rows for i in (-4, -2)]
     expected = [1e3 * value for value in figures.values()]
     assert shown == pytest.approx(expected, rel=0.05)
-    assert "position in the measured region  60 cross-validated" in err
-    assert f"Measured region: {format_share(document['covered_share'])} of joint space." in err
+    assert "position inside   60 cross-validated" in err
+    assert f"Inside: the measured region, {format_share(document['covered_share'])} of joint space." in err
 
 
 def test_regions_are_left_out_of_complete_calibrations(run, robot_folder):
@@ -197,7 +197,7 @@ def test_regions_are_left_out_of_complete_calibrations(run, robot_folder):
         assert document[stage]["position_rms_m"] == pytest.approx(plain[stage]["position_rms_m"], rel=0.05)
     assert document["holdout_region_after"] != plain["holdout_region_after"]
     assert document["comparisons"][0]["title"] == "region hold-out"
-    assert "position outside of it left-out regions" in " ".join(err.split())
+    assert "position outside left-out regions" in " ".join(err.split())
     assert "regions of joint space in turn" in Path("report.md").read_text()
 
 
@@ -449,7 +449,7 @@ def test_the_screen_names_the_error_of_images(run, robot_folder):
     err = run(
         "calibrate", "arm.dh.toml", "a.csv", "--rig", "a.rig.toml", "-o", "out.urdf", "--extend", "none"
     )[2]
-    assert "image error in the measured region" in " ".join(err.split())
+    assert "image error inside" in " ".join(err.split())
     assert "pixels in the" not in err
 
 

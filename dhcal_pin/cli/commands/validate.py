@@ -83,6 +83,9 @@ class Judged(NamedTuple):
     fit: Result | None  # Fit of base and tool, on request
     before: Accuracy
     accuracies: dict[str, Accuracy]  # Accuracy by the name of the model; the last one is that of `chain`
+    alone: (
+        Accuracy  # Accuracy of the URDF without the sidecar, with base and tool fitted if it has joint errors
+    )
     reference: tuple[Chain, Mapping[str, float]] | None = None  # Nominal robot and its instrument parameters
     remarks: Sequence[str] = ()
 
@@ -204,11 +207,17 @@ def _judge(args: Namespace, given: Given) -> Judged:
     chain, data, known = given.chain, given.data, given.known
     before = accuracy(chain, data, known)
     name = "fitted to these images" if _unstated_entries(given.rig) else "base and tool as given"
-    judged = Judged(chain, known, None, before, {name: before})
+    accuracies, alone = {name: before}, before
+    if chain.error_families:
+        alone = fit_frames(chain.urdf_alone, data, known).comparisons[-1].after
+        accuracies = {"URDF alone, base and tool fitted": alone, name: before}
+    judged = Judged(chain, known, None, before, accuracies, alone)
     if args.fit_frames:
         fit = fit_frames(chain, data, known)
-        accuracies = {name: before, "base and tool fitted": fit.comparisons[-1].after}
-        judged = Judged(fit.chain, known | fit.instruments, fit, before, accuracies)
+        after = fit.comparisons[-1].after
+        accuracies = accuracies | {"base and tool fitted": after}
+        alone = alone if chain.error_families else after
+        judged = Judged(fit.chain, known | fit.instruments, fit, before, accuracies, alone)
     if not args.nominal:
         return judged
     nominal, reference, remarks = _nominal_accuracy(judged.chain, data, judged.known, args)
@@ -224,7 +233,8 @@ def _document(report: Validation, judged: Judged) -> dict[str, Any]:
         document = result_to_dict(judged.fit, {}, report.inputs, is_calibration=False)
     else:
         document = validation_to_dict(report.chain, report.data, report.inputs, report.known)
-    return document | {"before": main_statistics(judged.before)}
+    before, alone = main_statistics(judged.before), main_statistics(judged.alone)
+    return document | {"before": before, "urdf_alone": {"before": before, "after": alone}}
 
 
 def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str]:

@@ -162,22 +162,26 @@ def _count_outliers(rows: list[int], item: Measurement) -> str:
 def _accuracy_blocks(fit: Result) -> list[Block]:
     """Describe the accuracy within the measured region and outside it, before and after."""
     covered, reached = fit.generalization.covered_share, fit.generalization.reached_share
-    places, rows, sentences = ("in the measured region", "outside of it"), [], []
+    labels, places = ("inside", "outside"), ("in the measured region", "outside of it")
     if covered is None or reached is None:
-        places = ("among the measured poses", "outside of them")
-    for place, (comparison, reason) in zip(
-        places, summary.judged_regions(fit.generalization, fit.comparisons), strict=True
+        labels = places = ("among the measured poses", "outside of them")
+    rows, sentences = [], []
+    for label, place, (comparison, reason) in zip(
+        labels, places, summary.judged_regions(fit.generalization, fit.comparisons), strict=True
     ):
         if comparison:
-            rows += _accuracy_rows(comparison, place)
+            rows += _accuracy_rows(comparison, label)
         else:
             sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
     if rows and covered is not None and reached is not None:
         sentences.append(
-            f"Measured region: {summary.format_share(covered)} of joint space. "
+            f"Inside: the measured region, {summary.format_share(covered)} of joint space. "
             f"Accuracy unknown: {summary.format_share(1 - reached)} of joint space."
         )
-    table = Table(["RMS error", "judged on", "before", "after"], rows, 2)
+    if fit.bare:
+        sentences.append("URDF alone: without its sidecar, as other programs read it.")
+    header = ["RMS error", "judged on", "before", "after", *(["URDF alone"] if fit.bare else [])]
+    table = Table(header, rows, 2)
     return [
         Block(table, noun="figure", rank=7, n_kept=len(rows), has_space=True),
         Block(sentences),
@@ -192,7 +196,9 @@ def _accuracy_rows(comparison: Comparison, place: str) -> Iterator[list[str | Qu
         judged = "left-out regions" if is_region else f"{after.samples} {comparison.title}"
         errors = ERROR_GROUPS[group]
         name = errors.name if errors.is_vector else errors.label
-        yield [f"{name} {place}", judged, *summary.before_and_after(comparison, group)]
+        alone = summary.urdf_alone(comparison, group)
+        sides = (*summary.before_and_after(comparison, group), *([alone] if alone else []))
+        yield [f"{name} {place}", judged, *sides]
 
 
 def _correction_block(fit: Result) -> Block:
