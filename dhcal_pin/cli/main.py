@@ -33,6 +33,7 @@ COMMANDS = (
     Command("plan", "plan", "choose the poses to measure and predict the resulting accuracy"),
     Command("simulate", "simulate", "simulate measurements of a robot with known errors"),
     Command("compensate", "compensate", "compute joint values and targets that correct the errors"),
+    Command("export", "export", "write the calibrated model as C or Python code for other programs"),
     Command("detect", "detect", "find the corners of boards in images and write their image coordinates"),
     Command("board", "board", "draw a board to print, at its true scale"),
     Command("app", "app", "serve a page on this computer that calibrates a robot from dropped files"),

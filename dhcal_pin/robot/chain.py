@@ -471,6 +471,13 @@ class Chain:
             return of_temperature if growth is None else growth + of_temperature
         return growth
 
+    @property
+    def growth_vectors(self) -> Array:
+        """Motion of each link's end per relative growth, in the axes of its body, shape (k+1, 3) [m]."""
+        axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
+        loads = self.loads if self.transmission is None else self.transmission.loads
+        return (axes @ loads.link_vectors[..., None])[..., 0]
+
     def growth_motions(self, frames: FrameBatch) -> Array:
         """Compute the tool twist per relative growth of each link, shape (k+1, 6, m).
 
@@ -478,10 +485,7 @@ class Chain:
         behind a link along the link; it turns nothing. A link grows in front of the next joint, the last one
         behind the motion of the last joint, in front of all errors of its own.
         """
-        axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
-        loads = self.loads if self.transmission is None else self.transmission.loads
-        vectors = (axes @ loads.link_vectors[..., None])[..., 0]
-        linear = np.einsum("ja,jacm->jcm", vectors, frames.columns[:, :3])
+        linear = np.einsum("ja,jacm->jcm", self.growth_vectors, frames.columns[:, :3])
         return np.concatenate([linear, np.zeros_like(linear)], 1)
 
     def _require_link(self, link: str) -> None:

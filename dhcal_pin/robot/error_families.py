@@ -8,8 +8,8 @@ conditions of a sample. There are four types of coefficients, see `transmission`
 - joint terms: one function per joint, with one coefficient per joint;
 - link terms: one function of the sample, with one coefficient per link, which changes the length of the link.
 
-To add a family with a joint term or a link term: write a row with its function, and the same as a formula in
-JavaScript for the viewer.
+To add a family with a joint term or a link term: write a row with its function, and the same as a formula. The
+3-D page and the exported models evaluate the formula, see `Term`.
 
 Shapes: m samples, n independent joints, k moving joints, K orders of harmonics, f families of joint terms, g
 families of link terms.
@@ -96,7 +96,7 @@ class Coefficient(NamedTuple):
         owner: Number of the joint that it moves, or of the link that it makes longer.
         name: Name, after that of the joint or link.
         unit: Unit.
-        formula: Its term in JavaScript; see `Term`.
+        formula: Its term as a formula; see `Term`.
     """
 
     entry: int
@@ -113,12 +113,15 @@ class Term:
     Attributes:
         coefficient: Name of the coefficient, after the name of its joint or link.
         unit: Unit of the coefficient.
-        formula: The function of joint `{i}` in JavaScript, by which the 3-D page draws it: of the positions
-            `q` of all joints and their gravity torques `torques()`. It is "0" if the page does not know the
-            condition. Links are drawn without growth.
+        formula: The function of joint `{i}`, or that of all links, as an expression that means the same in
+            JavaScript, C and Python. It may use `sin`, `cos`, the positions `q` of all joints, their gravity
+            torques `torque`, the directions `approach`, `temperature` and `reference_temperature`. On the 3-D
+            page joints have no direction, and the links do not grow.
         evaluate: Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link
             term, whose value is the same for all links.
         has_effect: Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
+        derivative: Derivative of the formula by the position of joint `{j}`, which may also use the derivatives
+            `torque_by_q` of the torques; "0" for a term that does not depend on q, as all link terms.
     """
 
     coefficient: str
@@ -126,6 +129,7 @@ class Term:
     formula: str
     evaluate: Callable[[Conditions, ArmProperties], Array]
     has_effect: Callable[[ArmProperties], Array]
+    derivative: str = "0"
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ class ErrorFamily:
             ]
         numbers = indices.harmonics.tolist()
         return [
-            Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad", f"Math.{function}({k} * q[{i}])")
+            Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad", f"{function}({k} * q[{i}])")
             for i in joints
             for k in self.orders
             for part, function in enumerate(("sin", "cos"))
@@ -309,7 +313,9 @@ FAMILIES = {
             _UNIVERSAL,
             1e-4,
             "compliance_rad_per_nm",
-            joint_term=Term("compliance", "rad/Nm", "torques()[{i}]", _torques, _is_loaded),
+            joint_term=Term(
+                "compliance", "rad/Nm", "torque[{i}]", _torques, _is_loaded, "torque_by_q[{i}][{j}]"
+            ),
         ),
         ErrorFamily(
             COUPLING,
@@ -327,7 +333,7 @@ FAMILIES = {
             _OF_A_CONDITION,
             3e-3,
             "backlash_rad",
-            joint_term=Term("backlash", "rad", "0", _half_direction, _all_joints),
+            joint_term=Term("backlash", "rad", "-0.5 * approach[{i}]", _half_direction, _all_joints),
             condition="approach",
         ),
         ErrorFamily(
@@ -337,7 +343,9 @@ FAMILIES = {
             _OF_A_CONDITION,
             2e-5,
             "per_kelvin",
-            link_term=Term("thermal", "1/K", "0", _temperature_rise, _has_length),
+            link_term=Term(
+                "thermal", "1/K", "temperature - reference_temperature", _temperature_rise, _has_length
+            ),
             condition="temperature",
         ),
     )

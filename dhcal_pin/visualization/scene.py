@@ -352,14 +352,15 @@ def _joint_errors(chain: Chain) -> str:
     for family in chain.error_families:
         for coefficient in [] if family.link_term else family.coefficients(chain, indices):
             value = values[coefficient.entry].item()
-            if value and coefficient.formula != "0":
+            if value:
                 errors[coefficient.owner].append(f"{value!r} * {coefficient.formula}")
-    return f"(q, torques) => [{', '.join(map(' + '.join, errors))}]"
+    conditions = "{ q, torque, approach, temperature, reference_temperature }"
+    return f"({conditions}) => [{', '.join(map(' + '.join, errors))}]"
 
 
 def _gravity_bodies(chain: Chain) -> list[dict[str, Any]]:
-    """Return the bodies whose weight loads the joints: weight [N], centre of mass and joint of each."""
-    if chain.transmission is None:
+    """Return the bodies whose weight loads compliant joints: weight [N], centre of mass and joint of each."""
+    if chain.transmission is None or not chain.transmission.has_compliance:
         return []
     model = chain.transmission.loads.model
     moving = {model.getJointId(name): j for j, name in enumerate(chain.moving_joints)}

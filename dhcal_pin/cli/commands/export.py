@@ -1,0 +1,40 @@
+"""`dhcal export`: write the model of a robot as source code for other programs."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+
+from ..options import ROBOT, add_urdf_options
+
+EXAMPLE = "dhcal export ur10_calibrated.urdf --tip tool0 -o model.h"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal export`."""
+    parser.add_argument("robot", **ROBOT)
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="file to write: NAME.h, a C99 header without dependencies, whose functions begin with NAME_, or "
+        "NAME.py, a Python module that needs NumPy only",
+    )
+    add_urdf_options(parser)
+
+
+def run(args: Namespace) -> int:
+    """Write the source code."""
+    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
+    from ...model_code import model_code, require_code_ending
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block
+    from ..screens.screen import Screen
+
+    require_code_ending(args.output)
+    require_writable_outputs([args.output], [args.robot, *existing_sidecars([args.robot])])
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    write_outputs({args.output: model_code(chain, args.output)})
+    console.show(Screen([files_block([args.output])]), args.verbosity)
+    return 0
