@@ -251,7 +251,7 @@ def _python_constants(constants: _Constants, prefix: str) -> str:
 def _c_names(names: Sequence[str]) -> str:
     """State names in C, with all bytes but letters, digits and some signs as octal numbers."""
     texts = (re.sub(rb"[^\w .-]", lambda match: b"\\%03o" % match[0][0], name.encode()) for name in names)
-    return "{" + ", ".join(f'"{text.decode()}"' for text in texts) + "}"
+    return "{\n        " + ",\n        ".join(f'"{text.decode()}"' for text in texts) + "}"
 
 
 LANGUAGES = {

@@ -91,13 +91,13 @@ def python_model(chain: Chain, folder: Path) -> ModuleType:
 
 
 def _pointer(values: np.ndarray | None) -> ctypes.c_void_p | None:
-    return None if values is None else ctypes.c_void_p(values.ctypes.data)
+    return None if values is None else values.ctypes.data_as(ctypes.c_void_p)
 
 
 class CModel:
     """Model in C with the functions of the model in Python, for one sample."""
 
-    def __init__(self, chain: Chain, folder: Path, compiler: str = "gcc", optimization: str = "-O1"):
+    def __init__(self, chain: Chain, folder: Path, compiler: str = "gcc", optimization: str = "-O0"):
         self.n = chain.n_joints
         self.defaults = chain.reference_temperature, chain.payload.mass if chain.payload else 0.0
         (folder / "model.h").write_text(model_code(chain, "model.h"), encoding="utf-8")
