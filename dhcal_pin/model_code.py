@@ -1,21 +1,21 @@
 """Source code of a robot's model for other programs: a C header, or a Python module that needs NumPy only.
 
-The code computes the pose of the tip in the frame of the base link with all joint errors, its body Jacobian by the
-commanded joint positions, and joint positions for a pose. Base and tool are constants of it, with functions between
-the tip and the measured point. The ending of the file name selects the language; `model_code.h.in` and
-`model_code.py.in` are the templates.
+The code computes the pose of the tip in the frame of the base link with all joint errors, its body Jacobian
+by the commanded joint positions, and joint positions for a pose. Base and tool are constants of it, with
+functions between the tip and the measured point. The ending of the file name selects the language, one row
+of `LANGUAGES` with its template.
 
-Joint terms and link terms are the formulas in the rows of `robot.error_families`. The actual joint positions q + Δ(q)
-have the derivatives
+Joint terms and link terms are the formulas in the rows of `robot.error_families`. The actual joint
+positions q + Δ(q) of `robot.transmission` have the derivatives
 
     ∂q_i/∂q_j = δ_ij + A_ij + δ_ij·Σ_k k·(S_ki·cos(k·q_i) - C_ki·sin(k·q_i)) + Σ_f c_fi·∂t_fi/∂q_j.
 
-The derivative of compliance is that of the gravity torques. With the first moment m_j of the mass M_j behind joint j,
-its axis z_j through p_j, and v_j = z_j × (m_j - M_j·p_j), the torque of joint j is g·v_j along the vertical, and its
-derivative by a joint i before it is g·(z_i × v_j).
+The derivative of compliance is that of the gravity torques. With the first moment m_j of the mass M_j
+behind joint j, its axis z_j through p_j, and v_j = z_j × (m_j - M_j·p_j), the torque of joint j is g times
+the vertical component of v_j. Its derivative by a joint i before it is g times that of z_i × v_j.
 
-Names are data of the robot file. They appear as literals that contain no other code, and in comments without
-special characters.
+Names are data of the robot file. They appear as literals in which every other character is escaped, and in
+comments without special characters.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata, resources
+from importlib import metadata
+from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -58,7 +59,7 @@ class Language:
         constants: Function that states the constants, whose names begin with a prefix.
         names: Function that states a list of names.
         torques: Statement that computes the gravity torques.
-        joint_term: Statement that adds a joint term; `{c}` is its array of coefficients, `{formula}` its formula.
+        joint_term: Statement that adds a joint term with its `{formula}`; `{name}`, `{NAME}`: its family.
         derivative: Statement that adds its derivative.
         link_term: Statement that adds a link term.
     """
@@ -99,7 +100,7 @@ def model_code(chain: Chain, path: PathLike) -> str:
         prefix = f"model_{prefix}".strip("_")
     transmission = chain.transmission or Transmission.zero(chain.loads)
     constants = _constants(chain, transmission)
-    template = resources.files(__package__).joinpath(language.template).read_text(encoding="utf-8")
+    template = Path(__file__).with_name(language.template).read_text(encoding="utf-8")
     plain = {"robot": chain.urdf.name, "root": chain.root, "tip": chain.tip}
     return Template(template).substitute(
         {key: re.sub(r"[^\w .-]", "_", name, flags=re.ASCII) for key, name in plain.items()},
@@ -137,7 +138,7 @@ def _constants(chain: Chain, transmission: Transmission) -> dict[str, Any]:
         "temperature": float(loads.reference_temperature),
         "linear": transmission.linear,
         "waves": transmission.harmonics[: max(transmission.order, 1)],
-        **{_identifier(name): values for name, _, values in _used_terms(transmission)},
+        **{name: values for name, _, values in _used_terms(transmission)},
         "growth_vectors": chain.growth_vectors,
         "base": chain.base,
         "tool": chain.tool,
@@ -148,8 +149,8 @@ def _constants(chain: Chain, transmission: Transmission) -> dict[str, Any]:
 def _weights(chain: Chain, loads: GravityLoads) -> tuple[dict[str, Array], Array, Array]:
     """Return the tree of the moving joints in the whole robot, and masses and first moments of its bodies.
 
-    Joints that are not on the chain stay at neutral. The order is that of Pinocchio: a joint is behind the one
-    that carries it, also where the chain passes joints from child to parent. The last body is the payload.
+    Joints that are not on the chain stay at neutral. The order is that of Pinocchio: a joint is behind the
+    one that carries it, also where the chain passes joints from child to parent. The payload is the last.
     """
     model = loads.model
     data = model.createData()
@@ -184,11 +185,6 @@ def _weights(chain: Chain, loads: GravityLoads) -> tuple[dict[str, Array], Array
     return tree, mass, moment
 
 
-def _identifier(name: str) -> str:
-    """Return the name of a family as an identifier."""
-    return name.replace("-", "_")
-
-
 def _used_terms(transmission: Transmission) -> list[tuple[str, Term, Array]]:
     """List families with a joint term or a link term that is not zero: name, term and coefficients."""
     rows = (*transmission.joint_terms, *transmission.link_terms)
@@ -201,17 +197,15 @@ def _terms(transmission: Transmission, language: Language) -> str:
     used = _used_terms(transmission)
     lines = [language.torques] if any("torque" in term.formula for _, term, _ in used) else []
     for name, term, _ in used:
-        statements = {language.link_term: term.formula}
+        statements = [(language.link_term, term.formula)]
         if name in JOINT_TERMS:
-            statements = {language.joint_term: term.formula, language.derivative: term.derivative}
+            statements = [(language.joint_term, term.formula), (language.derivative, term.derivative)]
         lines += [
-            statement.format(
-                name=_identifier(name), NAME=_identifier(name).upper(), formula=formula.format(i="i", j="j")
-            )
-            for statement, formula in statements.items()
+            statement.format(name=name, NAME=name.upper(), formula=formula.format(i="i", j="j"))
+            for statement, formula in statements
             if formula != "0"
         ]
-    return "".join(f"    {line}\n" for line in "\n".join(lines).splitlines())
+    return textwrap.indent("".join(f"{line}\n" for line in lines), "    ")
 
 
 def _literal(values: Any, brackets: str = "[]") -> str:

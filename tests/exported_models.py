@@ -11,8 +11,9 @@ from types import ModuleType
 
 import numpy as np
 
+from dhcal_pin import se3
 from dhcal_pin.model_code import model_code
-from dhcal_pin.robot import CONDITIONS, Chain, Conditions, Payload
+from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload
 from dhcal_pin.robot.transmission import Transmission, coefficient_indices, n_coefficients
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wvla"]
@@ -98,15 +99,13 @@ class CModel:
     """Model in C with the functions of the model in Python, for one sample."""
 
     def __init__(self, chain: Chain, folder: Path, compiler: str = "gcc", optimization: str = "-O0"):
-        self.n = chain.n_joints
+        self.n, self.compiler = chain.n_joints, compiler
         self.defaults = chain.reference_temperature, chain.payload.mass if chain.payload else 0.0
         (folder / "model.h").write_text(model_code(chain, "model.h"), encoding="utf-8")
         (folder / "wrapper.c").write_text(_WRAPPER, encoding="utf-8")
-        library = folder / "model.so"
+        library = folder / f"{compiler}{optimization}.so"
         options = [*STRICT, optimization, "-shared", "-fPIC"]
-        subprocess.run(
-            [compiler, *options, "wrapper.c", "-o", library.name, "-lm"], cwd=folder, check=True
-        )
+        subprocess.run([compiler, *options, "wrapper.c", "-o", library.name, "-lm"], cwd=folder, check=True)
         self.library = ctypes.CDLL(str(library))
 
     def _conditions(self, approach, temperature, payload):
@@ -117,17 +116,20 @@ class CModel:
         return np.array([*(np.zeros(self.n) if approach is None else approach), *rest])
 
     def forward_kinematics(self, q, approach=None, temperature=None, payload=None):
+        """Compute the pose of the tip."""
         pose, known = np.empty((4, 4)), self._conditions(approach, temperature, payload)
         self.library.place(_pointer(np.array(q, float)), _pointer(known), _pointer(pose))
         return pose
 
     def pose_and_jacobian(self, q, approach=None, temperature=None, payload=None):
+        """Compute the pose of the tip and the body Jacobian."""
         pose, jacobian = np.empty((4, 4)), np.empty((6, self.n))
         q, known = np.array(q, float), self._conditions(approach, temperature, payload)
         self.library.differentiate(_pointer(q), _pointer(known), _pointer(pose), _pointer(jacobian))
         return pose, jacobian
 
     def inverse_kinematics(self, target, start, approach=None, temperature=None, payload=None):
+        """Bring the tip to a target; return joint positions and whether they reach it."""
         target, q = np.ascontiguousarray(target, float), np.array(start, float)
         known = self._conditions(approach, temperature, payload)
         return q, bool(self.library.reach(_pointer(target), _pointer(known), _pointer(q)))
@@ -138,12 +140,15 @@ class CModel:
         return out
 
     def measured_point(self, pose):
+        """Compute the pose of the measured point."""
         return self._convert(self.library.point, pose)
 
     def tip_target(self, point):
+        """Compute the pose of the tip for a pose of the measured point."""
         return self._convert(self.library.target, point)
 
     def gravity_torques(self, q, payload=None):
+        """Compute the torques of gravity."""
         q, out = np.array(q, float), np.empty(self.n)
         mass = self.defaults[1] if payload is None else payload
         self.library.torques(_pointer(q), ctypes.c_double(mass), _pointer(out))
@@ -164,23 +169,19 @@ class CModel:
         return self.library.reach_many(_pointer(targets), _pointer(start.copy()), len(start))
 
 
-def with_joint_errors(chain: Chain, rng: np.random.Generator, families=None, scale: float = 1.0) -> Chain:
-    """Return a chain with all errors of some families, of all if None, of the size of their priors."""
-    from dhcal_pin.robot import FAMILIES
-
+def with_joint_errors(chain: Chain, rng: np.random.Generator, families=tuple(FAMILIES)) -> Chain:
+    """Return a chain with all errors of some families, of the size of their priors."""
     indices = coefficient_indices(*chain.mimic_matrix.shape)
     coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
     for name, family in FAMILIES.items():
-        if families is None or name in families:
+        if name in families:
             entries = [c.entry for c in family.coefficients(chain, indices)]
-            coefficients[entries] = scale * family.prior * rng.standard_normal(len(entries))
+            coefficients[entries] = family.prior * rng.standard_normal(len(entries))
     return chain.with_transmission(Transmission(coefficients, chain.loads))
 
 
 def with_payload_and_frames(chain: Chain, rng: np.random.Generator) -> Chain:
     """Return a chain with a payload, another reference temperature, base and tool."""
-    from dhcal_pin import se3
-
     base, tool = se3.exp6(rng.standard_normal((2, 6)))
     chain = replace(chain, reference_temperature=23.5, base=base, tool=tool)
     return chain.with_payload(Payload(2.5, (0.02, -0.03, 0.1)))

@@ -2,9 +2,9 @@
 
 Blocks of a page run in the order of the page, in a folder of their own with the files of the examples:
 
-- ```sh: commands `dhcal …`;
+- ```sh: commands `dhcal …`, and those of programs that the page compiles;
 - ```python: Python, one namespace per page;
-- ```toml and ```text that start with `# file: NAME`: written to this file.
+- ```toml, ```text and ```c that start with `# file: NAME` or `// file: NAME`: written to this file.
 
 Other blocks of text are not executed. A block of text behind a line `<!-- output: last N -->` shows the last
 N lines of the command before it; numbers may differ.
@@ -17,6 +17,7 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
 import textwrap
 import tomllib
 from collections.abc import Iterator
@@ -65,6 +66,15 @@ def page_name(path: Path) -> str:
 def run(command: str) -> None:
     """Run a command that must succeed."""
     assert main.main(shlex.split(command)) == 0, command
+
+
+def run_program(command: str) -> list[str]:
+    """Run a compiler or what it made, and return the lines that it prints."""
+    if shutil.which("gcc") is None:
+        pytest.skip("gcc is not installed")
+    return subprocess.run(
+        shlex.split(command), check=True, capture_output=True, text=True
+    ).stdout.splitlines()
 
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
@@ -138,17 +148,21 @@ def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=page_name)
 def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(shutil.copytree(examples, tmp_path / "page"))
+    monkeypatch.syspath_prepend(tmp_path / "page")
     # What a page adds to the tables of the package is removed after its test.
     monkeypatch.setattr(parameters, "PARAMETER_SETS", dict(parameters.PARAMETER_SETS))
     monkeypatch.setattr(sources, "FORMATS", sources.FORMATS)
     namespace: dict = {}
     output: list[str] = []
     for _, text, _ in blocks(page):
-        if name := re.match(r"# file: (\S+)\n", text):
+        if name := re.match(r"(?:#|//) file: (\S+)\n", text):
             Path(name[1]).write_text(text, encoding="utf-8")
     for language, text, before in blocks(page):
         if language == "sh":
             for line in text.replace("\\\n", " ").splitlines():
+                if line.startswith(("gcc ", "./")):
+                    output = run_program(line)
+                    continue
                 assert line.startswith("dhcal "), f"{line}: mark it as text, or begin it with dhcal"
                 capsys.readouterr()
                 status = main.main(shlex.split(line, comments=True)[1:])

@@ -19,10 +19,12 @@ from exported_models import (
     with_joint_errors,
     with_payload_and_frames,
 )
-from robots import paper, random_table, robot_file, with_masses
+from robots import random_table, robot_file, with_masses
 
 from dhcal_pin import se3
+from dhcal_pin.cli import main
 from dhcal_pin.exceptions import InvalidArgumentError
+from dhcal_pin.io import read_robot, write_urdf
 from dhcal_pin.model_code import model_code
 from dhcal_pin.robot import FAMILIES, Chain
 
@@ -85,8 +87,7 @@ def test_poses_and_derivatives_are_those_of_the_package(name, mimicking, tmp_pat
     )
     poses, jacobians = in_python.pose_and_jacobian(q, **known)
     np.testing.assert_array_equal(poses, in_python.forward_kinematics(q, **known))
-    slopes = differences(base_to_tip, conditions)
-    np.testing.assert_allclose(jacobians, slopes, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(jacobians, differences(base_to_tip, conditions), rtol=0, atol=1e-8)
     for i, row in enumerate(q):
         pose, jacobian = in_c.pose_and_jacobian(row, **of_sample(conditions, i))
         np.testing.assert_allclose(pose, wanted[i], rtol=0, atol=1e-12)
@@ -94,7 +95,7 @@ def test_poses_and_derivatives_are_those_of_the_package(name, mimicking, tmp_pat
         np.testing.assert_array_equal(pose, in_c.forward_kinematics(row, **of_sample(conditions, i)))
         np.testing.assert_allclose(in_c.forward_kinematics(row), plain[i], rtol=0, atol=1e-12)
         np.testing.assert_allclose(
-            in_c.gravity_torques(row, conditions.payload[i]), torques[i], rtol=0, atol=1e-12 * scale
+            in_c.gravity_torques(row, known["payload"][i]), torques[i], rtol=0, atol=1e-12 * scale
         )
 
 
@@ -260,3 +261,34 @@ def test_unknown_ending_is_refused():
 def test_the_same_robot_gives_the_same_text(mimicking):
     for path in ("model.h", "model.py"):
         assert model_code(arm("ur10", mimicking), path) == model_code(arm("ur10", mimicking), path)
+
+
+def test_command_writes_the_robot_with_its_sidecar(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    chain = with_joint_errors(
+        with_payload_and_frames(ur10(), np.random.default_rng(9)), np.random.default_rng(9)
+    )
+    write_urdf(chain, "arm.urdf")
+    assert main.main(["export", "arm.urdf", "--tip", "tool0", "-o", "model.py"]) == 0
+    read = read_robot("arm.urdf", "tool0")
+    assert Path("model.py").read_text() == model_code(read, "model.py")
+    assert {family.name for family in read.error_families} == set(FAMILIES)
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ("model.c", "model.c: unknown ending; choose from .h, .py"),
+        ("no/model.h", "no/model.h: "),
+        ("arm.py", "arm.py: is an input file"),
+    ],
+)
+def test_command_refuses_outputs_and_writes_nothing(output, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_bytes(ur10().urdf.data)
+    Path("arm.py").symlink_to("arm.urdf")
+    assert main.main(["export", "arm.urdf", "--tip", "tool0", "-o", output]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"dhcal: {message}")
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in Path().iterdir()) == ["arm.py", "arm.urdf"]

@@ -8,8 +8,8 @@ conditions of a sample. There are four types of coefficients, see `transmission`
 - joint terms: one function per joint, with one coefficient per joint;
 - link terms: one function of the sample, with one coefficient per link, which changes the length of the link.
 
-To add a family with a joint term or a link term: write a row with its function, and the same as a formula. The
-3-D page and the exported models evaluate the formula, see `Term`.
+To add a family with a joint term or a link term: write a row with its function, and the same as a formula.
+The 3-D page and exported models evaluate the formula, see `Term`. The name of such a family is an identifier.
 
 Shapes: m samples, n independent joints, k moving joints, K orders of harmonics, f families of joint terms, g
 families of link terms.
@@ -120,8 +120,8 @@ class Term:
         evaluate: Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link
             term, whose value is the same for all links.
         has_effect: Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
-        derivative: Derivative of the formula by the position of joint `{j}`, which may also use the derivatives
-            `torque_by_q` of the torques; "0" for a term that does not depend on q, as all link terms.
+        derivative: Derivative of the formula by the position of joint `{j}`; it may also use the derivatives
+            `torque_by_q` of the torques. It is "0" for a term that does not depend on q, as all link terms.
     """
 
     coefficient: str
