@@ -200,9 +200,9 @@ def make_result(
     bare = None
     if shrinkage_factor:
         calibrated = errors.at(x[: len(errors.parameters)]).with_current_loads()
-        bare = fit_bare_geometry(errors, x, calibrated, fit.without_rejected().data)
+        bare = fit_bare_geometry(errors, x, calibrated, fit.without_rejected().problem.data)
         if bare:
-            origins = without_negligible_moves(bare.chain).origins
+            origins = without_negligible_moves(bare.with_frames_of(calibrated)).origins
             calibrated = replace(calibrated, urdf_origins=origins).with_current_loads()
     else:
         calibrated = fit_frames(errors, fit.data, problem.known)

@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..measurements.measured_region import draw_joint_space
@@ -31,7 +32,7 @@ from .solver import minimize
 MAX_MEASURED, MAX_DRAWN = 600, 200
 # Weight of the joint space as a whole, relative to the measured configurations.
 JOINT_SPACE_WEIGHT = 0.01
-# Lever ℓ by which differences of the orientation count as distances [m].
+# Lever ℓ by which differences of the orientation count as distances, if no orientation was measured [m].
 LEVER = 0.1
 # Distance that counts as one [m]. It is far below the priors, which only hold what no pose depends on.
 UNIT = 1e-5
@@ -46,22 +47,32 @@ class BareGeometry:
         x: Identified geometric errors, shape (g,) [m or rad].
         configurations: Measured configurations, then those of the joint space, shape (m, n).
         weights: Weight of each of them, shape (m,).
+        lever: Lever ℓ by which differences of the orientation count as distances [m].
     """
 
     errors: ErrorModel
     x: Array
     configurations: Array
     weights: Array
+    lever: float
 
     @cached_property
     def chain(self) -> Chain:
         """Chain without joint errors, with the base and the tool that fit best."""
         return self.errors.at(self.x)
 
+    def with_frames_of(self, complete: Chain) -> Chain:
+        """Return the same model with base and tool of the complete one, and other outer joint origins."""
+        chain = self.chain
+        origins = chain.origins.copy()
+        origins[0] = se3.inverse(complete.base) @ chain.base @ origins[0]
+        origins[-1] = origins[-1] @ chain.tool @ se3.inverse(complete.tool)
+        return replace(chain, origins=origins, base=complete.base, tool=complete.tool)
+
     def refitted(self, complete: Chain) -> BareGeometry:
         """Fit the geometric errors to another complete model."""
         sigma = UNIT / np.sqrt(self.weights)[:, None] * np.ones(3)
-        poses = Pose(self.configurations, complete.poses(self.configurations), sigma, sigma / LEVER)
+        poses = Pose(self.configurations, complete.poses(self.configurations), sigma, sigma / self.lever)
         problem = Problem(self.errors, (poses,), 1 / self.errors.priors, {})
         return replace(self, x=minimize(problem, "lm", self.x).x)
 
@@ -69,7 +80,10 @@ class BareGeometry:
 def fit_bare_geometry(
     errors: ErrorModel, x: Array, complete: Chain, data: Sequence[Measurement]
 ) -> BareGeometry | None:
-    """Fit the geometry without joint errors to a complete model with the errors x; None if it has none."""
+    """Fit the geometry without joint errors to a complete model with the errors x; None if it has none.
+
+    Distances and angles have the weights that they have in the measurements.
+    """
     if not complete.error_families:
         return None
     geometric = tuple(p for p in errors.parameters if p.coefficient_index is None)
@@ -79,5 +93,9 @@ def fit_bare_geometry(
     drawn = draw_joint_space(complete)[:MAX_DRAWN]
     shares = (1.0, measured), (JOINT_SPACE_WEIGHT, drawn)
     weights = np.concatenate([np.full(len(q), share / len(q)) for share, q in shares])
-    start = BareGeometry(bare, x[: len(geometric)], np.concatenate([measured, drawn]), weights)
+    levers = [
+        np.median(item.sigma) / np.median(item.rotation_sigma) for item in data if isinstance(item, Pose)
+    ]
+    lever = float(np.median(levers or [LEVER]))
+    start = BareGeometry(bare, x[: len(geometric)], np.concatenate([measured, drawn]), weights, lever)
     return start.refitted(complete)

@@ -17,6 +17,7 @@ from dhcal_pin.cli import main
 from dhcal_pin.diagnostics import fit_frames
 from dhcal_pin.exceptions import UnknownNameError
 from dhcal_pin.io import read_measurements, read_robot
+from dhcal_pin.measurements import Measurement
 from dhcal_pin.robot import Chain, Transmission
 
 UR5 = "ur_description/urdf/ur5_robot.urdf"
@@ -48,7 +49,7 @@ def calibrated():
     return truth, tool, dh.calibrate(nominal, data), dh.calibrate(nominal, data, extend="none")
 
 
-def error_of(chain: Chain, data: dh.Position) -> float:
+def error_of(chain: Chain, data: Measurement) -> float:
     """Return the RMS error of the position with the base and the tool that fit best [m]."""
     return fit_frames(chain, [data], {}).comparisons[-1].after["position_rms_m"]
 
@@ -64,6 +65,9 @@ def test_urdf_alone_is_as_good_as_a_calibration_without_joint_errors(calibrated)
     )
     assert alone <= MAX_RATIO * none
     assert complete < 0.2 * alone
+    # Its own base and tool are those of the complete model.
+    stated_frames = dh.Result.validate(replace(geometry, chain=fit.chain.urdf_alone), fresh)
+    assert stated_frames["position_rms_m"] < 1.1 * alone
     # The origins that belong to the joint errors are worse without them.
     assert error_of(replace(fit.chain, transmission=None), fresh) > 1.03 * alone
     stated = fit.comparisons[0].after_alone
@@ -83,7 +87,7 @@ def test_urdf_and_sidecar_together_are_the_fitted_model(calibrated, tmp_path):
     sidecar = tomllib.loads((tmp_path / "arm.calibration.toml").read_text())
     model = pin.buildModelFromUrdf(str(path))
     for placement, expected_placement in zip(model.jointPlacements, fit.model.jointPlacements, strict=True):
-        np.testing.assert_allclose(placement.homogeneous, expected_placement.homogeneous, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(placement.homogeneous, expected_placement.homogeneous, rtol=0, atol=1e-14)
     pose = {
         name: pin.SE3(pin.exp3(np.array(table["rotvec_rad"])), np.array(table["xyz_m"])).homogeneous
         for name, table in {**sidecar["link"], "": sidecar["base"], "tool": sidecar["tool"]}.items()

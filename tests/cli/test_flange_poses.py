@@ -63,4 +63,4 @@ def test_a_robot_with_joint_values_has_a_measured_region(run, tmp_path, monkeypa
     )
     assert status == 0, err
     assert 0 < json.loads(Path("fit.json").read_text())["covered_share"] <= 1
-    assert "Inside: the measured region, " in err
+    assert "Inside: measured region, " in err

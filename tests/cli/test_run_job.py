@@ -181,7 +181,7 @@ def test_accuracy_within_and_beyond_the_measured_region(run, robot_folder):
     expected = [1e3 * value for value in figures.values()]
     assert shown == pytest.approx(expected, rel=0.05)
     assert "position inside   60 cross-validated" in err
-    assert f"Inside: the measured region, {format_share(document['covered_share'])} of joint space." in err
+    assert f"Inside: measured region, {format_share(document['covered_share'])} of joint space." in err
 
 
 def test_regions_are_left_out_of_complete_calibrations(run, robot_folder):

@@ -175,11 +175,9 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
             sentences.append(f"Accuracy {place}: cannot be said, {reason}.")
     if rows and covered is not None and reached is not None:
         sentences.append(
-            f"Inside: the measured region, {summary.format_share(covered)} of joint space. "
-            f"Accuracy unknown: {summary.format_share(1 - reached)} of joint space."
+            f"Inside: measured region, {summary.format_share(covered)} of joint space. "
+            f"Accuracy unknown: {summary.format_share(1 - reached)}."
         )
-    if fit.bare:
-        sentences.append("URDF alone: without its sidecar, as other programs read it.")
     header = ["RMS error", "judged on", "before", "after", *(["URDF alone"] if fit.bare else [])]
     table = Table(header, rows, 2)
     return [
