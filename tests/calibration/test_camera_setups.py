@@ -8,6 +8,7 @@ import camera_setups
 import numpy as np
 import pytest
 from camera_setups import ARMS, polyhedron_setup, random_setup, simulate, wrong_arm
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import select_parameters
@@ -38,7 +39,7 @@ def converges(seed):
     assert image_rms(fit, setup.images) < limit
 
 
-@pytest.mark.parametrize("seed", [0, 5, 8, 13, 18, 23])
+@pytest.mark.parametrize("seed", some_slow([0, 5, 8, 13, 18, 23], {1, 2, 5}))
 def test_setups_converge_without_a_guess(seed):
     converges(seed)
 
@@ -224,7 +225,7 @@ def check_statistics(seeds, coverage, *, is_arm_free):
 
 def test_cameras_and_boards_are_as_uncertain_as_predicted():
     """The bounds are wide, as the parameters of a few set-ups are correlated."""
-    check_statistics(range(5), (0.88, 1.0), is_arm_free=False)
+    check_statistics(range(3), (0.88, 1.0), is_arm_free=False)
 
 
 @pytest.mark.slow

@@ -136,7 +136,8 @@ def test_warnings_are_in_console_and_summary(cells, capsys):
     """One row of a file is a copy of another."""
     lines = (cells / "data.csv").read_text().splitlines()
     (cells / "copied.csv").write_text("\n".join([*lines, lines[3]]))
-    write_manifest(cells, job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="copied.csv"))
+    jobs = job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="copied.csv")
+    write_manifest(cells, f'parameters = "dh"\nextend = "none"\n{jobs}')
     assert main.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
     line = unfolded(capsys.readouterr().err)
     assert line.count("warning:") == 1

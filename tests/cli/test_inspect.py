@@ -181,9 +181,11 @@ def test_invalid_arguments(assert_refused):
 
 def test_the_proposed_map_of_a_real_file_is_the_one_written_by_hand(run, robot_folder, ur10):
     """Rotations, separators and decimal commas of the laser tracker's file, with 20 other columns."""
-    path = DATA / "ipa_ur10" / "Series_B" / "measurements_joint_configurations.csv"
-    if not path.exists():
-        missing(str(path))
+    source = DATA / "ipa_ur10" / "Series_B" / "measurements_joint_configurations.csv"
+    if not source.exists():
+        missing(str(source))
+    path = Path("series.csv")
+    path.write_bytes(b"".join(source.read_bytes().splitlines(keepends=True)[:150]))
     robot = ("--robot", ur10.urdf.source, "--tip", "tool0")
     (file,) = inspect(run, path, *robot)["files"]
     Path("map.toml").write_text("\n".join(file["column_map"]))

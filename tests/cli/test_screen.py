@@ -54,7 +54,7 @@ def test_calibrations_of_several_robots(run, robot_folder, arm):
     assert_fits(err)
 
 
-@pytest.mark.parametrize("n_files", some_slow([1, 12, 40], {0, 1}))
+@pytest.mark.parametrize("n_files", some_slow([1, 8, 40], {0, 1}))
 def test_long_paths_and_many_files(run, robot_folder, n_files):
     folder = Path(LONG_FOLDER)
     folder.mkdir(parents=True)
