@@ -12,6 +12,7 @@ along a column, and z = 0. Corners are numbered row by row, as OpenCV does:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -70,7 +71,7 @@ class Board:
         n_squares = self.columns * self.rows
         return {"charuco": n_squares // 2, "aprilgrid": n_squares}.get(self.type, 0)
 
-    @property
+    @cached_property
     def points(self) -> Array:
         """Positions of the corners in the frame of the board, shape (c, 3) [m]."""
         if self.type == "points":

@@ -635,18 +635,17 @@ def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Ar
 
     A change δ of the rotation vector turns the pose by exp([L·δ]×), in axes of the end, with L = R_link·Jl.
     """
-    poses, turns = np.empty((len(parts), 4, 4)), np.empty((len(parts), 3, 3))
-    for i, (part, mount) in enumerate(zip(parts, mounts, strict=True)):
-        poses[i] = mount.link_pose @ se3.transform(se3.exp3(part[3:6]), part[:3])
-        turns[i] = mount.link_pose[:3, :3] @ left_jacobian(part[3:6])
-    return poses, turns
+    values = np.array([part[:6] for part in parts])
+    links = np.array([mount.link_pose for mount in mounts])
+    poses = links @ se3.transform(se3.exp3(values[:, 3:]), values[:, :3])
+    return poses, links[:, :3, :3] @ left_jacobian(values[:, 3:])
 
 
 def left_jacobian(rotvec: Array) -> Array:
     """Compute the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order."""
-    _, second, third = se3.exp_coefficients(np.asarray(np.linalg.norm(rotvec)))
+    _, second, third = se3.exp_coefficients(np.linalg.norm(rotvec, axis=-1))
     k = se3.skew(rotvec)
-    return np.eye(3) + second * k + third * (k @ k)
+    return np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
 
 
 def _rotate(rotations: Array, vectors: Array) -> Array:
@@ -661,7 +660,8 @@ def _product(a: Array, b: Array) -> Array:
 
 def _cross(rows: Array, vectors: Array) -> Array:
     """Return rows·[v]× of rows (i, 3, m) and vectors (3, m)."""
-    return np.cross(rows, vectors[None], axis=1)
+    (a, b, c), (x, y, z) = rows.swapaxes(0, 1), vectors
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], 1)
 
 
 def _numbers(names: Sequence[str] | None, known: Sequence[str], m: int, what: str) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from robots import joint_sample, measured_arm, robot_file, with_random_frames
+from slow_cases import some_slow
 
 from dhcal_pin.calibration import calibrate, good_samples
 from dhcal_pin.cameras.boards import Board
@@ -151,14 +152,13 @@ def trial(kind, m, fraction, is_clustered, is_stated, seed, largest=500):
 @pytest.mark.parametrize(("kind", "m"), [("pose", 30), ("position", 60), ("wires", 60), ("point", 60)])
 def test_outliers_that_hide_each_other_are_found(kind, m, is_clustered):
     """A third of the samples; a fit to all samples is 3 to 60 times worse, and finds hardly any."""
-    trials = [trial(kind, m, 0.3, is_clustered, is_stated, 1) for is_stated in (False, True)]
-    assert all(trials)
-    for ratio, n_found, n_bad, n_false, _ in filter(None, trials):
-        assert ratio <= 1.10
-        assert (n_found, n_false) == (n_bad, 0)
+    is_stated = is_clustered == (kind in ("pose", "wires"))
+    ratio, n_found, n_bad, n_false, _ = trial(kind, m, 0.3, is_clustered, is_stated, 1) or [0] * 5
+    assert 0 < ratio <= 1.10
+    assert (n_found, n_false) == (n_bad, 0)
 
 
-@pytest.mark.parametrize(("seed", "is_clustered"), [(1, True), (3, True), (10, False)])
+@pytest.mark.parametrize(("seed", "is_clustered"), some_slow([(1, True), (3, True), (10, False)], {0, 2}))
 def test_few_lengths_determine_fewer_unknowns_than_there_are(seed, is_clustered):
     """18 good samples, 12 bad ones, and 39 unknowns, half of which only the priors determine."""
     ratio, n_found, n_bad, n_false, _ = trial("wires", 30, 0.4, is_clustered, False, seed) or [0] * 5
@@ -168,13 +168,16 @@ def test_few_lengths_determine_fewer_unknowns_than_there_are(seed, is_clustered)
 
 @pytest.mark.parametrize(
     ("kind", "m", "fraction", "is_clustered", "is_stated", "seed"),
-    [
-        ("wires", 30, 0.2, False, True, 87),
-        ("position", 30, 0.3, True, True, 33),
-        ("point", 30, 0.4, False, False, 59),
-        ("position", 30, 0.3, False, True, 37),
-        ("point", 60, 0.4, True, True, 21),
-    ],
+    some_slow(
+        [
+            ("wires", 30, 0.2, False, True, 87),
+            ("position", 30, 0.3, True, True, 33),
+            ("point", 30, 0.4, False, False, 59),
+            ("position", 30, 0.3, False, True, 37),
+            ("point", 60, 0.4, True, True, 21),
+        ],
+        {0, 1, 3},
+    ),
 )
 def test_good_samples_are_fitted_and_searched_away_from_the_bent_solution(
     kind, m, fraction, is_clustered, is_stated, seed
@@ -212,24 +215,24 @@ def test_outliers_in_many_trials(kind, is_clustered, is_stated, largest):
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_without_outliers_the_digits_are_those_of_least_squares(kind):
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        chain = measured_arm("slide")
-        data = KINDS[kind].simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
-        for item in (data, without_sigma(data)):
-            fits = [
-                calibrate(chain, item, "minimal,base,tool", extend="none", loss=loss)
-                for loss in ("auto", "linear")
-            ]
-            np.testing.assert_array_equal(fits[0].x, fits[1].x)
-            assert np.all(fits[0].weights[0] == 1)
+    rng = np.random.default_rng(0)
+    chain = measured_arm("slide")
+    data = KINDS[kind].simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
+    for item in (data, without_sigma(data)):
+        fits = [
+            calibrate(chain, item, "minimal,base,tool", extend="none", loss=loss)
+            for loss in ("auto", "linear")
+        ]
+        np.testing.assert_array_equal(fits[0].x, fits[1].x)
+        assert np.all(fits[0].weights[0] == 1)
 
 
-def test_few_good_samples_are_all_kept():
+@pytest.mark.parametrize("seeds", some_slow([5, 12], {0}))
+def test_few_good_samples_are_all_kept(seeds):
     """The best of many choices of samples fits better by chance, which is no reason to reject the others."""
     arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     errors = select_parameters(arm, "minimal,base,tool")
-    for seed in range(12):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         actual = errors.at(np.minimum(errors.priors, 0.1) * rng.normal(size=len(errors.parameters)))
         data = Pose.simulate(actual, rng.uniform(-2.5, 2.5, (20, 6)), Noise(5e-5, 1e-4), rng)
@@ -419,11 +422,12 @@ def test_the_robust_start_keeps_the_digits_of_clean_data(kind):
     np.testing.assert_array_equal(fits[0].x, fits[1].x)
 
 
+@pytest.mark.parametrize("seeds", some_slow([1, 4], {0}))
 @pytest.mark.parametrize("is_clustered", [False, True])
 @pytest.mark.parametrize("kind", [Pose, Position])
-def test_outliers_of_half_a_metre_do_not_spoil_the_start(kind, is_clustered):
+def test_outliers_of_half_a_metre_do_not_spoil_the_start(kind, is_clustered, seeds):
     """With them a least-squares fit of base and tool, or of the robot, ends in a wrong minimum."""
-    for seed in range(4):
+    for seed in range(seeds):
         rng = np.random.default_rng([seed, 7])
         chain = with_random_frames(measured_arm("slide"), rng)
         clean = kind.simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)

@@ -50,18 +50,10 @@ def check_cause(fit, fault):
 
 @pytest.mark.parametrize(
     ("name", "fault", "seed", "is_on_wrist"),
-    [
-        ("ur10", "arm", 21, True),
-        ("panda", "offsets", 22, False),
-        ("panda", "size", 23, True),
-        ("ur10", "warped", 24, False),
-        ("xarm7", "focal", 25, False),
-        ("panda", "distortion", 26, True),
-        ("ur10", "lag", 27, True),
-    ],
+    [("panda", "offsets", 22, False), ("xarm7", "distortion", 26, True), ("ur10", "lag", 27, True)],
 )
 def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
-    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=25), fault)
+    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20), fault)
 
 
 def test_rejected_corners_do_not_hide_a_bent_board():
@@ -99,11 +91,11 @@ def test_noise_never_has_a_cause(name, is_on_wrist, seed):
     check_nothing(hand_eye(name, "nothing", seed, is_on_wrist))
 
 
-@pytest.mark.parametrize("n_seeds", [2, pytest.param(12, marks=pytest.mark.slow)])
-def test_noise_of_few_images_is_predicted(n_seeds):
+@pytest.mark.parametrize(("n_seeds", "step"), some_slow([(2, 2), (12, 1)], {0}))
+def test_noise_of_few_images_is_predicted(n_seeds, step):
     """Six images: the noise of the fitted ones adds to the error of a left-out one."""
     found = []
-    for name, is_on_wrist, seed in product(("ur10", "panda"), (True, False), range(n_seeds)):
+    for name, is_on_wrist, seed in list(product(("ur10", "panda"), (True, False), range(n_seeds)))[::step]:
         result = hand_eye(name, "nothing", 160 + seed, is_on_wrist, n_images=6)
         assert result.hand_eye is not None
         found.append(result.hand_eye)
@@ -114,13 +106,17 @@ def test_noise_of_few_images_is_predicted(n_seeds):
 def test_figures_of_the_causes_are_true():
     """The size of a board and the focal length are those of the simulation."""
     chain, images, setup = faulty_setup("ur10", "size", 51, is_on_wrist=True, n_images=20)
-    found = dh.calibrate(chain, images, "camera,board", loss="linear").hand_eye
+    fit = dh.calibrate(chain, images, "camera,board", loss="linear")
+    check_cause(fit, "size")
+    found = fit.hand_eye
     assert found is not None
     size = 1e3 * setup.images.rig.boards[0].square * 0.97, 1e3 * setup.images.rig.boards[0].square * 1.03
     text = found.causes[0].text
     assert any(f"squares of {each:.3g}"[:14] in text for each in size)
     chain, images, setup = faulty_setup("ur10", "focal", 52, is_on_wrist=True, n_images=20)
-    found = dh.calibrate(chain, images, "camera,board", loss="linear").hand_eye
+    fit = dh.calibrate(chain, images, "camera,board", loss="linear")
+    check_cause(fit, "focal")
+    found = fit.hand_eye
     assert found is not None
     value = float(found.causes[0].text.split(": ")[1].split(",")[0])
     assert value == pytest.approx(setup.exact.rig.cameras[0].values[0], rel=2e-3)
@@ -128,7 +124,7 @@ def test_figures_of_the_causes_are_true():
 
 def test_two_faults_are_named_in_turn():
     """The lens and the arm are wrong: the poses alone, the lens alone and the arm alone leave an error."""
-    chain, images, setup = faulty_setup("ur10", "arm", 53, is_on_wrist=False)
+    chain, images, setup = faulty_setup("ur10", "arm", 53, is_on_wrist=False, n_images=20)
     camera = images.rig.cameras[0]
     values = camera.values.copy()
     values[2:4] += 40
@@ -148,10 +144,10 @@ def test_two_faults_are_named_in_turn():
 
 @pytest.mark.parametrize("has_names", some_slow([True, False], {0}))
 def test_images_with_wrong_joint_values_are_counted(has_names):
-    chain, images, _ = faulty_setup("panda", "nothing", 54, is_on_wrist=True, n_images=24)
+    chain, images, _ = faulty_setup("panda", "nothing", 54, is_on_wrist=True, n_images=16)
     q = np.unique(images.q, axis=0)
     swapped = images.q.copy()
-    for first, second in ((3, 17), (8, 20)):
+    for first, second in ((3, 13), (8, 15)):
         swapped[np.all(images.q == q[first], 1)] = q[second]
         swapped[np.all(images.q == q[second], 1)] = q[first]
     names = [f"{np.flatnonzero(np.all(q == each, 1))[0]:04}.png" for each in images.q]
@@ -167,7 +163,7 @@ def test_images_with_wrong_joint_values_are_counted(has_names):
         assert "left out: check" in text
         assert listed == []
     else:
-        assert sorted(listed) == ["0003.png", "0008.png", "0017.png", "0020.png"]
+        assert sorted(listed) == ["0003.png", "0008.png", "0013.png", "0015.png"]
         assert f"left out ({', '.join(listed[:3])} and 1 more): check" in text
 
 

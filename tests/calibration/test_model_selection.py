@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from robots import robot_file
+from slow_cases import some_slow
 
 from dhcal_pin.calibration import Extension, calibrate
 from dhcal_pin.calibration.model_selection import (
@@ -59,7 +60,7 @@ def test_hint_names_the_missing_family_and_its_effect(family):
     assert not hint(whole)
 
 
-@pytest.mark.parametrize("seeds", [20, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", some_slow([6, 300], {0}))
 @pytest.mark.parametrize("kind", [Pose, Position])
 def test_geometric_errors_alone_give_no_hint(kind, seeds):
     """Chance gives a hint once in a million, whether or not standard deviations are stated."""
@@ -74,7 +75,7 @@ def test_hint_uses_a_part_of_many_samples():
     assert FAMILIES["harmonics"].description in hint(calibrate(arm, data, "minimal,base,tool", extend="none"))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", some_slow(range(2), {0}))
 def test_geometric_errors_alone_are_fitted_as_without_extension(seed):
     """Without a supported family and with white residuals, the result is that of the geometry, bit by bit."""
     arm, data = simulated("minimal,base,tool", seed)
@@ -108,7 +109,7 @@ def test_hardly_a_family_is_added_to_200_robots_with_geometric_errors(kind):
     assert n_curves <= 4
 
 
-@pytest.mark.parametrize("family", ["compliance", "harmonics", "gain"])
+@pytest.mark.parametrize("family", some_slow(["compliance", "harmonics", "gain"], {0, 1}))
 def test_simulated_family_is_added(family):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
     fit, plain = calibrate(arm, data), calibrate(arm, data, extend="none")
@@ -141,7 +142,7 @@ def joint_errors(chain: Chain, q: np.ndarray) -> np.ndarray:
     return chain.actual_positions(Conditions(q))[0] - q.T
 
 
-@pytest.mark.parametrize("has_fine_lines", [True, False])
+@pytest.mark.parametrize("has_fine_lines", some_slow([True, False], {0}))
 def test_curves_of_high_order_have_a_prior_width_of_their_own(has_fine_lines):
     """Lines of order 40 and 55 that are a fifth of those of low order; without them their curves stay out."""
     arm, truth, data = with_curves(0, 220)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from camera_setups import ARMS, Setup, simulate, wrong_arm
 from scipy.optimize import least_squares
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
@@ -56,7 +57,7 @@ def true_errors(fit: Result, setup: Setup, measured: np.ndarray, q: np.ndarray) 
 @pytest.mark.parametrize(
     ("n_seeds", "bounds"), [(2, (0.5, 2.0)), pytest.param(12, (0.8, 1.25), marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("is_on_wrist", [True, False])
+@pytest.mark.parametrize("is_on_wrist", some_slow([True, False], {0}))
 def test_predicted_errors_are_true_ones(is_on_wrist, n_seeds, bounds):
     """RMS of true over predicted errors, at the measured configurations and all over the workspace."""
     everywhere = np.random.default_rng(9).uniform(-np.pi, np.pi, (300, 6))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robots import DATA, MAPS, missing, robot_file
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, blocked_folds, calibrate
@@ -61,9 +62,9 @@ def covered_share(error: np.ndarray, std: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("seeds", "bounds"),
-    [(3, (0.88, 0.99)), pytest.param(40, (0.93, 0.97), marks=pytest.mark.slow)],
+    some_slow([(2, (0.88, 0.99)), (40, (0.93, 0.97))], {0}),
 )
-@pytest.mark.parametrize(("m", "size"), [(40, 0.0), (100, 0.0), (40, 3e-4), (100, 3e-4)])
+@pytest.mark.parametrize(("m", "size"), some_slow([(40, 0.0), (100, 0.0), (40, 3e-4), (100, 3e-4)], {0, 3}))
 def test_intervals_hold_in_simulations(m, size, seeds, bounds):
     shares = []
     for seed in range(seeds):
@@ -76,8 +77,8 @@ def test_intervals_hold_in_simulations(m, size, seeds, bounds):
     assert bounds[0] <= np.mean(shares) <= bounds[1]
 
 
-@pytest.mark.parametrize("seeds", [3, pytest.param(20, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("m", [40, 100])
+@pytest.mark.parametrize("seeds", some_slow([3, 20], {0}))
+@pytest.mark.parametrize("m", some_slow([40, 100], {0}))
 def test_stated_noise_of_the_instrument_is_not_counted_as_an_error_of_the_model(m, seeds):
     """The smooth error is only twice the noise. Predictions without noise would be 12 % too wide with it."""
     shares, sizes = [], []

@@ -46,15 +46,15 @@ def test_standard_deviations_match_scatter_over_repeats(sim_6dof, sim_6dof_actua
     """Errors of observable parameters, divided by their standard deviations, are standard normal."""
     truth = {p.name: p.nominal for p in select_parameters(sim_6dof_actual, "dh").parameters}
     scores = []
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (40, 6)), Noise(1e-4, 1e-4), rng)
         fit = calibrate(sim_6dof, data, "dh", priors="none")
         for p, x, std in zip(fit.parameters, fit.x, fit.std, strict=True):
             if p.name in ("a1", "a2", "alpha1", "d1", "theta1", "a6", "alpha4"):
                 scores.append((p.nominal + x - truth[p.name]) / std)
-    assert np.std(scores) == pytest.approx(1.0, abs=0.1)
-    assert abs(np.mean(scores)) < 0.15
+    assert np.std(scores) == pytest.approx(1.0, abs=0.15)
+    assert abs(np.mean(scores)) < 0.2
 
 
 def coverage(nominal: Chain, actual: Chain, n_poses: int, n_repeats: int) -> float:
@@ -72,7 +72,7 @@ def coverage(nominal: Chain, actual: Chain, n_poses: int, n_repeats: int) -> flo
 
 def test_noise_that_few_poses_determine_widens_the_standard_deviations(sim_6dof, sim_6dof_actual):
     """91.5 to 92.8 % with the quantiles of a normal distribution."""
-    assert 0.94 < coverage(sim_6dof, sim_6dof_actual, 8, 300) < 0.97
+    assert 0.935 < coverage(sim_6dof, sim_6dof_actual, 8, 150) < 0.97
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_standard_deviations_follow_students_t_distribution(sim_6dof, sim_6dof_a
 def test_predicted_covariance_matches_scatter_over_repeats(sim_6dof, sim_6dof_actual):
     """The Mahalanobis distance of true poses has the mean of χ² with six degrees of freedom."""
     scores, squares, expected = [], [], []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (15, 6)), Noise(1e-4, 2e-4), rng)
         q = rng.uniform(-3, 3, (20, 6))
@@ -115,7 +115,7 @@ def test_predicted_covariance_matches_scatter_over_repeats(sim_6dof, sim_6dof_ac
         scores.append(np.einsum("mi,mij,mj->m", moved, np.linalg.inv(found.covariance), moved))
         squares.append(np.sum(moved[:, :3] ** 2, 1))
         expected.append(found.position_std**2)
-    assert np.mean(scores) == pytest.approx(6, rel=0.1)
+    assert np.mean(scores) == pytest.approx(6, rel=0.15)
     assert np.sqrt(np.mean(squares) / np.mean(expected)) == pytest.approx(1, abs=0.1)
 
 

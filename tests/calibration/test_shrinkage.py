@@ -94,7 +94,7 @@ def test_the_factor_follows_from_its_definition(monkeypatch):
 
     monkeypatch.setattr(procedure, "compute_shrinkage_factor", record)
     nominal, found = measured_arm("paper"), []
-    for seed in range(24):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         errors = select_parameters(nominal, "dh")
         size = np.array([np.deg2rad(1.0) if p.unit == "rad" else 5e-3 for p in errors.parameters])
@@ -103,11 +103,11 @@ def test_the_factor_follows_from_its_definition(monkeypatch):
         data = Position.simulate(truth, joint_sample(nominal, 2 + seed % 5, rng), noise, rng)
         fit = calibrate(nominal, data, "dh", extend="none")
         found.append((fit.shrinkage_factor, factor_by_definition(*calls[-1])))
-    assert len(calls) == 24
+    assert len(calls) == 12
     for factor, expected in found:
         assert factor == pytest.approx(expected, abs=0.011)
     # Some corrections are applied in part.
-    assert sum(0.05 < factor < 0.95 for factor, _ in found) >= 3
+    assert sum(0.05 < factor < 0.95 for factor, _ in found) >= 2
 
 
 def two_poses(chain: Chain, rng: np.random.Generator):
@@ -140,7 +140,7 @@ NAMES = ("name", "sets", "kind", "poses")
 
 @pytest.mark.parametrize(NAMES, some_slow(CASES, range(10)))
 def test_few_measurements_do_no_harm(name, sets, kind, poses):
-    assert count_worse_than_nominal(name, sets, kind, poses, range(4)) == 0
+    assert count_worse_than_nominal(name, sets, kind, poses, range(2)) == 0
 
 
 @pytest.mark.slow
