@@ -29,6 +29,8 @@ FOLDS = (lambda data: k_fold(data, 5), blocked_folds)
 PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
 PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
 EXTEND = ("--extend", "auto")
+# `test_no_real_series_is_refused` examines the sessions.
+SESSION = ("--session", "off")
 PANDA_1 = "back-high front right".split()
 
 
@@ -59,7 +61,7 @@ def ur10(dhcal, series, sets, folder, *more):
     robot = robot_file(UR10)
     output = folder / f"{series}.urdf"
     options = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--parameters", sets, "-o", output)
-    return dhcal("calibrate", robot, SERIES[series], *options, *more), output
+    return dhcal("calibrate", robot, SERIES[series], *options, *SESSION, *more), output
 
 
 @pytest.mark.parametrize(("series", "frames", "best"), [("B", 1.083e-3, 0.450e-3), ("D", 0.774e-3, 0.412e-3)])
@@ -73,14 +75,6 @@ def test_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
         assert fit["rank"] == 30
         assert fit["holdout_after"]["position_rms_m"] <= best
         assert fit["holdout_after"]["orientation_rms_rad"] < 0.0012
-
-
-@pytest.mark.parametrize(("series", "other", "most"), [("B", "D", 0.53e-3), ("D", "B", 0.50e-3)])
-def test_links_of_one_series_are_accurate_on_another(dhcal, tmp_path, series, other, most):
-    _, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "none")
-    columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0")
-    moved = dhcal("validate", output, SERIES[other], *columns, "--fit-frames")
-    assert moved["after"]["position_rms_m"] <= most
 
 
 @pytest.mark.parametrize(
@@ -125,15 +119,16 @@ def test_split_by_regions_shows_overfitting_that_a_random_split_hides():
     assert regions > 1.2
 
 
-@pytest.mark.parametrize(("series", "other"), [("B", "D"), ("D", "B")])
+@pytest.mark.parametrize(("series", "other", "most"), [("B", "D", 0.53e-3), ("D", "B", 0.50e-3)])
 def test_error_on_another_series_is_not_much_more_than_that_on_regions_left_out(
-    dhcal, tmp_path, series, other
+    dhcal, tmp_path, series, other, most
 ):
     fit, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--extend", "none")
     assert fit["cross_validated_after"]["position_rms_m"] < fit["holdout_region_after"]["position_rms_m"]
     assert fit["cross_validated_before"]["position_rms_m"] > 0.75e-3
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--fit-frames")
     moved = dhcal("validate", output, SERIES[other], *columns, "--nominal", robot_file(UR10))
+    assert moved["after"]["position_rms_m"] <= most
     assert moved["after"]["position_rms_m"] < 1.25 * fit["holdout_region_after"]["position_rms_m"]
     assert moved["before"]["position_rms_m"] > 1.3 * moved["after"]["position_rms_m"]
     # The series have hardly a configuration in common.
@@ -151,7 +146,7 @@ def actual_over_stated(number: int) -> tuple[str, float, float, float]:
     chain = Chain.from_urdf(robot_file(UR10), "tool0")
     data = read_measurement_file(SERIES[case["series"]], chain, MAPS / "ipa_ur10.toml").data
     is_fitted = np.isin(np.arange(len(data.rows)), case["rows"])
-    fit = calibrate(chain, data.take(is_fitted), "minimal,base,tool", extend="none")
+    fit = calibrate(chain, data.take(is_fitted), "minimal,base,tool", extend="none", session="off")
     rest, found, region = data.take(~is_fitted), fit.generalization, fit.measured_region
     assert region is not None
     _, errors = position_errors(fit.chain, [rest])
@@ -287,7 +282,8 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
         first, second = data.take(np.sort(order[:half])), data.take(np.sort(order[half:]))
 
         def held_out(part, second=second) -> float:
-            return calibrate(chain, part, sets, extend="none").validate(second)["position_rms_m"]
+            fit = calibrate(chain, part, sets, extend="none", session="off")
+            return fit.validate(second)["position_rms_m"]
 
         all_poses = held_out(first)
         planned = plan(chain, 40, noise=noise, parameters=sets, criterion=criterion, candidates=first.q)
@@ -315,7 +311,7 @@ def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> flo
     """Calibrate with rows of series B; return the RMS position error on D, frames refitted [m]."""
     chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     fitted, judged = (read_measurements(SERIES[name], chain, MAPS / "ipa_ur10.toml") for name in "BD")
-    fit = calibrate(chain, fitted.take(rows), extend=extend)
+    fit = calibrate(chain, fitted.take(rows), extend=extend, session="off")
     return calibrate(fit.chain, judged, "base,tool").comparisons[-1].after.groups["position"].rms
 
 
@@ -397,6 +393,9 @@ def test_no_real_series_is_refused(tmp_path, capsys, name):
     ]
     words += ["--columns", columns] if columns else []
     assert main.main([str(word) for word in words]) == 0, capsys.readouterr().err
-    verdict = json.loads(output.read_text())["verdict"]
+    document = json.loads(output.read_text())
+    verdict = document["verdict"]
+    # Left-out blocks of time of the series of a UR10 are not predicted better by any event or drift.
+    assert not (name.startswith("UR10") and any(document["session"][kind] for kind in ("events", "drift")))
     assert verdict["status"] in ("ok", "caution"), verdict
     assert (verdict["status"] == "caution") == bool(verdict["reasons"])

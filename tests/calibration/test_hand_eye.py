@@ -187,7 +187,7 @@ def test_similar_rotations_are_named():
 def test_other_names_of_the_poses(sets):
     """Base and tool move camera and board along: the error and its cause are the same."""
     found, alone = (
-        hand_eye("ur10", "arm", 56, True, names, n_images=20).hand_eye for names in (sets, "camera,board")
+        hand_eye("ur10", "arm", 56, True, names, n_images=12).hand_eye for names in (sets, "camera,board")
     )
     assert found is not None
     assert alone is not None

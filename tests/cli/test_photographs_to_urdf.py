@@ -18,7 +18,7 @@ from dhcal_pin.io.rig_file import rig_text
 
 cv2 = pytest.importorskip("cv2")
 
-N_IMAGES = 50
+N_IMAGES = 36
 # More corners, as errors of the arm by 0.05 mm are to be found.
 BOARD = replace(SMALL_BOARD, columns=9, rows=7, square=0.03, marker=0.022)
 
@@ -32,13 +32,13 @@ def simulated(robot_folder):
     arm = dh.read_robot("example:ur10", tip="tool0")
     rng = np.random.default_rng(0)
     rig = dh.mount_rig(Rig({"wrist": CAMERA}, {"table": BOARD}), arm)
-    q = draw_views(arm, rig, rng, 400_000)
+    q = draw_views(arm, rig, rng, 300_000)
     errors = dh.select_parameters(arm, "placement")
     scale = np.array([1e-3 if p.unit == "m" else 2e-3 for p in errors.parameters])
     truth = errors.at(scale * rng.normal(size=len(scale)))
     measured = q[:N_IMAGES]
     poses = rig.board_in_camera(0, 0, truth.poses(measured))
-    images = render_images(CAMERA, [[(BOARD, pose)] for pose in poses], rng, ImageQuality(0.7, 2.0, 4))
+    images = render_images(CAMERA, [[(BOARD, pose)] for pose in poses], rng, ImageQuality(0.7, 2.0, 3))
     Path("images").mkdir()
     rows = ["image," + ",".join(f"{name}[deg]" for name in arm.joint_names)]
     for i, (image, position) in enumerate(zip(images, np.degrees(measured), strict=True)):

@@ -100,7 +100,7 @@ def projected(board, pose):
 def test_corners_of_rendered_boards(board, blur, noise, tmp_path):
     rng, path, errors = np.random.default_rng(1), str(tmp_path / "board.png"), []
     poses = views(board, 2, rng)
-    images = render_images(CAMERA, [[(board, pose)] for pose in poses], rng, ImageQuality(blur, noise))
+    images = render_images(CAMERA, [[(board, pose)] for pose in poses], rng, ImageQuality(blur, noise, 4))
     for pose, image in zip(poses, images, strict=True):
         cv2.imwrite(path, image)
         layout = find_layout(board, [image])

@@ -193,7 +193,7 @@ def test_nothing_is_found_where_nothing_happened(count):
         assert not session_of(fit).found, seed
 
 
-@pytest.mark.parametrize("sets", ["minimal,base,tool", "placement,base,tool"])
+@pytest.mark.parametrize("sets", some_slow(["minimal,base,tool", "placement,base,tool"], {1}))
 def test_an_event_is_found_without_priors_and_with_redundant_parameters(sets):
     simulation = Simulation("ur10", 100, 3)
     changes = Changes("base", 5e-3)
@@ -285,7 +285,7 @@ def test_times_order_the_samples():
 
 
 @pytest.mark.parametrize(
-    "series", some_slow(["B/measurements_joint_configurations", "D/measurements_iso_cubes"], {1})
+    "series", some_slow(["B/measurements_joint_configurations", "D/measurements_iso_cubes"], ())
 )
 def test_nothing_happened_in_the_public_series_of_a_ur10(series):
     """Left-out blocks of time of these series are not predicted better by any event or drift."""
@@ -338,7 +338,7 @@ def test_commands_state_what_happened(tmp_path, capsys):
     assert "The base moved by" in capsys.readouterr().err
     assert main(["inspect", str(file), "--robot", str(robot), "--tip", "tool0"]) in (0, 1)
     assert "The base moved by" in " ".join(capsys.readouterr().err.split())
-    assert main([*map(str, words), *map(str, outputs), "--session", "off"]) == 0
+    assert main([*map(str, words), *map(str, outputs[:2]), "--session", "off"]) == 0
     assert json.loads((tmp_path / "out.json").read_text())["session"]["events"] == []
 
 
