@@ -17,7 +17,7 @@ from command_line import CALIBRATE, positions_csv
 from robots import URDF
 from study_runs import SMALL_STUDY
 
-from dhcal_pin.cli import outputs, run_job
+from dhcal_pin.cli import main, outputs, run_job
 from dhcal_pin.cli.screens import console
 from dhcal_pin.saving import transaction
 from dhcal_pin.studies import open_journal, read_study
@@ -136,18 +136,29 @@ READERS = {
 }
 
 
+@pytest.fixture(scope="module")
+def mixed_files(tmp_path_factory):
+    """Folder for `mixed`."""
+    folder = tmp_path_factory.mktemp("mixed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        shutil.copy(URDF / "experiment.dh.toml", "arm.dh.toml")
+        Path("data.csv").write_text(positions_csv(20))
+        assert main.main(CALIBRATE) == 0
+        first = Path("out.urdf").read_bytes()
+        Path("data.csv").write_text(positions_csv(20, seed=5))
+        assert main.main(CALIBRATE) == 0
+        assert Path("out.urdf").read_bytes() != first
+        Path("out.urdf").write_bytes(first)
+        shutil.copy("out.urdf", "copy.urdf")
+        Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n500,100,600\n")
+    return folder
+
+
 @pytest.fixture
-def mixed(run, robot_folder):
+def mixed(mixed_files, robot_folder):
     """A new URDF beside the sidecar of another run, as a kill between two renames left them."""
-    assert run(*CALIBRATE)[0] == 0
-    first = Path("out.urdf").read_bytes()
-    Path("data.csv").write_text(positions_csv(20, seed=5))
-    assert run(*CALIBRATE)[0] == 0
-    assert Path("out.urdf").read_bytes() != first
-    Path("out.urdf").write_bytes(first)
-    shutil.copy("out.urdf", "copy.urdf")
-    Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n500,100,600\n")
-    return robot_folder
+    return shutil.copytree(mixed_files, robot_folder, dirs_exist_ok=True)
 
 
 @pytest.mark.parametrize("command", READERS)
