@@ -1,8 +1,7 @@
 """URDF files: a safe parser that checks everything about the kinematics before any library reads the file.
 
-The parser accepts plain XML in UTF-8 of bounded size and depth. It refuses document types, entities and
-unexpanded xacro, and it records the byte offset of every tag, so that `urdf_edit` can rewrite single
-attributes. Errors name file and line. A `Urdf` is a tree of links and joints without cycles, whose numbers
+The XML is parsed by `xml_tags`, and unexpanded xacro is refused. The byte offset of every tag is recorded, so
+that `urdf_edit` can rewrite single attributes. Errors name file and line. A `Urdf` is a tree of links and joints without cycles, whose numbers
 are finite.
 
 Lengths are in metres and angles in radians. The origin of a joint is the pose of its frame in the frame of
@@ -15,11 +14,9 @@ from __future__ import annotations
 import difflib
 import html
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from xml.parsers import expat
 
 import numpy as np
 
@@ -27,12 +24,11 @@ from .. import se3
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError, UnknownNameError
 from ..messages import quote
-from ..ros_packages import mesh_folders, resolve_robot_path
+from ..ros_packages import mesh_folders
+from .xml_tags import XmlTag, parse_numbers, read_xml, scan
 
-# Maximum size of a file [byte], number of links and of joints, and depth of nested elements.
-_MAX_BYTES = 16 << 20
+# Maximum number of links and of joints.
 _MAX_ELEMENTS = 20_000
-_MAX_DEPTH = 64
 
 # Maximum number of joints in a row. Pinocchio recurses along the chain and overflows its stack at thousands.
 _MAX_CHAIN = 500
@@ -71,24 +67,18 @@ _NUMERIC_ATTRIBUTES = {
     "safety_controller": ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity"),
 }
 
-# float() also accepts '1_0', 'nan' and digits of other scripts.
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+# What other files are, by their outermost element.
+_OTHER_FORMATS = {
+    "sdf": "this is SDF, not URDF",
+    "mujoco": "this is MJCF, not URDF, and needs the ending .xml",
+}
 
 
 @dataclass(frozen=True, eq=False)
-class UrdfTag:
-    """Start tag of an XML element."""
+class UrdfTag(XmlTag):
+    """Start tag of an element of a URDF."""
 
-    source: str  # Name of the file for messages
-    line: int
-    label: str  # Name of the element for messages
-    start: int  # Byte offset of the tag
-    attributes: dict[str, str]  # Values of the attributes by name
     children: dict[str, UrdfTag] = field(default_factory=dict)  # Tags of the direct children by element name
-
-    def error(self, text: str) -> FileFormatError:
-        """Create an error that names the file, the line and the element."""
-        return FileFormatError(f"{self.source}:{self.line}: {self.label}: {text}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,31 +157,11 @@ class Urdf:
 
 def read_urdf(path: PathLike) -> Urdf:
     """Read and check a URDF file."""
-    source = resolve_robot_path(path)
-    try:
-        with open(source, "rb") as file:
-            data = file.read(_MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise FileFormatError(f"{source}: cannot be read: {reason}; give the path of a URDF file") from None
-    return parse_urdf(data, source)
+    return parse_urdf(*read_xml(path, "a URDF"))
 
 
 def parse_urdf(data: bytes, source: str) -> Urdf:
     """Parse and check the bytes of a URDF."""
-    if len(data) > _MAX_BYTES:
-        raise FileFormatError(
-            f"{source}: the file is larger than {_MAX_BYTES >> 20} MiB, which no URDF is; check the path"
-        )
-    if not data.strip():
-        raise FileFormatError(f"{source}:1: the file is empty; expected a <robot> element")
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise FileFormatError(f"{source}:{line}: not UTF-8; convert the file to UTF-8") from None
-    if b"\0" in data:
-        raise FileFormatError(f"{source}:1: zero bytes as in UTF-16; convert the file to UTF-8")
     robot, link_tags, joint_tags = scan_tags(data, source)
     for tag in link_tags.values():
         if "inertial" in tag.children:
@@ -206,54 +176,31 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
 
     Errors of the XML and of names are raised as `FileFormatError` with the line.
     """
-    parser = expat.ParserCreate("utf-8")
-    depth, robot = 0, None
+    robot: UrdfTag | None = None
     # Link or joint and which of both it is, and in a link its inertial, whose children are collected.
     parent: UrdfTag | None = None
     inertial: UrdfTag | None = None
     kind = ""
     tags_by_kind: dict[str, dict[str, UrdfTag]] = {"link": {}, "joint": {}}
 
-    def current_tag(label: str, attributes: dict[str, str]) -> UrdfTag:
-        return UrdfTag(source, parser.CurrentLineNumber, label, parser.CurrentByteIndex, attributes)
+    def urdf_tag(tag: XmlTag, label: str) -> UrdfTag:
+        return UrdfTag(source, tag.line, label, tag.start, tag.attributes)
 
-    def on_declaration(_version: str, encoding: str | None, _standalone: int) -> None:
-        name = (encoding or "utf-8").lower()
-        if name not in ("utf-8", "utf8") and not (name in ("us-ascii", "ascii") and data.isascii()):
-            tag = current_tag("<?xml>", {})
-            raise tag.error(f"the encoding is {quote(name)}; convert the file to UTF-8")
-
-    def on_doctype(*_: object) -> None:
-        raise current_tag("<!DOCTYPE>", {}).error("document types and entities are not accepted; remove it")
-
-    def on_instruction(target: str, _: str) -> None:
-        # Before the robot, instructions are common and harmless; inside, Pinocchio fails on them.
-        if depth > 0:
-            tag = current_tag(f"<?{target[:60]}?>", {})
-            raise tag.error("processing instructions are not accepted; remove it")
-
-    def on_end(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    def add_child(tag: UrdfTag, kind: str, element: str, attributes: dict[str, str]) -> UrdfTag:
-        child = current_tag(f"{tag.label} <{element[:60]}>", attributes)
+    def add_child(tag: UrdfTag, kind: str, element: str, start: XmlTag) -> UrdfTag:
+        child = urdf_tag(start, f"{tag.label} {start.label}")
         if element in _UNIQUE_ELEMENTS[kind] and element in tag.children:
             raise child.error("a second element of this kind; keep one")
         return tag.children.setdefault(element, child)
 
-    def on_start(element: str, attributes: dict[str, str]) -> None:
-        nonlocal depth, robot, parent, inertial, kind
-        depth, label = depth + 1, f"<{element[:60]}>"
-        if depth > _MAX_DEPTH:
-            raise current_tag(label, {}).error(f"nested too deep; at most {_MAX_DEPTH} levels are accepted")
+    def on_start(depth: int, element: str, start: XmlTag) -> None:
+        nonlocal robot, parent, inertial, kind
+        attributes = start.attributes
         if element.startswith("xacro:") or any("${" in text or "$(" in text for text in attributes.values()):
-            tag = current_tag(label, {})
-            raise tag.error("unexpanded xacro; expand it first: xacro FILE > out.urdf")
+            raise start.error("unexpanded xacro; expand it first: xacro FILE > out.urdf")
         if depth == 1:
-            robot = current_tag(label, attributes)
+            robot = urdf_tag(start, start.label)
             if element != "robot":
-                format_name = "this is SDF, not URDF" if element == "sdf" else "this is not a URDF"
+                format_name = _OTHER_FORMATS.get(element, "this is not a URDF")
                 raise robot.error(f"{format_name}; expected <robot> as the outermost element")
             if not attributes.get("name"):
                 raise robot.error('no name; expected name="..."')
@@ -262,7 +209,7 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
             if element not in tags_by_kind:
                 return
             name, siblings = attributes.get("name", ""), tags_by_kind[element]
-            tag = current_tag(f"{element} {quote(name)}", attributes)
+            tag = urdf_tag(start, f"{element} {quote(name)}")
             if not name:
                 raise tag.error('no name; expected name="..."')
             if name in siblings:
@@ -274,41 +221,14 @@ def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], di
             siblings[name] = tag
             parent, kind = tag, element
         elif depth == 3 and parent is not None:
-            child = add_child(parent, kind, element, attributes)
+            child = add_child(parent, kind, element, start)
             inertial = child if kind == "link" and element == "inertial" else None
         elif depth == 4 and inertial is not None:
-            add_child(inertial, "inertial", element, attributes)
+            add_child(inertial, "inertial", element, start)
 
-    parser.XmlDeclHandler, parser.StartDoctypeDeclHandler = on_declaration, on_doctype
-    parser.StartElementHandler, parser.EndElementHandler = on_start, on_end
-    parser.ProcessingInstructionHandler = on_instruction
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        reason = expat.ErrorString(error.code)
-        raise FileFormatError(
-            f"{source}:{error.lineno}: broken XML: {reason}; repair this line or export the file again"
-        ) from None
+    scan(data, source, "URDF", "robot", on_start)
     assert robot is not None, "expat refuses a document without an element"
     return robot, tags_by_kind["link"], tags_by_kind["joint"]
-
-
-def parse_numbers(tag: UrdfTag, key: str, count: int) -> list[float]:
-    """Parse the finite numbers of an attribute.
-
-    A wrong number raises a `FileFormatError` with the line.
-    """
-    # Expat replaces white space by spaces, except for character references such as &#9;, which do not
-    # separate.
-    words = [word for word in tag.attributes[key].split(" ") if word]
-    if len(words) != count:
-        noun = "number" if len(words) == 1 else "numbers"
-        separated = ", separated by spaces" if count > 1 else ""
-        raise tag.error(f"{key} has {len(words)} {noun}; expected {count}{separated}")
-    for word in words:
-        if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
-            raise tag.error(f"{key} has {quote(word)}; expected a finite number such as 0.25 or -1e-3")
-    return [float(word) for word in words]
 
 
 def suggest_names(name: str, known: Iterable[str]) -> str:

@@ -11,34 +11,29 @@ triples of roll, pitch and yaw; the one nearest to that of the file is written (
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from xml.parsers import expat
 
 import numpy as np
 
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
-from ..se3 import nearest_rpy, to_xyz_rpy
+from ..se3 import nearest_rotation, nearest_rpy, to_xyz_rpy
 from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
+from .xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
 _RIGIDITY_TOL = 1e-9
-
-_ELEMENT = re.compile(rb"<[^ \t\r\n/>]+")
-
-_ATTRIBUTE = re.compile(rb"""[ \t\r\n]+([^ \t\r\n=/>]+)[ \t\r\n]*=[ \t\r\n]*("[^"]*"|'[^']*')""")
 
 # White space before the first child of a joint, from the last line end on.
 _INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
 
 
-def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
-    """Return the bytes of a URDF with new joint origins.
+def changed_origins(urdf: Urdf, origins: Mapping[str, Array]) -> Iterator[tuple[UrdfJoint, Array]]:
+    """List the joints whose new origins, which must be rigid, differ from those of the file.
 
-    Translation and rotation are each rewritten only if they differ from those of the file. An unknown joint
-    raises an `UnknownNameError`.
+    An unknown joint raises an `UnknownNameError`.
     """
-    edits: list[tuple[int, int, bytes]] = []
     for name, value in origins.items():
         joint, origin = urdf.joint(name), np.asarray(value, float)
         where = f"{urdf.source}:{joint.line}: joint {name!r}: the new origin"
@@ -57,13 +52,18 @@ def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
                 f"{where} is not rigid; expected a rotation and a translation within {MAX_ORIGIN:g} m"
             )
         if not np.array_equal(origin, joint.origin):
-            edits += _origin_edits(urdf, joint, origin)
-    parts, end_of_last = [], 0
-    # The sort is stable: two attributes inserted at one offset keep their order.
-    for start, end, text in sorted(edits, key=lambda edit: edit[0]):
-        parts += [urdf.data[end_of_last:start], text]
-        end_of_last = end
-    return b"".join([*parts, urdf.data[end_of_last:]])
+            yield joint, origin
+
+
+def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
+    """Return the bytes of a URDF with new joint origins.
+
+    Translation and rotation are each rewritten only if they differ from those of the file.
+    """
+    changed = changed_origins(urdf, origins)
+    return edited(
+        urdf.data, [edit for joint, origin in changed for edit in _origin_edits(urdf, joint, origin)]
+    )
 
 
 def with_world(data: bytes, base: Array) -> bytes:
@@ -99,43 +99,28 @@ def with_fixed_frame(data: bytes, parent: str, name: str, pose: Array, option: s
     return _with_fixed_link(data, name, joint, parent, name, pose)
 
 
-def _attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, tuple[int, int]], int, bytes]:
-    """Find the attributes of the tag at a byte offset.
-
-    Expat reports the offset of a tag, but values only after normalization. The tag is known to be
-    well-formed.
-    """
-    element = _ELEMENT.match(data, start)
-    assert element is not None, "expat found a tag at this offset"
-    spans, end, quote = {}, element.end(), b""
-    while attribute := _ATTRIBUTE.match(data, end):
-        spans[attribute[1]] = attribute.start(2) + 1, attribute.end(2) - 1
-        end, quote = attribute.end(), attribute[2][:1]
-    return spans, end, quote
-
-
-def _origin_edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[tuple[int, int, bytes]]:
-    """Return the edits (start, end, new bytes) that give a joint a new origin, shape (4, 4)."""
-    u, _, vt = np.linalg.svd(origin[:3, :3])
-    rpy, old = nearest_rpy(u @ vt, joint.rpy), joint.origin
+def _origin_edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[Edit]:
+    """Return the edits that give a joint a new origin, shape (4, 4)."""
+    rpy, old = nearest_rpy(nearest_rotation(origin[:3, :3]), joint.rpy), joint.origin
     texts = {
-        key: " ".join(repr(float(x) + 0.0) for x in value).encode()  # + 0.0 turns -0.0 into 0.0
+        key: number_text(value)
         for key, value, is_unchanged in (
             (b"xyz", origin[:3, 3], np.array_equal(origin[:3, 3], old[:3, 3])),
             (b"rpy", rpy, np.array_equal(origin[:3, :3], old[:3, :3])),
         )
         if not (is_unchanged and joint.origin_start is not None)
     }
-    joint_quote = _attribute_spans(urdf.data, joint.start)[2]
+    joint_quote = attribute_spans(urdf.data, joint.start)[2]
     if joint.origin_start is None:
-        start, quote = joint.first_child, joint_quote
-        attributes = b"".join(b" " + key + b"=" + quote + text + quote for key, text in texts.items())
+        start = joint.first_child
+        attributes = b"".join(attribute_text(key, text, joint_quote) for key, text in texts.items())
         indent = _INDENT.search(urdf.data, joint.start, start)
-        return [(start, start, b"<origin" + attributes + b"/>" + (indent[0] if indent else b""))]
-    spans, end, quote = _attribute_spans(urdf.data, joint.origin_start)
-    quote = quote or joint_quote
+        return [Edit(start, start, b"<origin" + attributes + b"/>" + (indent[0] if indent else b""))]
+    spans, end, quote = attribute_spans(urdf.data, joint.origin_start)
     return [
-        (*spans[key], text) if key in spans else (end, end, b" " + key + b"=" + quote + text + quote)
+        Edit(*spans[key].value, text)
+        if key in spans
+        else Edit(end, end, attribute_text(key, text, quote or joint_quote))
         for key, text in texts.items()
     ]
 
