@@ -39,6 +39,7 @@ from ..io.toml_table import Key, TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
 from .job import Job, option_flags
+from .job_outputs import ROBOT_FORMATS
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .run_job import run_job
@@ -335,7 +336,8 @@ def _robot_text(entry: FleetJob, outcome: FleetJobOutcome) -> str:
 
 def _is_written(outcome: FleetJobOutcome) -> bool:
     """Return whether a corrected robot was written: neither failed nor refused, or refused but forced."""
-    return "urdf" in outcome.document.get("files", {})
+    files = outcome.document.get("files", {})
+    return any(ending[1:] in files for ending in ROBOT_FORMATS)
 
 
 def _require_manifest_arguments(args: Namespace) -> None:

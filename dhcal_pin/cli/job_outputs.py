@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..calibration.result import Result
     from ..io.camera_files import CameraFrame
     from ..report.provenance import Provenance
+    from ..robot.chain import Chain
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +90,33 @@ class RobotOutput(NamedTuple):
     Attributes:
         help: What the file is, for the help of --output.
         files: Function that makes the files of the robot by path, from the value of --output and all options
-            of the job by name. A format refuses the options that it cannot follow.
+            of the job by name.
+        require: Function that refuses what the format cannot hold before the calibration, from the nominal
+            robot, the value of --output and all options of the job by name.
     """
 
     help: str
     files: Callable[[Result, str, Mapping[str, Any]], dict[PathLike, str | bytes]]
+    require: Callable[[Chain, str, Mapping[str, Any]], None]
+
+
+def _any_robot(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
+    """Accept all robots and options."""
+
+
+def _require_mjcf(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
+    """Require an MJCF whose origins can be written, and no option that adds frames."""
+    from ..io.robot import with_written_origins  # lazy import, as the following: they load Pinocchio
+    from ..robot.mjcf import Mjcf
+    from ..robot.mjcf_edit import require_writable
+
+    for name in ("world_joint", "tool_frame", "camera_frame", "camera_files"):
+        if options[name]:
+            flag = name.replace("_", "-")
+            raise InvalidArgumentError(f"--{flag}: not available for {output}, an MJCF; expected a .urdf")
+    with_written_origins(chain.urdf, {}, output)
+    assert isinstance(chain.urdf, Mjcf)
+    require_writable(chain.urdf, chain.moving_joints)
 
 
 def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
@@ -161,7 +184,10 @@ def _camera_frames(
 
 
 # Formats of the calibrated robot by the ending of --output.
-ROBOT_FORMATS = {".urdf": RobotOutput("corrected URDF", urdf_with_sidecar)}
+ROBOT_FORMATS = {
+    ".urdf": RobotOutput("corrected URDF", urdf_with_sidecar, _any_robot),
+    ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF", urdf_with_sidecar, _require_mjcf),
+}
 
 
 def robot_ending(path: str) -> str:

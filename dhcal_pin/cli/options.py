@@ -110,7 +110,10 @@ DATA: dict[str, Any] = {
     "nargs": "+",
     "help": "measurement files: text such as CSV, Excel, Parquet",
 }
-TIP: dict[str, Any] = {"metavar": "LINK", "help": "tip link of a URDF (default: the deepest leaf link)"}
+TIP: dict[str, Any] = {
+    "metavar": "LINK",
+    "help": "tip link of a URDF, or body or site of an MJCF (default: the deepest leaf link)",
+}
 ROOT: dict[str, Any] = {
     "metavar": "LINK",
     "help": "link of a URDF where the chain begins, such as that of a camera (default: the root)",

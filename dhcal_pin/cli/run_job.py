@@ -96,6 +96,7 @@ def run_job(
     """Calibrate one robot and write its outputs, in this process or another; no messages are shown."""
     inputs = _checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
+    ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
     sets = chain.parameters if job.parameters is None else job.parameters

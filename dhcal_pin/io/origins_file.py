@@ -29,7 +29,7 @@ ORIGIN_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
 MIN_MOVE = 1e-8
 
 
-def without_negligible_moves(chain: Chain) -> Chain:
+def without_negligible_moves(chain: Chain, min_move: float = MIN_MOVE) -> Chain:
     """Return a chain whose joint origins are exactly nominal where they moved less than rounding errors.
 
     Translation and rotation of each origin are compared separately with the URDF.
@@ -37,8 +37,8 @@ def without_negligible_moves(chain: Chain) -> Chain:
     nominal = chain.nominal().origins
     origins = chain.origins.copy()
     change = se3.inverse(nominal) @ origins
-    same_position = np.linalg.norm(change[:, :3, 3], axis=1) <= MIN_MOVE
-    same_rotation = np.linalg.norm(se3.log3(change[:, :3, :3]), axis=1) <= MIN_MOVE
+    same_position = np.linalg.norm(change[:, :3, 3], axis=1) <= min_move
+    same_rotation = np.linalg.norm(se3.log3(change[:, :3, :3]), axis=1) <= min_move
     origins[same_position, :3, 3] = nominal[same_position, :3, 3]
     origins[same_rotation, :3, :3] = nominal[same_rotation, :3, :3]
     return replace(chain, origins=origins)
@@ -48,8 +48,8 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     """Compute the changed origin of each joint of the URDF, and the remaining tool pose.
 
     The origins of fixed joints before a moving joint stay; the origin of the moving joint takes up the whole
-    change. A change of the tip goes to the last fixed joint after the last moving joint. Without such a joint
-    it goes to the tool.
+    change. A change of the tip goes to the last fixed joint after the last moving joint whose origin the file
+    can hold. Without such a joint it goes to the tool.
     """
     nominal = chain.nominal()
     changed: dict[str, Array] = {}
@@ -74,7 +74,8 @@ def _fixed_part(chain: Chain, link: str) -> tuple[Array, UrdfJoint | None]:
     pose, last = np.eye(4), None
     for joint in chain.urdf.path(link):
         if joint.type == "fixed":
-            pose, last = pose @ joint.origin, joint
+            pose = pose @ joint.origin
+            last = last if joint.name in chain.urdf.fixed_origins else joint
         else:
             pose, last = np.eye(4), None
     return pose, last

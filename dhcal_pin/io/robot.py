@@ -16,23 +16,27 @@ from typing import Protocol
 import numpy as np
 
 from .. import se3
-from .._typing import PathLike
+from .._typing import Array, PathLike
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
-from ..messages import escape_control_characters
-from ..robot.chain import Chain
+from ..messages import escape_control_characters, quote
+from ..robot import mjcf_edit
+from ..robot.chain import Chain, without_mimics
 from ..robot.dh import Convention, DHTable
-from ..robot.urdf import parse_urdf, read_urdf
+from ..robot.mjcf import Mjcf, parse_mjcf, read_mjcf
+from ..robot.urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from ..robot.urdf_edit import with_origins
 from ..ros_packages import validated_package_dirs
 from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
 from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
+from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
 from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_additions, with_sidecar
+from .template import with_kinematics
 from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -40,8 +44,14 @@ ADDITION_TOL = 1e-14
 # Largest difference between the poses of a chain and of its written URDF, relative to the largest entry of
 # the poses or 1.
 READ_BACK_TOL = 1e-12
+# Largest difference of a tip after the kinematics were written into another file [m].
+TEMPLATE_TOL = 1e-9
 # Number of random configurations at which they are compared.
 N_READ_BACK_SAMPLES = 50
+
+
+# Why nothing but an MJCF becomes an MJCF.
+_NEEDS_TEMPLATE = "an MJCF holds more than kinematics; give the MJCF of the robot with --template"
 
 
 def robot_name(path: PathLike) -> str:
@@ -54,12 +64,25 @@ def _urdf_of_table(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     return ConvertedRobot(robot.chain.urdf.data.decode(), _notes_beside(path))
 
 
-def _copy_of_urdf(source: PathLike, target: PathLike) -> ConvertedRobot:
-    """Copy a URDF, which need not have a single deepest tip."""
+def _mjcf_needs_template(robot: RobotSource, path: PathLike) -> ConvertedRobot:
+    """Refuse to make an MJCF of a DH table."""
+    raise InvalidArgumentError(f"{os.fspath(path)}: {_NEEDS_TEMPLATE}")
+
+
+def _copy(source: PathLike, target: PathLike, urdf: Urdf) -> ConvertedRobot:
+    """Copy a URDF or an MJCF, or translate an MJCF to a URDF; no single deepest tip is needed."""
     notes = _notes_beside(target)
     if sidecar := existing_sidecar(source):
         notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
-    return ConvertedRobot(read_urdf(source).data.decode(), notes)
+    if not is_mjcf_path(target):
+        if isinstance(urdf, Mjcf):
+            notes.append(
+                f"{os.fspath(target)} has the kinematics and the stated masses of the MJCF, no meshes"
+            )
+        return ConvertedRobot(urdf.data.decode(), notes)
+    if not isinstance(urdf, Mjcf):
+        raise InvalidArgumentError(f"{os.fspath(target)}: {_NEEDS_TEMPLATE}")
+    return ConvertedRobot(urdf.file.decode(), notes)
 
 
 def _notes_beside(path: PathLike) -> list[str]:
@@ -86,7 +109,14 @@ FORMATS = (
         other_endings=(".yml",),
     ),
     RobotFormat("table of joint origins", (".origins.csv",), convert_to_origins),
+    RobotFormat("MJCF", (".xml",), _mjcf_needs_template, read_urdf=read_mjcf, other_endings=(".mjcf",)),
 )
+
+
+def is_mjcf_path(path: PathLike) -> bool:
+    """Return whether a path has the ending of an MJCF."""
+    robot_format = find_format(path)
+    return robot_format is not None and robot_format.read_urdf is read_mjcf
 
 
 def _endings(formats: Iterable[RobotFormat]) -> list[str]:
@@ -111,6 +141,24 @@ def has_dh_table(path: PathLike) -> bool:
     return robot_format is not None and robot_format.read_table is not None
 
 
+def _read_urdf(path: PathLike) -> Urdf:
+    """Read a URDF or an MJCF; a file with an unknown ending is read as a URDF."""
+    robot_format = find_format(path)
+    if robot_format is None:
+        return read_urdf(path)
+    if robot_format.read_urdf is None:
+        formats = [
+            each
+            for each in FORMATS
+            if (each.is_readable if robot_format.read_table is None else each.read_urdf)
+        ]
+        raise FileFormatError(
+            f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from "
+            f"{', '.join(_endings(formats))}"
+        )
+    return robot_format.read_urdf(path)
+
+
 def _read(
     path: PathLike,
     tip: str | None,
@@ -123,22 +171,15 @@ def _read(
     complete_interrupted_save(path)
     robot_format = find_format(path)
     table = None
-    if robot_format is None:
-        chain = Chain.from_urdf(replace(read_urdf(path), package_dirs=folders), tip, root)
-    elif robot_format.read_table is not None:
+    if robot_format is not None and robot_format.read_table is not None:
         if tip is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
         if root is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one root; leave out --root")
         table = robot_format.read_table(path)
         chain = Chain.from_dh(table, robot_name(path))
-    elif robot_format.read_urdf is not None:
-        chain = Chain.from_urdf(replace(robot_format.read_urdf(path), package_dirs=folders), tip, root)
     else:
-        readable = ", ".join(_endings(other for other in FORMATS if other.is_readable))
-        raise FileFormatError(
-            f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from {readable}"
-        )
+        chain = Chain.from_urdf(replace(_read_urdf(path), package_dirs=folders), tip, root)
     sidecar = sidecar or existing_sidecar(path)
     return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
 
@@ -168,9 +209,29 @@ def read_robot(
 
 
 def convert_robot(
-    source: PathLike, target: PathLike, tip: str | None = None, convention: Convention | None = None
+    source: PathLike,
+    target: PathLike,
+    tip: str | None = None,
+    convention: Convention | None = None,
+    template: PathLike | None = None,
+    template_tip: str | None = None,
 ) -> ConvertedRobot:
-    """Convert a robot file to another format, chosen by the ending of the target; a URDF can be copied."""
+    """Convert a robot file to another format, chosen by the ending of the target.
+
+    A URDF or an MJCF can be copied. With a template the target is that file with the kinematics of the
+    source, see `template`.
+
+    Args:
+        source: Robot file.
+        target: Path of the file to write, whose ending selects the format.
+        tip: Tip link of the source.
+        convention: Convention of a DH table to write.
+        template: URDF or MJCF of the same robot to fill in.
+        template_tip: Tip of the template; of the name of the tip of the source if None.
+
+    Returns:
+        Text of the target, and notes.
+    """
     robot_format = find_format(target)
     if robot_format is None:
         raise InvalidArgumentError(
@@ -182,10 +243,68 @@ def convert_robot(
             raise InvalidArgumentError(
                 f"{os.fspath(target)}: a URDF has no DH convention; leave out --convention"
             )
-        if source_format is None or source_format.read_urdf is not None:
-            return _copy_of_urdf(source, target)
+        if template is not None:
+            return _with_template(source, target, tip, template, template_tip)
+        read = read_urdf if source_format is None else source_format.read_urdf
+        if read is not None:
+            return _copy(source, target, read(source))
+    elif template is not None:
+        raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
     chain, table = _read(source, tip, None)
     return robot_format.convert(RobotSource(os.fspath(source), chain.urdf_alone, table, convention), target)
+
+
+def _with_template(
+    source: PathLike, target: PathLike, tip: str | None, template: PathLike, template_tip: str | None
+) -> ConvertedRobot:
+    """Write the kinematics of a robot into another file of it."""
+    robot, _ = _read(source, tip, None)
+    nominal = None if has_dh_table(template) else _read_urdf(resolve_robot_file(template))
+    if nominal is None or is_mjcf_path(target) != isinstance(nominal, Mjcf):
+        raise InvalidArgumentError(
+            f"{os.fspath(target)}: {os.fspath(template)} has another format; expected a URDF for a .urdf "
+            "and an MJCF for an .xml"
+        )
+    if template_tip is None and robot.tip not in nominal.links:
+        raise InvalidArgumentError(
+            f"{nominal.source}: no link {quote(robot.tip)} as in {robot.urdf.source}; name the same frame "
+            f"with --template-tip: {suggest_names(robot.tip, nominal.links)}"
+        )
+    nominal_chain = Chain.from_urdf(nominal, template_tip or robot.tip)
+    filled = with_kinematics(nominal_chain, robot, template)
+    data, urdf = with_written_origins(nominal, joint_origins(filled)[0], target)
+    parsed = Chain.from_urdf(urdf, filled.tip)
+    q = _random_positions(len(robot.moving_joints))
+    ideal = replace(robot, base=np.eye(4), tool=np.eye(4), transmission=None)
+    difference = np.abs(without_mimics(parsed).poses(q) - without_mimics(ideal).poses(q)).max()
+    if not difference <= TEMPLATE_TOL:
+        raise InvalidArgumentError(
+            f"{nominal.source}: cannot hold the tip of {robot.urdf.source}, which would be {difference:.2g} "
+            "off; choose a --template-tip behind a fixed joint, or a site"
+        )
+    require_agreement(parsed, nominal_chain, target)
+    notes = _notes_beside(target)
+    if sidecar := existing_sidecar(source):
+        notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
+    return ConvertedRobot(data.decode(), notes)
+
+
+def _random_positions(n_joints: int) -> Array:
+    """Return the joint positions at which a written robot is compared, shape (m, n)."""
+    return np.random.default_rng(0).uniform(-np.pi, np.pi, (N_READ_BACK_SAMPLES, n_joints))
+
+
+def with_written_origins(urdf: Urdf, origins: Mapping[str, Array], path: PathLike) -> tuple[bytes, Urdf]:
+    """Return the bytes of a robot file with new joint origins, and the robot that is read from them."""
+    if not is_mjcf_path(path):
+        data = with_origins(urdf, origins)
+        return data, parse_urdf(data, os.fspath(path))
+    if not isinstance(urdf, Mjcf):
+        raise InvalidArgumentError(
+            f"{os.fspath(path)}: {urdf.source} is no MJCF; write a .urdf, and convert it with --template"
+        )
+    data = mjcf_edit.with_origins(urdf, origins)
+    return data, parse_mjcf(data, os.fspath(path))
 
 
 def urdf_files(
@@ -207,8 +326,8 @@ def urdf_files(
     """
     alone = without_negligible_moves(chain.urdf_alone)
     complete = chain if chain.urdf_origins is not None else replace(chain, origins=alone.origins)
-    data = with_origins(chain.urdf, joint_origins(alone)[0])
-    urdf = parse_urdf(data, os.fspath(path))
+    data, urdf = with_written_origins(chain.urdf, joint_origins(alone)[0], path)
+    parsed = Chain.from_urdf(urdf, chain.tip, chain.root)
     moved, tool = joint_origins(replace(complete, urdf=urdf))
     added = {
         urdf.joint(name).child: se3.inverse(urdf.joint(name).origin) @ origin
@@ -216,7 +335,7 @@ def urdf_files(
     }
     additions = {name: pose for name, pose in added.items() if np.abs(pose - np.eye(4)).max() > ADDITION_TOL}
     written = replace(
-        Chain.from_urdf(urdf, chain.tip, chain.root),
+        parsed,
         base=chain.base,
         tool=tool,
         payload=chain.payload,
@@ -229,7 +348,7 @@ def urdf_files(
         chain, written = chain.with_transmission(transmission), written.with_transmission(transmission)
     if additions:
         written = with_additions(written, additions, os.fspath(path))
-    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_READ_BACK_SAMPLES, chain.n_joints))
+    q = _random_positions(chain.n_joints)
     poses = chain.poses(q)
     difference = np.abs(written.poses(q) - poses).max()
     if not difference <= READ_BACK_TOL * max(1.0, np.abs(poses).max()):
@@ -237,11 +356,14 @@ def urdf_files(
             f"{os.fspath(path)}: not written: the tool of the URDF as read back differs by {difference:.2g}; "
             "please report it"
         )
+    require_agreement(parsed, alone.nominal(), path)
     data = edit(data)
     contents: dict[PathLike, str | bytes] = {path: data}
     is_replaced = existing_sidecar(path) is not None
+    # The sidecar of an MJCF belongs to its translation.
+    hashed = urdf.data if isinstance(urdf, Mjcf) else data
     sidecar = sidecar_text(
-        chain, tool, data, instrument, uncertainty, measured_region, rig, additions, required=is_replaced
+        chain, tool, hashed, instrument, uncertainty, measured_region, rig, additions, required=is_replaced
     )
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar

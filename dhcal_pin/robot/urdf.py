@@ -1,8 +1,8 @@
 """URDF files: a safe parser that checks everything about the kinematics before any library reads the file.
 
 The XML is parsed by `xml_tags`, and unexpanded xacro is refused. The byte offset of every tag is recorded, so
-that `urdf_edit` can rewrite single attributes. Errors name file and line. A `Urdf` is a tree of links and joints without cycles, whose numbers
-are finite.
+that `urdf_edit` can rewrite single attributes. Errors name file and line. A `Urdf` is a tree of links and
+joints without cycles, whose numbers are finite.
 
 Lengths are in metres and angles in radians. The origin of a joint is the pose of its frame in the frame of
 its parent link, T = Trans(xyz) · Rz(yaw) · Ry(pitch) · Rx(roll), as in the URDF specification
@@ -22,7 +22,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..exceptions import FileFormatError, UnknownNameError
+from ..exceptions import UnknownNameError
 from ..messages import quote
 from ..ros_packages import mesh_folders
 from .xml_tags import XmlTag, parse_numbers, read_xml, scan
@@ -70,7 +70,7 @@ _NUMERIC_ATTRIBUTES = {
 # What other files are, by their outermost element.
 _OTHER_FORMATS = {
     "sdf": "this is SDF, not URDF",
-    "mujoco": "this is MJCF, not URDF, and needs the ending .xml",
+    "mujoco": "this is MJCF, which is read by read_robot from files that end with .xml",
 }
 
 
@@ -117,6 +117,8 @@ class Urdf:
     root: str  #: Name of the link without a parent.
     #: Folders in which packages with meshes are searched first, see `mesh_folders`.
     package_dirs: tuple[str, ...] = ()
+    #: Names of joints whose origins the file cannot hold, see `mjcf`.
+    fixed_origins: frozenset[str] = frozenset()
 
     @cached_property
     def _joints_by_name(self) -> dict[str, UrdfJoint]:

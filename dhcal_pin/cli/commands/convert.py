@@ -30,6 +30,18 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--convention", choices=("standard", "modified"), help="DH convention of the file to write"
     )
     parser.add_argument(
+        "--template",
+        metavar="FILE",
+        type=ROBOT["type"],
+        help="write this URDF or MJCF of the same robot with the kinematics of IN; joints are matched by "
+        "their names, and all else stays",
+    )
+    parser.add_argument(
+        "--template-tip",
+        metavar="LINK",
+        help="link, body or site of the template that is the tip of IN (default: the one of the same name)",
+    )
+    parser.add_argument(
         "--pose-topic",
         metavar="TOPIC",
         help="topic of the measured poses or points of a recording, TOPIC:FRAME for a child frame of "
@@ -58,8 +70,8 @@ def run(args: Namespace) -> int:
     from ..screens.result_screens import files_block, notes_block
     from ..screens.screen import Screen
 
-    robots = [args.robot] if args.robot else []
-    require_writable_outputs([args.output], [args.input, *robots])
+    others = [path for path in (args.robot, args.template) if path]
+    require_writable_outputs([args.output], [args.input, *others])
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_outputs({args.output: text})
     console.show(Screen([notes_block(notes), files_block([args.output])]), args.verbosity)
@@ -77,7 +89,9 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
             )
     if args.robot:
         raise InvalidArgumentError("--robot: only for a recording; omit it")
-    return convert_robot(args.input, args.output, args.tip, args.convention)
+    if args.template_tip and not args.template:
+        raise InvalidArgumentError("--template-tip: needs --template, the file that it is in")
+    return convert_robot(args.input, args.output, args.tip, args.convention, args.template, args.template_tip)
 
 
 def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
@@ -87,8 +101,9 @@ def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
 
     if not args.output.lower().endswith(".csv"):
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
-    if args.convention:
-        raise InvalidArgumentError("--convention: a recording has none; omit it")
+    for option, value in (("--convention", args.convention), ("--template", args.template)):
+        if value:
+            raise InvalidArgumentError(f"{option}: a recording has none; omit it")
     chain = (
         read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
         if args.robot

@@ -1,0 +1,170 @@
+"""Written robot files read back by other programs, whose forward kinematics must be those of the chain.
+
+Pinocchio reads every robot. A URDF is read by yourdfpy too, and an MJCF by MuJoCo, where they are installed.
+A program that already reads the nominal robot in another way, or not at all, is left out: axes that are not
+normalized, for example, are read differently.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from .. import se3
+from .._typing import Array, PathLike
+from ..exceptions import DhcalError
+from ..native_output import discard_native_messages
+from ..robot.chain import Chain
+from ..robot.mjcf import ORIENTATIONS, Mjcf, MjcfTag
+from ..robot.urdf import Urdf, xml_attribute
+from ..robot.urdf_path import build_model
+
+# Largest difference of the tip [m, and entries of its rotation], relative to the largest entry or 1.
+READER_TOL = 1e-9
+# Number of random configurations at which the tip is compared.
+_N_SAMPLES = 10
+# Elements of an MJCF that move bodies, with their attributes.
+_POSE = ("name", "pos", *ORIENTATIONS)
+_KINEMATIC = {
+    "compiler": ("angle", "eulerseq"),
+    "default": ("class",),
+    "worldbody": ("childclass",),
+    "body": (*_POSE, "childclass"),
+    "frame": (*_POSE, "childclass"),
+    "joint": ("name", "class", "type", "pos", "axis", "ref"),
+    "freejoint": ("name",),
+    "site": _POSE,
+}
+
+
+class Reader(NamedTuple):
+    """Program that reads robot files.
+
+    Attributes:
+        name: Name in messages.
+        module: Python package that must be installed.
+        reads: Classes of the robots that it reads.
+        poses: Function that computes the poses (m, 4, 4) of the tip of a chain in its first link from joint
+            positions (m, n), with nothing but the file.
+    """
+
+    name: str
+    module: str
+    reads: tuple[type[Urdf], ...]
+    poses: Callable[[Chain, Array], Array]
+
+
+def _pinocchio_poses(chain: Chain, q: Array) -> Array:
+    """Compute the poses of the tip by Pinocchio."""
+    model = build_model(chain.urdf)
+    data = model.createData()
+    root, tip = (model.getFrameId(link, pin.FrameType.BODY) for link in (chain.root, chain.tip))
+    out = []
+    for configuration in chain.configurations(q):
+        pin.framesForwardKinematics(model, data, configuration)
+        out.append((data.oMf[root].inverse() * data.oMf[tip]).homogeneous)
+    return np.array(out)
+
+
+def _yourdfpy_poses(chain: Chain, q: Array) -> Array:
+    """Compute the poses of the tip by yourdfpy."""
+    import yourdfpy  # lazy import: takes most of a second
+
+    robot: Any = yourdfpy.URDF.load(
+        io.BytesIO(chain.urdf.data), load_meshes=False, build_collision_scene_graph=False
+    )
+    out = []
+    for row in q:
+        robot.update_cfg(dict(zip(chain.joint_names, row, strict=True)))
+        out.append(robot.get_transform(chain.tip, chain.root))
+    return np.array(out)
+
+
+def _mujoco_poses(chain: Chain, q: Array) -> Array:
+    """Compute the poses of the tip by MuJoCo."""
+    import mujoco  # lazy import: only for MJCF
+
+    assert isinstance(chain.urdf, Mjcf)
+    assert chain.urdf.document is not None
+    model: Any = mujoco.MjModel.from_xml_string(kinematics_text(chain.urdf.document))
+    data: Any = mujoco.MjData(model)
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    frames = [data.body(name) if name in bodies else data.site(name) for name in (chain.root, chain.tip)]
+    addresses = [model.joint(name).qposadr[0] for name in chain.joint_names]
+    out = []
+    for row in q:
+        data.qpos[addresses] = row
+        mujoco.mj_kinematics(model, data)
+        root, tip = (se3.transform(frame.xmat.reshape(3, 3), frame.xpos) for frame in frames)
+        out.append(se3.inverse(root) @ tip)
+    return np.array(out)
+
+
+def kinematics_text(tag: MjcfTag) -> str:
+    """Write the elements of an MJCF that move bodies, with values as in the file, but without shapes."""
+    if tag.element == "mujoco":
+        attributes, start = "", '<compiler boundmass="1e-3" boundinertia="1e-6"/>'
+    else:
+        keys = [key for key in _KINEMATIC[tag.element] if key in tag.attributes]
+        attributes = "".join(f" {key}={xml_attribute(tag.attributes[key])}" for key in keys)
+        start = ""
+    children = [
+        child
+        for child in tag.children
+        # Defaults of sites may name materials, and have no poses.
+        if child.element in _KINEMATIC and not (tag.element == "default" and child.element == "site")
+    ]
+    content = "".join(map(kinematics_text, children))
+    return f"<{tag.element}{attributes}>{start}{content}</{tag.element}>"
+
+
+READERS = (
+    Reader("Pinocchio", "pinocchio", (Urdf, Mjcf), _pinocchio_poses),
+    Reader("yourdfpy", "yourdfpy", (Urdf,), _yourdfpy_poses),
+    Reader("MuJoCo", "mujoco", (Mjcf,), _mujoco_poses),
+)
+
+
+def require_agreement(written: Chain, nominal: Chain, path: PathLike) -> None:
+    """Require that all programs compute the tip of a written robot as the chain does.
+
+    Args:
+        written: Chain read from the bytes of the file, with identity base and tool and ideal joints.
+        nominal: The same for the file that was edited.
+        path: Path of the file for messages.
+
+    Raises:
+        DhcalError: A program that reads the nominal robot computes another tip.
+    """
+    for reader in READERS:
+        if type(written.urdf) not in reader.reads or not find_spec(reader.module):
+            continue
+        difference = _difference(reader, written)
+        if difference <= READER_TOL or not _difference(reader, nominal) <= READER_TOL:
+            continue
+        result = (
+            "cannot read it" if difference == np.inf else f"computes a tip that differs by {difference:.2g}"
+        )
+        raise DhcalError(f"{os.fspath(path)}: not written: {reader.name} {result}; please report it")
+
+
+def _difference(reader: Reader, chain: Chain) -> float:
+    """Return the largest difference of a tip, relative to the largest entry or 1; inf if it is not read."""
+    q = np.random.default_rng(1).uniform(-1.0, 1.0, (_N_SAMPLES, chain.n_joints))
+    poses = chain.poses(q)
+    try:
+        # Imports of the programs warn of their own dependencies.
+        with warnings.catch_warnings(), discard_native_messages():
+            warnings.simplefilter("ignore")
+            difference = np.abs(reader.poses(chain, q) - poses).max()
+    # What a program raises depends on the program.
+    except Exception:
+        return np.inf
+    return float(difference) / max(1.0, np.abs(poses).max()) if np.isfinite(difference) else np.inf

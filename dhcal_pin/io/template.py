@@ -1,0 +1,121 @@
+"""Kinematics of one robot file in another one: a template whose joint origins take up those of a robot.
+
+Both files describe one robot with the same names of joints, but their joint frames may differ, as those of
+a URDF and an MJCF often do. The forward kinematics of a chain follow from the poses of its joint axes and of
+its tip at zero joint positions. A joint frame of the template therefore becomes
+
+- that of the robot, if both are nearly equal: then all links have the same poses in both files,
+- otherwise the frame of the template after the smallest motion that puts its axis onto that of the robot:
+  shapes stay where they are in the template, up to this motion.
+
+The tip becomes that of the robot. Where the template cannot move its tip in the last link, as without a fixed
+joint or a site, the frame of the last joint follows from it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+
+import numpy as np
+
+from .. import se3
+from .._typing import Array, PathLike
+from ..exceptions import InvalidArgumentError
+from ..messages import quote
+from ..robot.chain import Chain
+from .origins_file import joint_origins, without_negligible_moves
+
+# Largest distance [m] and angle [rad] of frames that count as the same frame before and after a calibration.
+SAME_FRAME = (0.01, 0.05)
+# Largest motion of an axis or a tip [m, rad]; beyond it the files describe different robots.
+SAME_ROBOT = (0.05, 0.1)
+# Largest difference of axes in the same frame.
+_AXIS_TOL = 1e-9
+# Motions that are rounding errors [m or rad].
+_ROUNDING = 1e-14
+
+
+def with_kinematics(template: Chain, robot: Chain, path: PathLike) -> Chain:
+    """Return a template with joint origins that give its tip the poses of the tip of a robot.
+
+    Args:
+        template: Chain of the file to fill in.
+        robot: Chain of the calibrated robot.
+        path: Path of the template for messages.
+
+    Raises:
+        InvalidArgumentError: The files do not describe the same robot between root and tip.
+    """
+    source = os.fspath(path)
+    if template.moving_joints != robot.moving_joints or not np.array_equal(
+        template.prismatic, robot.prismatic
+    ):
+        raise InvalidArgumentError(
+            f"{source}: the joints up to {quote(template.tip)} are {', '.join(template.moving_joints)}; "
+            f"expected those of {robot.urdf.source}: {', '.join(robot.moving_joints)}"
+        )
+    old, given = np.array(_frames(template)), np.array(_frames(robot))
+    new = [
+        _joint_frame(source, name, old[j], template.axes[j], given[j], robot.axes[j], template.prismatic[j])
+        for j, name in enumerate(template.moving_joints)
+    ]
+    if _exceeds(se3.inverse(given[-1]) @ old[-1], SAME_ROBOT):
+        raise InvalidArgumentError(
+            f"{source}: {quote(template.tip)} is {_text(se3.inverse(given[-1]) @ old[-1])} from "
+            f"{quote(robot.tip)} of {robot.urdf.source}; name the same frame with --tip and --template-tip"
+        )
+    filled = _with_frames(template, [*new, given[-1]])
+    if np.array_equal(joint_origins(filled)[1], np.eye(4)):
+        return filled
+    return _with_frames(template, [*new[:-1], given[-1] @ se3.inverse(template.origins[-1]), given[-1]])
+
+
+def _frames(chain: Chain) -> list[Array]:
+    """Return the poses of the joints and of the tip at zero joint positions, in the first link."""
+    poses = [np.eye(4)]
+    for origin in chain.origins:
+        poses.append(poses[-1] @ origin)
+    return poses[1:]
+
+
+def _with_frames(template: Chain, frames: list[Array]) -> Chain:
+    """Return a chain with other poses of the joints and of the tip at zero joint positions."""
+    before = [np.eye(4), *frames[:-1]]
+    origins = [se3.inverse(a) @ b for a, b in zip(before, frames, strict=True)]
+    return without_negligible_moves(replace(template, origins=np.array(origins)), _ROUNDING)
+
+
+def _joint_frame(
+    source: str, name: str, old: Array, axis: Array, given: Array, given_axis: Array, is_prismatic: bool
+) -> Array:
+    """Compute the frame of a joint of the template from that of the robot, shape (4, 4)."""
+    if np.abs(axis - given_axis).max() <= _AXIS_TOL and not _exceeds(se3.inverse(given) @ old, SAME_FRAME):
+        return given
+    a, b = old[:3, :3] @ axis, given[:3, :3] @ given_axis
+    sine = np.linalg.norm(np.cross(a, b))
+    turn = se3.exp3(np.cross(a, b) * (np.arctan2(sine, a @ b) / sine if sine else 0.0))
+    shift = np.zeros(3)
+    if not is_prismatic:
+        shift = given[:3, 3] - old[:3, 3]
+        shift -= (shift @ b) * b
+    motion = se3.transform(turn, shift)
+    if _exceeds(motion, SAME_ROBOT):
+        raise InvalidArgumentError(
+            f"{source}: the axis of joint {quote(name)} is {_text(motion)} from that of the robot; expected "
+            "the same robot with the same root, zero position and directions of its joints"
+        )
+    return se3.transform(turn @ old[:3, :3], old[:3, 3] + shift)
+
+
+def _exceeds(motion: Array, limits: tuple[float, float]) -> bool:
+    """Return whether a motion is larger than a distance [m] or an angle [rad]."""
+    return bool(
+        np.linalg.norm(motion[:3, 3]) > limits[0] or np.linalg.norm(se3.log3(motion[:3, :3])) > limits[1]
+    )
+
+
+def _text(motion: Array) -> str:
+    """Describe the size of a motion."""
+    angle = np.degrees(np.linalg.norm(se3.log3(motion[:3, :3])))
+    return f"{1e3 * np.linalg.norm(motion[:3, 3]):.3g} mm and {angle:.3g}°"
