@@ -99,10 +99,10 @@ def parse_mjcf(data: bytes, source: str) -> Urdf:
         return parse_urdf(data, source)
     if root.element != "mujoco":
         raise root.error("neither MJCF nor URDF; expected <mujoco> or <robot> as the outermost element")
-    worlds = tuple(tag for tag in root.children if tag.element == "worldbody")
+    translation = _Translation(root)
+    worlds = [tag for tag in root.children if tag.element == "worldbody"]
     if not worlds:
         raise root.error("no <worldbody>; expected the bodies of a robot in it")
-    translation = _Translation(source, root)
     translation.add_worlds(worlds)
     name = xml_attribute(root.attributes.get("model") or "robot")
     text = "\n".join([f"<robot name={name}>", *translation.lines, "</robot>", ""])
@@ -145,8 +145,7 @@ class _Scope(NamedTuple):
 class _Translation:
     """Lines of the URDF of an MJCF, and where the origins of its joints are."""
 
-    def __init__(self, source: str, root: MjcfTag):
-        self.source = source
+    def __init__(self, root: MjcfTag):
         self.lines: list[str] = []
         self.tags: dict[str, MjcfTag] = {}  # Tags behind the joints by name, for messages
         self.bodies: dict[str, MjcfTag] = {}
@@ -257,7 +256,7 @@ class _Translation:
 
     # --- bodies --------------------------------------------------------------------------------------
 
-    def add_worlds(self, worlds: tuple[MjcfTag, ...]) -> None:
+    def add_worlds(self, worlds: list[MjcfTag]) -> None:
         """Translate all bodies, then all sites: a name that a body and a site share means the body."""
         self.lines.append('<link name="world"/>')
         for world in worlds:
@@ -285,7 +284,7 @@ class _Translation:
 
     def _add_body(self, tag: MjcfTag, scope: _Scope) -> _Scope:
         """Translate a body and its joints; return the scope of its elements."""
-        name = tag.attributes.get("name") or f"body of line {tag.line}"
+        name = tag.attributes.get("name") or f"unnamed body {len(self.bodies) + 1}"
         if name in self.bodies:
             raise tag.error(f"the name is already used on line {self.bodies[name].line}; give it another one")
         self.bodies[name] = tag
@@ -299,7 +298,7 @@ class _Translation:
         ]
         link, origin = scope.link, scope.frame @ self.pose(tag)
         for number, joint in enumerate(joints):
-            joint_name = joint.attributes.get("name") or f"joint of line {joint.line}"
+            joint_name = joint.attributes.get("name") or f"unnamed joint {len(self.tags) + 1}"
             urdf_type, in_body, limits, axis = self._joint(joint)
             after = in_body @ self._at_reference(joint, urdf_type, axis)
             if number:
