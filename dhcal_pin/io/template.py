@@ -14,8 +14,10 @@ joint or a site, the frame of the last joint follows from it.
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +28,25 @@ from ..messages import quote
 from ..robot.chain import Chain
 from .origins_file import joint_origins, without_negligible_moves
 
-# Largest distance [m] and angle [rad] of frames that count as the same frame before and after a calibration.
-SAME_FRAME = (0.01, 0.05)
-# Largest motion of an axis or a tip [m, rad]; beyond it the files describe different robots.
-SAME_ROBOT = (0.05, 0.1)
+
+class _Size(NamedTuple):
+    """Size of a motion."""
+
+    distance: float  # [m]
+    angle: float  # [rad]
+
+    def exceeds(self, limit: _Size) -> bool:
+        """Return whether the distance or the angle is larger than a limit."""
+        return self.distance > limit.distance or self.angle > limit.angle
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.distance:.3g} mm and {math.degrees(self.angle):.3g}°"
+
+
+# Largest motion of a frame that counts as the same frame before and after a calibration.
+SAME_FRAME = _Size(0.01, 0.05)
+# Largest motion of an axis or a tip; beyond it the files describe different robots.
+SAME_ROBOT = _Size(0.05, 0.1)
 # Largest difference of axes in the same frame.
 _AXIS_TOL = 1e-9
 # Motions that are rounding errors [m or rad].
@@ -60,10 +77,11 @@ def with_kinematics(template: Chain, robot: Chain, path: PathLike) -> Chain:
         _joint_frame(source, name, old[j], template.axes[j], given[j], robot.axes[j], template.prismatic[j])
         for j, name in enumerate(template.moving_joints)
     ]
-    if _exceeds(se3.inverse(given[-1]) @ old[-1], SAME_ROBOT):
+    motion = _size(se3.inverse(given[-1]) @ old[-1])
+    if motion.exceeds(SAME_ROBOT):
         raise InvalidArgumentError(
-            f"{source}: {quote(template.tip)} is {_text(se3.inverse(given[-1]) @ old[-1])} from "
-            f"{quote(robot.tip)} of {robot.urdf.source}; name the same frame with --tip and --template-tip"
+            f"{source}: {quote(template.tip)} is {motion} from {quote(robot.tip)} of {robot.urdf.source}; "
+            "name the same frame with --tip and --template-tip"
         )
     filled = _with_frames(template, [*new, given[-1]])
     if np.array_equal(joint_origins(filled)[1], np.eye(4)):
@@ -90,32 +108,25 @@ def _joint_frame(
     source: str, name: str, old: Array, axis: Array, given: Array, given_axis: Array, is_prismatic: bool
 ) -> Array:
     """Compute the frame of a joint of the template from that of the robot, shape (4, 4)."""
-    if np.abs(axis - given_axis).max() <= _AXIS_TOL and not _exceeds(se3.inverse(given) @ old, SAME_FRAME):
+    has_same_axis = np.abs(axis - given_axis).max() <= _AXIS_TOL
+    if has_same_axis and not _size(se3.inverse(given) @ old).exceeds(SAME_FRAME):
         return given
     a, b = old[:3, :3] @ axis, given[:3, :3] @ given_axis
-    sine = np.linalg.norm(np.cross(a, b))
-    turn = se3.exp3(np.cross(a, b) * (np.arctan2(sine, a @ b) / sine if sine else 0.0))
-    shift = np.zeros(3)
+    normal, shift = np.cross(a, b), np.zeros(3)
+    sine = float(np.linalg.norm(normal))
     if not is_prismatic:
         shift = given[:3, 3] - old[:3, 3]
         shift -= (shift @ b) * b
-    motion = se3.transform(turn, shift)
-    if _exceeds(motion, SAME_ROBOT):
+    motion = _Size(float(np.linalg.norm(shift)), math.atan2(sine, a @ b))
+    if motion.exceeds(SAME_ROBOT):
         raise InvalidArgumentError(
-            f"{source}: the axis of joint {quote(name)} is {_text(motion)} from that of the robot; expected "
-            "the same robot with the same root, zero position and directions of its joints"
+            f"{source}: the axis of joint {quote(name)} is {motion} from that of the robot; expected the "
+            "same robot with the same root, zero position and directions of its joints"
         )
+    turn = se3.exp3(normal * (motion.angle / sine)) if sine else np.eye(3)
     return se3.transform(turn @ old[:3, :3], old[:3, 3] + shift)
 
 
-def _exceeds(motion: Array, limits: tuple[float, float]) -> bool:
-    """Return whether a motion is larger than a distance [m] or an angle [rad]."""
-    return bool(
-        np.linalg.norm(motion[:3, 3]) > limits[0] or np.linalg.norm(se3.log3(motion[:3, :3])) > limits[1]
-    )
-
-
-def _text(motion: Array) -> str:
-    """Describe the size of a motion."""
-    angle = np.degrees(np.linalg.norm(se3.log3(motion[:3, :3])))
-    return f"{1e3 * np.linalg.norm(motion[:3, 3]):.3g} mm and {angle:.3g}°"
+def _size(motion: Array) -> _Size:
+    """Return the size of a motion, shape (4, 4)."""
+    return _Size(float(np.linalg.norm(motion[:3, 3])), float(np.linalg.norm(se3.log3(motion[:3, :3]))))

@@ -258,6 +258,7 @@ class _Translation:
 
     def add_worlds(self, worlds: list[MjcfTag]) -> None:
         """Translate all bodies, then all sites: a name that a body and a site share means the body."""
+        self.bodies["world"] = worlds[0]
         self.lines.append('<link name="world"/>')
         for world in worlds:
             self._add_elements(world, _Scope(childclass=world.attributes.get("childclass", "")))
@@ -279,7 +280,7 @@ class _Translation:
                 self._add_elements(tag, scope._replace(frame=frame, childclass=childclass))
             elif tag.element == "body":
                 self._add_elements(tag, self._add_body(tag, scope))
-            elif tag.element == "site" and "name" in tag.attributes and "fromto" not in tag.attributes:
+            elif tag.element == "site" and tag.attributes.get("name") and "fromto" not in tag.attributes:
                 self.sites.append((tag, scope))
 
     def _add_body(self, tag: MjcfTag, scope: _Scope) -> _Scope:
