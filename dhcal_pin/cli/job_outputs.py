@@ -107,8 +107,8 @@ def _any_robot(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
 def _require_mjcf(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
     """Require an MJCF whose origins can be written, and no option that adds frames."""
     from ..io.robot import with_written_origins  # lazy import, as the following: they load Pinocchio
-    from ..robot.mjcf import Mjcf
-    from ..robot.mjcf_edit import require_writable
+    from ..robot.formats.mjcf import Mjcf
+    from ..robot.formats.mjcf_edit import require_writable
 
     for name in ("world_joint", "tool_frame", "camera_frame", "camera_files"):
         if options[name]:

@@ -22,7 +22,7 @@ from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..native_output import discard_native_messages
 from ..robot.chain import Chain
-from ..robot.mjcf import ORIENTATIONS, Mjcf, MjcfTag
+from ..robot.formats.mjcf import ORIENTATIONS, Mjcf, MjcfTag
 from ..robot.urdf import Urdf, xml_attribute
 from ..robot.urdf_path import build_model
 

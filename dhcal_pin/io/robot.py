@@ -22,10 +22,10 @@ from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, Refu
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..messages import escape_control_characters, quote
-from ..robot import mjcf_edit
 from ..robot.chain import Chain, without_mimics
 from ..robot.dh import Convention, DHTable
-from ..robot.mjcf import Mjcf, parse_mjcf, read_mjcf
+from ..robot.formats import mjcf_edit
+from ..robot.formats.mjcf import Mjcf, parse_mjcf, read_mjcf
 from ..robot.urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from ..robot.urdf_edit import with_origins
 from ..ros_packages import validated_package_dirs

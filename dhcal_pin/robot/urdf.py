@@ -25,7 +25,7 @@ from .._typing import Array, PathLike
 from ..exceptions import UnknownNameError
 from ..messages import quote
 from ..ros_packages import mesh_folders
-from .xml_tags import XmlTag, parse_numbers, read_xml, scan
+from .formats.xml_tags import XmlTag, parse_numbers, read_xml, scan
 
 # Maximum number of links and of joints.
 _MAX_ELEMENTS = 20_000

@@ -19,8 +19,8 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..se3 import nearest_rotation, nearest_rpy, to_xyz_rpy
+from .formats.xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
 from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
-from .xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
 _RIGIDITY_TOL = 1e-9

@@ -14,7 +14,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_back, read_robot, urdf_files
 from dhcal_pin.io.read_back import READER_TOL, READERS, Reader, require_agreement
 from dhcal_pin.robot import Chain
-from dhcal_pin.robot.mjcf import parse_mjcf
+from dhcal_pin.robot.formats.mjcf import parse_mjcf
 
 
 def robots() -> dict[str, Chain]:

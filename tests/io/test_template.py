@@ -17,7 +17,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import convert_robot, read_robot, urdf_files
 from dhcal_pin.io.read_back import _pinocchio_poses
 from dhcal_pin.robot import Chain
-from dhcal_pin.robot.mjcf import parse_mjcf
+from dhcal_pin.robot.formats.mjcf import parse_mjcf
 
 UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 POSES = re.compile(r' (pos|quat|xyz|rpy)="[^"]*"')

@@ -17,8 +17,8 @@ from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import joint_origins, read_robot, urdf_files
 from dhcal_pin.robot import Chain
-from dhcal_pin.robot.mjcf import Mjcf, parse_mjcf
-from dhcal_pin.robot.mjcf_edit import with_origins
+from dhcal_pin.robot.formats.mjcf import Mjcf, parse_mjcf
+from dhcal_pin.robot.formats.mjcf_edit import with_origins
 
 ARMS = pytest.mark.parametrize("arm", ROBOTS)
 POSE = re.compile(rb"""[ ]+(pos|quat|euler|axisangle|xyaxes|zaxis)\s*=\s*("[^"]*"|'[^']*')""")

@@ -13,13 +13,13 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import pinocchio as pin
 
-from .. import se3
-from .._typing import Array
-from ..exceptions import InvalidArgumentError
-from ..messages import quote
+from ... import se3
+from ..._typing import Array
+from ...exceptions import InvalidArgumentError
+from ...messages import quote
+from ..urdf import UrdfJoint
+from ..urdf_edit import changed_origins
 from .mjcf import ORIENTATIONS, Mjcf
-from .urdf import UrdfJoint
-from .urdf_edit import changed_origins
 from .xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
 
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 from xml.parsers import expat
 
-from .._typing import PathLike
-from ..exceptions import FileFormatError
-from ..messages import quote
-from ..ros_packages import resolve_robot_path
+from ..._typing import PathLike
+from ...exceptions import FileFormatError
+from ...messages import quote
+from ...ros_packages import resolve_robot_path
 
 # Maximum size of a file [byte], and depth of nested elements.
 _MAX_BYTES = 16 << 20

@@ -26,10 +26,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import se3
-from .._typing import Array, PathLike
-from ..messages import quote
-from .urdf import MAX_MASS, MAX_ORIGIN, Urdf, parse_urdf, suggest_names, xml_attribute
+from ... import se3
+from ..._typing import Array, PathLike
+from ...messages import quote
+from ..urdf import MAX_MASS, MAX_ORIGIN, Urdf, parse_urdf, suggest_names, xml_attribute
 from .xml_tags import XmlTag, number_text, parse_numbers, read_xml, scan
 
 # Attributes of an orientation, with the number of their values.
