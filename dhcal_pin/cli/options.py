@@ -260,7 +260,13 @@ def _robot_formats() -> str:
 def _written_formats() -> str:
     from ..io.robot import FORMATS  # lazy import: loads Pinocchio
 
-    return _format_list(FORMATS)
+    return _format_list(robot_format for robot_format in FORMATS if robot_format.convert)
+
+
+def _correction_formats() -> str:
+    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
+
+    return _format_list(robot_format for robot_format in FORMATS if robot_format.correct)
 
 
 def _format_list(formats: Iterable[RobotFormat]) -> str:
@@ -276,6 +282,7 @@ def _shipped_studies() -> str:
 
 # Text of each placeholder; called only when a help page is printed.
 PLACEHOLDERS: dict[str, Callable[[], str]] = {
+    "correction_formats": _correction_formats,
     "criteria": _criteria,
     "error_families": _error_families,
     "kinds": _kinds,

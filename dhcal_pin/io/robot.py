@@ -31,13 +31,14 @@ from ..robot.urdf_edit import with_origins
 from ..ros_packages import validated_package_dirs
 from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
+from .makers.staubli_arm import correct_staubli_arm
+from .makers.ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
 from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_additions, with_sidecar
 from .template import with_kinematics
-from .ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
 ADDITION_TOL = 1e-14
@@ -110,6 +111,7 @@ FORMATS = (
     ),
     RobotFormat("table of joint origins", (".origins.csv",), convert_to_origins),
     RobotFormat("MJCF", (".xml",), _mjcf_needs_template, read_urdf=read_mjcf, other_endings=(".mjcf",)),
+    RobotFormat("joint offsets of Stäubli", (".cfx",), correct=correct_staubli_arm),
 )
 
 
@@ -146,15 +148,15 @@ def _read_urdf(path: PathLike) -> Urdf:
     robot_format = find_format(path)
     if robot_format is None:
         return read_urdf(path)
-    if robot_format.read_urdf is None:
-        formats = [
-            each
-            for each in FORMATS
-            if (each.is_readable if robot_format.read_table is None else each.read_urdf)
-        ]
+    if robot_format.correct is not None:
         raise FileFormatError(
-            f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from "
-            f"{', '.join(_endings(formats))}"
+            f"{os.fspath(path)}: holds corrections of a robot; apply them to the nominal one with dhcal "
+            "convert and --template"
+        )
+    if robot_format.read_urdf is None:
+        readable = ", ".join(_endings(other for other in FORMATS if other.is_readable))
+        raise FileFormatError(
+            f"{os.fspath(path)}: a {robot_format.name} cannot be read as a robot; choose from {readable}"
         )
     return robot_format.read_urdf(path)
 
@@ -233,10 +235,9 @@ def convert_robot(
         Text of the target, and notes.
     """
     robot_format = find_format(target)
-    if robot_format is None:
-        raise InvalidArgumentError(
-            f"{os.fspath(target)}: unknown ending; choose from {', '.join(_endings(FORMATS))}"
-        )
+    if robot_format is None or robot_format.convert is None:
+        written = _endings(other for other in FORMATS if other.convert)
+        raise InvalidArgumentError(f"{os.fspath(target)}: unknown ending; choose from {', '.join(written)}")
     source_format = find_format(source)
     if robot_format.read_urdf is not None:
         if convention is not None:
@@ -258,13 +259,19 @@ def _with_template(
     source: PathLike, target: PathLike, tip: str | None, template: PathLike, template_tip: str | None
 ) -> ConvertedRobot:
     """Write the kinematics of a robot into another file of it."""
-    robot, _ = _read(source, tip, None)
     nominal = None if has_dh_table(template) else _read_urdf(resolve_robot_file(template))
     if nominal is None or is_mjcf_path(target) != isinstance(nominal, Mjcf):
         raise InvalidArgumentError(
             f"{os.fspath(target)}: {os.fspath(template)} has another format; expected a URDF for a .urdf "
             "and an MJCF for an .xml"
         )
+    notes = _notes_beside(target)
+    source_format = find_format(source)
+    if source_format is not None and source_format.correct is not None:
+        robot, applied = source_format.correct(source, Chain.from_urdf(nominal, template_tip or tip))
+        notes += applied
+    else:
+        robot, _ = _read(source, tip, None)
     if template_tip is None and robot.tip not in nominal.links:
         raise InvalidArgumentError(
             f"{nominal.source}: no link {quote(robot.tip)} as in {robot.urdf.source}; name the same frame "
@@ -283,7 +290,6 @@ def _with_template(
             "off; choose a --template-tip behind a fixed joint, or a site"
         )
     require_agreement(parsed, nominal_chain, target)
-    notes = _notes_beside(target)
     if sidecar := existing_sidecar(source):
         notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
     return ConvertedRobot(data.decode(), notes)

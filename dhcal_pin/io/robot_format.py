@@ -2,7 +2,8 @@
 
 A format is one module of this package with its functions, and one row of `robot.FORMATS`. Two kinds of
 robot description can be read: a DH table, whose only tip is the end of its last row, and a URDF, whose tip is
-chosen by name. Every format is written from a `RobotSource`, the robot that is to be converted.
+chosen by name. A file of a maker may hold corrections only, which are applied to a nominal robot. A format is
+written from a `RobotSource`, the robot that is to be converted.
 """
 
 from __future__ import annotations
@@ -40,12 +41,15 @@ class RobotFormat:
 
     name: str  #: Name in help texts and messages.
     endings: tuple[str, ...]  #: Recommended endings of file names, lower case.
-    #: Function that returns the text of a robot at a path.
-    convert: Callable[[RobotSource, PathLike], ConvertedRobot]
+    #: Function that returns the text of a robot at a path; None if the format is only read.
+    convert: Callable[[RobotSource, PathLike], ConvertedRobot] | None = None
     #: Function that reads a DH table; None if the format holds none.
     read_table: Callable[[PathLike], DHTable] | None = None
     #: Function that reads a URDF; None if the format holds none.
     read_urdf: Callable[[PathLike], Urdf] | None = None
+    #: Function that applies the corrections of a file to a nominal chain, and notes what it did; None if the
+    #: format holds none.
+    correct: Callable[[PathLike, Chain], tuple[Chain, list[str]]] | None = None
     other_endings: tuple[str, ...] = ()  #: Endings that are accepted, too.
 
     @property

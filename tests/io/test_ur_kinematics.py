@@ -15,7 +15,12 @@ from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import dh_text, read_robot
-from dhcal_pin.io.ur_kinematics import _yaml_number, read_ur_kinematics, ur_kinematics, ur_kinematics_text
+from dhcal_pin.io.makers.ur_kinematics import (
+    _yaml_number,
+    read_ur_kinematics,
+    ur_kinematics,
+    ur_kinematics_text,
+)
 from dhcal_pin.robot import Chain, DHTable
 
 FACTORY = DATA / "ur_factory/ur10_delta_dh.csv"

@@ -17,7 +17,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "input",
         metavar="IN",
         type=ROBOT["type"],
-        help=f"{ROBOT['help']}; or a recording: .bag, .mcap, or the folder of a ROS 2 bag",
+        help=f"{ROBOT['help']}; "
+        "with --template, corrections of a maker: {correction_formats}; "
+        "or a recording: .bag, .mcap, or the folder of a ROS 2 bag",
     )
     parser.add_argument(
         "output",

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from .. import se3
-from .._typing import PathLike
-from ..exceptions import FileFormatError, InvalidArgumentError
-from ..messages import quote
-from ..robot.chain import Chain, extract_dh_table
-from ..robot.dh import DHTable
-from ..robot.dh_extraction import extract_dh
-from ..robot.urdf import MAX_ORIGIN
-from .origins_file import ORIGIN_KEYS
-from .robot_format import ConvertedRobot, RobotSource
-from .tabular import parse_number, read_text
+from ... import se3
+from ..._typing import PathLike
+from ...exceptions import FileFormatError, InvalidArgumentError
+from ...messages import quote
+from ...robot.chain import Chain, extract_dh_table
+from ...robot.dh import DHTable
+from ...robot.dh_extraction import extract_dh
+from ...robot.urdf import MAX_ORIGIN
+from ..origins_file import ORIGIN_KEYS
+from ..robot_format import ConvertedRobot, RobotSource
+from ..tabular import parse_number, read_text
 
 # Joints of a UR arm, and the names of their origins in the file.
 UR_JOINTS = {
