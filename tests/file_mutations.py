@@ -27,6 +27,7 @@ import numpy as np
 from command_line import positions_csv
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
+from mjcf_robots import BENCH, UR5E
 from recordings import JOINTS, POSES, Recording, write_bag
 from robots import URDF
 
@@ -46,6 +47,16 @@ unit = "deg"
 x = {from = "X", unit = "mm"}
 y = {from = "Y", unit = "mm"}
 z = {from = "Z", unit = "mm"}
+"""
+ARM_CFX = """<?xml version="1.0" encoding="utf-8" ?>
+<arm>
+  <DhArray name="dhOffset" >
+    <DH index="0" theta="0.1" d="0" a="0" b="0" alpha="0" beta="0" />
+    <DH index="1" theta="-0.2" d="0" a="0" b="0" alpha="0" beta="0" />
+    <DH index="2" theta="0" d="0" a="0" b="0" alpha="0" beta="0" />
+  </DhArray>
+  <Float name="flangeLengthOffset" value="0" />
+</arm>
 """
 SIDECAR = """
 tip = "tool0"
@@ -274,6 +285,10 @@ def cases() -> list[Case]:
         Case("t.dh.csv", dh_csv, ("convert", "t.dh.csv", "o.urdf")),
         Case("t.dh.csv", dh_csv, ("simulate", "t.dh.csv", "-m", "4", "-o", "s.csv")),
         Case("k.yaml", ur_kinematics().encode(), ("convert", "k.yaml", "o.urdf")),
+        Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.urdf")),
+        Case("m.xml", UR5E.encode(), ("convert", "m.xml", "o.origins.csv", "--tip", "attachment_site")),
+        Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.xml", "--template", "m.xml")),
+        Case("a.cfx", ARM_CFX.encode(), ("convert", "a.cfx", "o.urdf", "--template", "arm.urdf")),
         Case("arm.calibration.toml", SIDECAR.encode(), ("validate", "arm.urdf", "data.csv")),
         Case("arm.calibration.toml", SIDECAR.encode(), compensate),
         Case("p.toml", b'"a*" = 0.001\n"alpha1" = 0.01\n', (*of_table, "--priors", "p.toml")),

@@ -14,15 +14,16 @@ from dhcal_pin.measurements import KINDS
 from dhcal_pin.planning import CRITERIA, plannable_kinds
 
 NAMES = {
+    "correction_formats": [".cfx"],
     "criteria": CRITERIA,
     "error_families": EXTENSIONS,
     "kinds": KINDS,
     "losses": LOSSES,
     "parameter_sets": PARAMETER_SETS,
     "plannable_kinds": plannable_kinds(),
-    "robot_formats": [".urdf", ".dh.toml", ".dh.csv", ".yaml"],
+    "robot_formats": [".urdf", ".dh.toml", ".dh.csv", ".yaml", ".xml"],
     "shipped_studies": ["figure3", "figure4", "ur10_poses"],
-    "written_formats": [ending for robot_format in FORMATS for ending in robot_format.endings],
+    "written_formats": [end for each in FORMATS if each.convert for end in each.endings],
 }
 
 
