@@ -37,7 +37,7 @@ from .origins_file import convert_to_origins, joint_origins, without_negligible_
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_additions, with_sidecar
+from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -271,7 +271,7 @@ def _with_template(
         robot, applied = source_format.correct(source, Chain.from_urdf(nominal, template_tip or tip))
         notes += applied
     else:
-        robot, _ = _read(source, tip, None)
+        robot = _read(source, tip, None)[0].urdf_alone
     if template_tip is None and robot.tip not in nominal.links:
         raise InvalidArgumentError(
             f"{nominal.source}: no link {quote(robot.tip)} as in {robot.urdf.source}; name the same frame "
@@ -353,7 +353,7 @@ def urdf_files(
         transmission = replace(chain.transmission, loads=written.loads)
         chain, written = chain.with_transmission(transmission), written.with_transmission(transmission)
     if additions:
-        written = with_additions(written, additions, os.fspath(path))
+        written = written.with_added_origins(additions)
     q = _random_positions(chain.n_joints)
     poses = chain.poses(q)
     difference = np.abs(written.poses(q) - poses).max()

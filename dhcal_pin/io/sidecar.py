@@ -104,7 +104,6 @@ from ..robot.transmission import (
     split_coefficients,
 )
 from ..robot.urdf import Urdf, parse_urdf, suggest_names
-from ..robot.urdf_edit import with_origins
 from ..saving import complete_interrupted_save
 from . import toml_table as toml
 from .rig_file import rig_content
@@ -278,22 +277,18 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
     if joints is not None or links:
         chain = chain.with_transmission(_read_transmission(chain, joints, links))
     additions = {name: toml.pose_of(pose) for name, pose in read["link"].items()}
-    return with_additions(chain, additions, table.where) if additions else chain
+    return _with_additions(chain, additions, table.where) if additions else chain
 
 
-def with_additions(chain: Chain, additions: Mapping[str, Array], where: str) -> Chain:
+def _with_additions(chain: Chain, additions: Mapping[str, Array], where: str) -> Chain:
     """Return the complete model of a chain as its URDF describes it, from the table [link]."""
-    urdf = chain.urdf
-    before = {joint.child: joint for joint in urdf.joints}
-    for name in additions:
-        if name not in before:
-            raise UnknownNameError(
-                f"{where}: [link] has {quote(name)}, no link with a joint before it; "
-                f"{suggest_names(name, before)}"
-            )
-    origins = {before[name].name: before[name].origin @ pose for name, pose in additions.items()}
-    complete = Chain.from_urdf(parse_urdf(with_origins(urdf, origins), urdf.source), chain.tip, chain.root)
-    return replace(chain, origins=complete.origins, urdf_origins=chain.origins)
+    links = [joint.child for joint in chain.urdf.joints]
+    if unknown := [name for name in additions if name not in links]:
+        raise UnknownNameError(
+            f"{where}: [link] has {quote(unknown[0])}, no link with a joint before it; "
+            f"{suggest_names(unknown[0], links)}"
+        )
+    return chain.with_added_origins(additions)
 
 
 def read_tool(path: PathLike) -> Array:

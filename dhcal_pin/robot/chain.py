@@ -216,6 +216,30 @@ class Chain:
         """Whether each moving joint is passed from child to parent, (k,)."""
         return [j < self.n_reversed for j in range(len(self.moving_joints))]
 
+    def with_added_origins(self, additions: Mapping[str, Array]) -> Chain:
+        """Return the complete model of a chain as its URDF describes it.
+
+        Args:
+            additions: Pose (4, 4) by the name of a link that is added to the origin of the joint before the
+                link, in the frame of that origin [m].
+
+        Returns:
+            Copy with these origins, whose `urdf_origins` are those of this chain.
+        """
+        model, tip = build_model(self.urdf), self.urdf.path(self.tip)
+        end = model.frames[model.getFrameId(self.tip, pin.FrameType.BODY)]
+        for joint in self.urdf.joints:
+            if joint.child not in additions:
+                continue
+            added = pin.SE3(additions[joint.child])
+            if joint.type != "fixed":
+                model.jointPlacements[model.getJointId(joint.name)] *= added
+            elif joint in tip:
+                origin = model.frames[model.getFrameId(joint.child, pin.FrameType.BODY)].placement
+                end.placement = origin * added * origin.inverse() * end.placement
+        origins, _ = placements(model, self.root, self.tip, self.moving_joints, self.is_reversed)
+        return replace(self, origins=origins, urdf_origins=self.origins)
+
     def nominal(self) -> Chain:
         """Return the chain between the same links as the URDF describes it, with identity base and tool."""
         return Chain.from_urdf(self.urdf, self.tip, self.root)
