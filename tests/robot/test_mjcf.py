@@ -16,7 +16,7 @@ from robots import write
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import joint_origins, read_robot, urdf_files
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, Transmission
 from dhcal_pin.robot.formats.mjcf import Mjcf, parse_mjcf
 from dhcal_pin.robot.formats.mjcf_edit import with_origins
 
@@ -95,6 +95,25 @@ def test_calibrated_files_agree_with_mujoco_and_keep_all_other_bytes(arm, tmp_pa
     np.testing.assert_allclose(pinocchio_poses(written, q), by_mujoco, atol=1e-9)
 
     assert without_poses(data, written, origins) == without_poses(ROBOTS[arm][0].encode(), chain, origins)
+
+
+@ARMS
+def test_file_alone_and_sidecar_hold_two_models(arm, tmp_path):
+    """MuJoCo has the origins that are best without joint errors; with the sidecar it is the complete model."""
+    chain, rng = chain_of(arm), np.random.default_rng(2)
+    alone, complete = (
+        chain.origins @ se3.exp6(1e-3 * rng.normal(size=(len(chain.origins), 6))) for _ in "ab"
+    )
+    transmission = Transmission.zero(chain.loads)
+    transmission.linear[np.diag_indices(chain.n_joints)] = 1e-3
+    fit = replace(chain, origins=complete, urdf_origins=alone).with_transmission(transmission)
+    for path, content in urdf_files(fit, tmp_path / "out.xml").items():
+        write(tmp_path, path, content)
+    q = draw(chain)
+    written = read_robot(tmp_path / "out.xml", chain.tip)
+    by_mujoco = mujoco_poses((tmp_path / "out.xml").read_bytes(), chain.tip, chain.joint_names, q)
+    np.testing.assert_allclose(written.urdf_alone.poses(q), by_mujoco @ written.tool, atol=1e-9)
+    np.testing.assert_allclose(written.poses(q), fit.poses(q), atol=1e-12)
 
 
 def test_a_file_without_changes_is_the_same(tmp_path):
