@@ -7,6 +7,7 @@ change, joint values are late, or lengths are too long.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -187,3 +188,9 @@ class Changes:
 def _motion(v: np.ndarray, w: np.ndarray) -> pin.SE3:
     """Return the rigid motion of a twist."""
     return pin.exp6(np.concatenate([v, w]))
+
+
+def write_csv(path: Path, simulation: Simulation, data: Measurement) -> None:
+    """Write positions as a measurement file."""
+    header = ",".join([*(f"{name}[rad]" for name in simulation.chain.joint_names), "x[m],y[m],z[m]"])
+    np.savetxt(path, np.hstack([data.q, data.positions()]), "%.9f", ",", header=header, comments="")

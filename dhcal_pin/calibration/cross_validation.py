@@ -31,7 +31,16 @@ from ..estimation.solver import minimize, next_iterate
 from ..exceptions import DhcalError, InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
-from .evaluation import MIN_SAMPLES, Accuracy, Comparison, PairedErrors, Title, compute_errors, fit_nominal
+from .evaluation import (
+    MIN_SAMPLES,
+    Accuracy,
+    Comparison,
+    PairedErrors,
+    Title,
+    compute_errors,
+    fit_nominal,
+    take_errors,
+)
 from .fitted import FittedModel
 from .partition import (
     blocked_folds,
@@ -188,6 +197,17 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
     after: list[dict[str, Array]] = []
     alone: list[dict[str, Array]] = []
     largest_std = 0.0
+    # The fits of the folds contain the outliers that the calibration contains, but no figure does.
+    is_counted = [
+        counted[is_fitted]
+        for counted, is_fitted in (
+            (c, w > robust.ZERO_WEIGHT) for c, w in zip(fit.is_counted, fit.weights, strict=True)
+        )
+        if is_fitted.any()
+    ]
+    is_judged = [
+        counted[mask] for fold in folds for counted, mask in zip(is_counted, fold, strict=True) if mask.any()
+    ]
     for fold_after in cross_validate_folds(
         fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor, fit.bare
     ):
@@ -199,6 +219,9 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
         after = before
     labels = configuration_groups(data)
     held_out_labels = np.concatenate([labels[np.concatenate(fold)] for fold in folds])
+    before, after = (take_errors(errors, is_judged) for errors in (before, after))
+    alone = take_errors(alone, is_judged) if alone else []
+    held_out_labels = held_out_labels[np.concatenate(is_judged)]
     return FoldComparison(
         _comparison(fit, title, before, after, alone),
         largest_std,
@@ -229,7 +252,7 @@ def leave_regions_out(
         part = recalibrate(
             [item.take(~mask) for item, mask in zip(fit.data, fold, strict=True) if not mask.all()]
         )
-        is_judged = [mask & (w > robust.ZERO_WEIGHT) for mask, w in zip(fold, fit.weights, strict=True)]
+        is_judged = [mask & counted for mask, counted in zip(fold, fit.is_counted, strict=True)]
         held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
         before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
         after += compute_errors(part.chain, held_out, part.instruments)
@@ -246,13 +269,12 @@ def _comparison(
 ) -> Comparison:
     """Compare the errors of held-out samples before and after a calibration."""
     n_samples = sum(len(next(iter(item.values()))) for item in after)
-    n_rejected = fit.n_samples - sum(len(item.rows) for item in fit.inliers)
     return Comparison(
         title,
         n_samples,
         Accuracy.from_errors(before),
         Accuracy.from_errors(after),
-        n_rejected,
+        fit.n_outliers,
         after_alone=Accuracy.from_errors(alone) if alone else None,
     )
 

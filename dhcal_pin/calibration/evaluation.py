@@ -15,7 +15,7 @@ the measurements before the errors are computed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -233,19 +233,25 @@ def accuracy(
     return Accuracy.from_errors(compute_errors(chain, as_measurements(data), known))
 
 
-def remove_outliers(errors: Sequence[Mapping[str, Array]]) -> tuple[list[dict[str, Array]], int]:
-    """Remove the samples whose errors are outliers among those of their measurement.
+def find_inliers(errors: Sequence[Mapping[str, Array]]) -> tuple[Array, ...]:
+    """Find the samples whose errors are no outliers among those of their measurement, (m,) each.
 
     Only the first group of errors of a measurement is tested: of a pose, the position.
     """
-    inliers, n_outliers = [], 0
-    for item in errors:
-        tested = next(iter(item.values()))
-        scores = robust.standardize_mean_squares(np.mean(tested**2, 1), tested.shape[1])
-        is_inlier = scores <= robust.OUTLIER_THRESHOLD
-        n_outliers += int(np.sum(~is_inlier))
-        inliers.append({name: error[is_inlier] for name, error in item.items()})
-    return inliers, n_outliers
+    tested = [next(iter(item.values())) for item in errors]
+    return tuple(
+        robust.standardize_mean_squares(np.mean(each**2, 1), each.shape[1]) <= robust.OUTLIER_THRESHOLD
+        for each in tested
+    )
+
+
+def take_errors(errors: Iterable[Mapping[str, Array]], masks: Iterable[Array]) -> list[dict[str, Array]]:
+    """Take some samples of each measurement; measurements without any are left out."""
+    return [
+        {name: error[mask] for name, error in item.items()}
+        for item, mask in zip(errors, masks, strict=True)
+        if mask.any()
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,13 +317,12 @@ class Comparison:
     Attributes:
         title: "hold-out", "region hold-out" (regions of joint space are judged by a fit without them, and may
             overlap), "cross-validated" (each sample is judged by a fit without it) or "fitted".
-        n_samples: Number of samples.
+        n_samples: Number of samples, without outliers.
         before: Accuracy of the nominal robot. Its base, tool and instrument parameters are fitted to the same
             samples as those of the calibrated robot.
         after: Accuracy of the calibrated robot.
-        n_rejected: Number of fitted samples with zero weight; they are not in the figures.
-        n_outliers: Number of outliers among hold-out samples; they are in the figures.
-        after_without_outliers: `after` without these; empty if there are none.
+        n_outliers: Number of outliers; they are not in the figures.
+        after_with_outliers: `after` of hold-out samples with outliers; empty if there are none.
         after_alone: Accuracy of the calibrated URDF without its sidecar, with the base and the tool that fit
             it best; None if the sidecar has no errors of the arm.
     """
@@ -326,9 +331,8 @@ class Comparison:
     n_samples: int
     before: Accuracy
     after: Accuracy
-    n_rejected: int = 0
     n_outliers: int = 0
-    after_without_outliers: Accuracy = field(default_factory=Accuracy)
+    after_with_outliers: Accuracy = field(default_factory=Accuracy)
     after_alone: Accuracy | None = None
 
     def to_dict(self) -> dict[str, Any]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from .._typing import Array
-from ..estimation import robust
+from ..estimation.problem import linearize_and_factor
+from ..estimation.qr import rank
+from ..estimation.trimmed_squares import linearize_rows
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..session import Session
@@ -28,15 +30,18 @@ from .evaluation import (
     PairedErrors,
     accuracy,
     compute_errors,
-    remove_outliers,
+    take_errors,
 )
 from .fitted import FittedModel
+from .good_samples import independent_rows
 from .partition import configuration_groups, k_fold
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
 # So few configurations are held out one by one instead.
 MAX_LEAVE_ONE_OUT = 10
+# More samples are not examined for repeated configurations.
+MAX_EXAMINED = 1000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,6 +61,8 @@ class Evidence(FittedModel):
         earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
             if they were.
         session: What happened during the measurement; None if this was not examined.
+        with_auto: Function that calibrates with the loss "auto", whose verdict counts, too; None if this
+            calibration did.
     """
 
     region_comparison: Comparison | None = None
@@ -66,6 +73,24 @@ class Evidence(FittedModel):
     is_kept_nominal: bool = False
     earlier_diagnosis: Diagnosis | None = None
     session: Session | None = None
+    with_auto: Callable[[], Evidence] | None = None
+
+    @cached_property
+    def rows_per_direction(self) -> float:
+        """Number of independent rows for each direction that the geometry determines.
+
+        Repeated rows of one configuration show the noise, but no outlier that they share. Joint errors that
+        were added to the geometry do not count: outliers were found before.
+        """
+        data, problem = self.data, self.problem
+        is_geometric = [getattr(p, "coefficient_index", None) is None for p in self.parameters]
+        directions = max(rank(self.solution.system.r[:, is_geometric]), 1)
+        groups = configuration_groups(data)
+        if len(np.unique(groups)) < len(groups) and len(groups) <= MAX_EXAMINED:
+            system = linearize_and_factor(problem, self.solution.x, small_angle=False)
+            root = system.sqrt_covariance(problem.weights)[0]
+            return independent_rows(linearize_rows(problem, self.solution.x, root), groups) / directions
+        return sum(item.residual_dim * len(item.rows) for item in data) / directions
 
     @property
     def shrinkage_notes(self) -> list[str]:
@@ -84,25 +109,6 @@ class Evidence(FittedModel):
         return self.hand_eye_fit.diagnosis if self.hand_eye_fit else None
 
     @cached_property
-    def studentized_residuals(self) -> tuple[Array, ...]:
-        """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
-        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
-        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
-
-    @cached_property
-    def outliers(self) -> tuple[Array, ...]:
-        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python.
-
-        Outliers are the samples that were rejected and those whose studentized residual is large.
-        """
-        return tuple(
-            item.rows[(residuals > robust.OUTLIER_THRESHOLD) | (weights <= robust.ZERO_WEIGHT)]
-            for item, residuals, weights in zip(
-                self.data, self.studentized_residuals, self.weights, strict=True
-            )
-        )
-
-    @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
         return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data)
@@ -113,14 +119,14 @@ class Evidence(FittedModel):
 
         Regions that were left out, if any, come before the cross-validated samples. Without hold-out samples,
         five-fold cross-validation judges each sample by a fit without it; up to ten configurations are held
-        out one by one. Rejected samples are in none of these; outliers among the hold-out samples are in.
+        out one by one. Outliers are in none of these, see `is_counted`.
         """
-        inliers, (nominal, instruments) = self.inliers, self._nominal
-        count = sum(len(item.rows) for item in inliers)
-        before = accuracy(nominal, inliers, instruments)
-        after = accuracy(self.chain, inliers, self.instruments)
-        alone = accuracy(self.urdf_alone, inliers, self.instruments) if self.bare else None
-        fitted = Comparison("fitted", count, before, after, self.n_samples - count, after_alone=alone)
+        counted, (nominal, instruments) = self.counted, self._nominal
+        before = accuracy(nominal, counted, instruments)
+        after = accuracy(self.chain, counted, self.instruments)
+        alone = accuracy(self.urdf_alone, counted, self.instruments) if self.bare else None
+        n_counted = self.n_samples - self.n_outliers
+        fitted = Comparison("fitted", n_counted, before, after, self.n_outliers, after_alone=alone)
         found = [self._compare_holdout()] if self.holdout else []
         if self.region_comparison and self.generalization.region_holdout:
             found.append(self.region_comparison)
@@ -129,6 +135,20 @@ class Evidence(FittedModel):
         if self.random_folds and not self.holdout and is_judged:
             found.append(self.random_folds.comparison)
         return (*found, fitted)
+
+    @cached_property
+    def file_comparisons(self) -> tuple[Comparison, ...]:
+        """Accuracy before and after of the fitted samples of each measurement; those of a file share it."""
+        nominal, instruments = self._nominal
+        sides = [
+            compute_errors(nominal, self.data, instruments),
+            compute_errors(self.chain, self.data, self.instruments),
+        ]
+        out = []
+        for *errors, mask in zip(*sides, self.is_counted, strict=True):
+            before, after = (Accuracy.from_errors(take_errors([each], [mask])) for each in errors)
+            out.append(Comparison("fitted", int(mask.sum()), before, after, int(np.sum(~mask))))
+        return tuple(out)
 
     @cached_property
     def random_folds(self) -> FoldComparison | None:
@@ -171,14 +191,12 @@ class Evidence(FittedModel):
 
     def _compare_holdout(self) -> Comparison:
         """Compare the accuracy before and after on the hold-out samples."""
-        errors = compute_errors(self.chain, self.holdout, self.instruments)
-        inliers, n_outliers = remove_outliers(errors)
+        masks, (nominal, instruments) = self.is_holdout_counted, self._nominal
+        chains = (nominal, instruments), (self.chain, self.instruments), (self.urdf_alone, self.instruments)
+        errors = [compute_errors(chain, self.holdout, known) for chain, known in chains]
+        before, after, alone = (Accuracy.from_errors(take_errors(each, masks)) for each in errors)
+        n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
+        everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
         return Comparison(
-            "hold-out",
-            sum(len(item.rows) for item in self.holdout),
-            accuracy(self._nominal[0], self.holdout, self._nominal[1]),
-            Accuracy.from_errors(errors),
-            n_outliers=n_outliers,
-            after_without_outliers=Accuracy.from_errors(inliers) if n_outliers else Accuracy(),
-            after_alone=accuracy(self.urdf_alone, self.holdout, self.instruments) if self.bare else None,
+            "hold-out", n_counted, before, after, n_outliers, everything, alone if self.bare else None
         )

@@ -41,7 +41,7 @@ from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
-from .evaluation import compute_errors, fit_nominal
+from .evaluation import compute_errors, find_inliers, fit_nominal
 from .model_selection import Extension
 from .partition import different_configurations
 
@@ -135,8 +135,57 @@ class FittedModel:
 
     def _without_rejected(self, data: Sequence[Measurement]) -> list[Measurement]:
         """Remove the samples of zero weight from measurements that correspond to `data`."""
-        inliers = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(data, self.weights, strict=True)]
-        return [item for item in inliers if len(item.rows)]
+        return _take(data, [w > robust.ZERO_WEIGHT for w in self.weights])
+
+    @cached_property
+    def studentized_residuals(self) -> tuple[Array, ...]:
+        """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
+        data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
+        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
+
+    @cached_property
+    def is_counted(self) -> tuple[Array, ...]:
+        """Whether figures of the accuracy contain each fitted sample, shape (m,) per measurement.
+
+        They contain all but the outliers: the samples that were rejected and those whose studentized residual
+        is large.
+        """
+        return tuple(
+            (residuals <= robust.OUTLIER_THRESHOLD) & (weights > robust.ZERO_WEIGHT)
+            for residuals, weights in zip(self.studentized_residuals, self.weights, strict=True)
+        )
+
+    @cached_property
+    def is_holdout_counted(self) -> tuple[Array, ...]:
+        """The same for each held-out sample: outliers are far from most other samples of its measurement."""
+        return find_inliers(compute_errors(self.chain, self.holdout, self.instruments))
+
+    @property
+    def outliers(self) -> tuple[Array, ...]:
+        """Lines of the outliers of each fitted measurement; numbers from 1 for samples from Python."""
+        return tuple(item.rows[~mask] for item, mask in zip(self.data, self.is_counted, strict=True))
+
+    @property
+    def holdout_outliers(self) -> tuple[Array, ...]:
+        """Lines of the outliers of each held-out measurement."""
+        return tuple(
+            item.rows[~mask] for item, mask in zip(self.holdout, self.is_holdout_counted, strict=True)
+        )
+
+    @property
+    def counted(self) -> list[Measurement]:
+        """Fitted measurements without outliers."""
+        return _take(self.data, self.is_counted)
+
+    @property
+    def counted_holdout(self) -> list[Measurement]:
+        """Held-out measurements without outliers."""
+        return _take(self.holdout, self.is_holdout_counted)
+
+    @property
+    def n_outliers(self) -> int:
+        """Number of outliers among the fitted samples."""
+        return sum(map(len, self.outliers))
 
     @property
     def has_joint_values(self) -> bool:
@@ -240,6 +289,13 @@ class FittedModel:
         cost = system.min_cost + float(np.sum(system.z**2))
         return float(np.sqrt(cost / self.degrees_of_freedom)) if self.degrees_of_freedom else float("nan")
 
+    @property
+    def contradicts_sigma(self) -> bool:
+        """Whether the residuals are larger than the standard deviations explain, if all are stated."""
+        if not self.degrees_of_freedom:
+            return False
+        return self.unit_weight_std**2 > 1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
+
     @cached_property
     def _sigma_scale(self) -> float:
         """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined.
@@ -248,13 +304,7 @@ class FittedModel:
         t distribution. The factor widens the standard deviations so that ±1.96 of them contain 95 % of it.
         """
         if all(item.has_stated_sigma for item in self.data):
-            surprise = (
-                1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
-                if self.degrees_of_freedom
-                else np.inf
-            )
-            # Also without degrees of freedom, where the scale is not a number.
-            if not self.unit_weight_std**2 > surprise:
+            if not self.contradicts_sigma:
                 return 1.0
             return self.unit_weight_std * _student_ratio(self.degrees_of_freedom)
         return self.unit_weight_std * _student_ratio(self.noise_degrees_of_freedom)
@@ -419,6 +469,11 @@ class FittedModel:
         """Cameras and boards with their estimated poses and lenses; None without image coordinates."""
         rigs = (item.solved_rig(self.instruments) for item in self.data)
         return next((rig for rig in rigs if rig is not None), None)
+
+
+def _take(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
+    """Take some samples of each measurement; measurements without any are left out."""
+    return [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
 
 
 def _student_ratio(degrees_of_freedom: float) -> float:

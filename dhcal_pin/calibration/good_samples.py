@@ -96,7 +96,7 @@ def find_good_samples(
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
     rows = linearize_rows(part, solution.x, root)
-    redundancy = n_rows / _independent_rows(rows, groups[drawn])
+    redundancy = n_rows / independent_rows(rows, groups[drawn])
     if 2 * n_determined > n_rows / redundancy:
         return all_good
     core = _best_core(rows, search_majorities(rows, groups[drawn], n_determined), redundancy)
@@ -140,7 +140,7 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
     return weights
 
 
-def _independent_rows(rows: LinearizedRows, groups: Array) -> int:
+def independent_rows(rows: LinearizedRows, groups: Array) -> int:
     """Count the rows that differ; repeated rows of a configuration do not strengthen a majority."""
     total, first = 0, 0
     for item in rows.items:

@@ -138,27 +138,28 @@ def calibrate(
         Calibrated chain with uncertainty and accuracy.
     """
     require_chain(chain)
+    recalibrate = partial(
+        calibrate,
+        chain,
+        parameters=parameters,
+        method=method,
+        priors=priors,
+        fix=fix,
+        free=free,
+        known=known,
+        loss=loss,
+        extend=extend,
+        bounds=bounds,
+        max_iterations=max_iterations,
+        session=session,
+        executor=executor,
+    )
     if isinstance(holdout, str) and holdout == "region":
-        recalibrate = partial(
-            calibrate,
-            chain,
-            parameters=parameters,
-            method=method,
-            priors=priors,
-            fix=fix,
-            free=free,
-            known=known,
-            loss=loss,
-            extend=extend,
-            bounds=bounds,
-            max_iterations=max_iterations,
-            session=session,
-            executor=executor,
-        )
         result = recalibrate(data, progress=progress)
         return replace(result, region_comparison=leave_regions_out(result, recalibrate, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
+    with_auto = partial(recalibrate, data, holdout=holdout, loss="auto") if loss != "auto" else None
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
@@ -196,12 +197,12 @@ def calibrate(
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress)
-        return calibrate_images(fitting, fit, chain, holdout, exchanges)
+        return replace(calibrate_images(fitting, fit, chain, holdout, exchanges), with_auto=with_auto)
     fit = reweight(fit, stages, groups, max_iterations, progress)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
     result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
-    return replace(result, session=found)
+    return replace(result, session=found, with_auto=with_auto)
 
 
 def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:

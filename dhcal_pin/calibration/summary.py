@@ -21,8 +21,6 @@ from .cross_validation import Generalization
 from .estimates import Estimate
 from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
 
-# The headline gives the RMS without outliers if it is below this fraction of the RMS with them.
-OUTLIER_RMS_RATIO = 0.9
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
 MIN_SHOWN_SHARE = 0.01
 
@@ -115,6 +113,18 @@ def accuracy_table(comparisons: Sequence[Comparison]) -> Table:
     )
 
 
+def file_table(names: Sequence[str], comparisons: Sequence[Comparison]) -> Table | None:
+    """Make a table of the error of each file; None for a single one."""
+    if len(names) < 2:
+        return None
+    rows = [
+        [name, f"{c.n_samples}", f"{c.n_outliers}", *before_and_after(c, group)]
+        for name, c in zip(names, comparisons, strict=True)
+        for group in list(c.after.groups)[:1]
+    ]
+    return Table(["error of each file, RMS", "samples", "outliers", "before", "after"], rows)
+
+
 @dataclass(frozen=True)
 class Headline:
     """Most important figure of a calibration.
@@ -146,12 +156,17 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
     text = (
         f"RMS {ERROR_GROUPS[group].label} {describe_samples(best)}: {before_text} before, {after_text} after"
     )
-    clean = best.after_without_outliers.groups.get(group)
-    if clean and clean.rms < OUTLIER_RMS_RATIO * after.rms:
-        text += f", {statistic(clean)} without {_count_outliers(best.n_outliers)}"
+    if best.n_outliers:
+        text += f", without {_count_outliers(best.n_outliers)}"
+        everything = best.after_with_outliers.groups.get(group)
+        text += (
+            f" ({statistic(everything)} with {'it' if best.n_outliers == 1 else 'them'})"
+            if everything
+            else ""
+        )
     if alone := urdf_alone(best, group):
-        text += f", {alone} with the URDF alone"
-    text += f". {_count_outliers(best.n_rejected).capitalize()} rejected." if best.n_rejected else "."
+        text += f"; {alone} with the URDF alone"
+    text += "."
     if best.title == "fitted":
         text = f"No hold-out samples. {text}"
     elif note := small_sample_note(best):

@@ -83,8 +83,9 @@ class CalibrationOutcome:
     held_out: list[tuple[str, Measurement]]  # Measurements that were held out, each with its file
     # Rows that the robot cannot reach, by measurement file; excluded from everything.
     unreachable: dict[str, list[UnreachableRow]]
-    outliers: dict[str, list[int]]  # Lines of outliers, by measurement file
+    outliers: dict[str, list[int]]  # Lines of fitted outliers, by measurement file
     rejected: dict[str, list[int]]  # Lines with zero weight in the fit, by measurement file
+    held_out_outliers: dict[str, list[int]]  # Lines of outliers that were held out, by measurement file
     warnings: dict[str, list[str]]  # Warnings about the input, by file
     notes: dict[str, list[str]]  # What of the input is not used, by file
     hint: str  # Suggestion to use --extend; empty if there is none
@@ -391,7 +392,10 @@ def _write_job(
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
     )
     rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
-    document = _job_document(fit, data, outliers, files, source)
+    held_out: dict[str, list[int]] = {}
+    for (path, _), rows in zip(data.holdout, fit.holdout_outliers, strict=True):
+        held_out.setdefault(path, []).extend(rows.tolist())
+    document = _job_document(fit, data, (outliers, held_out), files, source)
     write_outputs(contents, job.json, document)
     return CalibrationOutcome(
         fit=fit,
@@ -403,6 +407,7 @@ def _write_job(
         unreachable=data.unreachable,
         outliers=outliers,
         rejected=rejected,
+        held_out_outliers=held_out,
         warnings=data.warnings,
         notes=data.notes,
         hint=hint,
@@ -447,13 +452,15 @@ def _provenance(
 def _job_document(
     fit: Result,
     data: _JobData,
-    outliers: Mapping[str, Sequence[int]],
+    outliers: Sequence[Mapping[str, Sequence[int]]],
     files: Mapping[str, str],
     source: Provenance,
 ) -> dict[str, Any]:
     """Create the JSON document of a job."""
     rows = {
-        path: sorted([*(item.row for item in unreachable), *outliers.get(path, [])])
+        path: sorted(
+            [*(item.row for item in unreachable), *(row for rows in outliers for row in rows.get(path, []))]
+        )
         for path, unreachable in data.unreachable.items()
     }
     rows = {path: numbers for path, numbers in rows.items() if numbers}

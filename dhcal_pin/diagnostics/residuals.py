@@ -37,19 +37,24 @@ MAX_PROFILE_STD = 0.02
 class Outlier:
     """Sample whose residual is too large for its standard deviation."""
 
-    item: int  #: Index of the measurement object in the fitted data.
+    item: int  #: Index of the measurement object in the fitted data, followed by the held-out data.
     row: int  #: Line in its file; for data from Python the number of the sample, from 1.
     error_norms: dict[str, float]  #: Error by group, "position" [m], "orientation" [rad] or "residual" [m].
-    score: float  #: Studentized residual; standard normal for a sample that is not an outlier.
+    #: Studentized residual; standard normal for a sample that is not an outlier. NaN if it was held out.
+    score: float
 
 
 def find_outliers(fit: Result) -> list[Outlier]:
     """Return the outliers of a calibration, by measurement object and row."""
-    all_errors = compute_errors(fit.chain, fit.data, fit.instruments)
-    out = []
-    for i, (item, errors) in enumerate(zip(fit.data, all_errors, strict=True)):
-        scores = fit.studentized_residuals[i]
-        for k in np.flatnonzero(np.isin(item.rows, fit.outliers[i])):
+    all_errors = [
+        e for data in (fit.data, fit.holdout) for e in compute_errors(fit.chain, data, fit.instruments)
+    ]
+    masks = (*fit.is_counted, *fit.is_holdout_counted)
+    unknown = [np.full(len(item.rows), np.nan) for item in fit.holdout]
+    all_scores, out = (*fit.studentized_residuals, *unknown), []
+    for i, (item, errors) in enumerate(zip((*fit.data, *fit.holdout), all_errors, strict=True)):
+        scores = all_scores[i]
+        for k in np.flatnonzero(~masks[i]):
             norms = {error_group(name): float(np.linalg.norm(error[k])) for name, error in errors.items()}
             out.append(Outlier(i, int(item.rows[k]), norms, float(scores[k])))
     return out
@@ -94,9 +99,9 @@ class JointProfile:
 def joint_offset_profiles(fit: Result) -> list[JointProfile]:
     """Compute the residual joint error of each moving joint over its position.
 
-    The samples are those held out, or the fitted ones without outliers if none are held out.
+    The samples are those held out, or the fitted ones if none are held out, without outliers.
     """
-    data = [item for item in fit.holdout or fit.inliers if item.configurations_per_row == 1]
+    data = [item for item in fit.counted_holdout or fit.counted if item.configurations_per_row == 1]
     if not data or not fit.has_joint_values:
         return []
     all_errors = compute_errors(fit.chain, data, fit.instruments)

@@ -120,9 +120,9 @@ def _warnings(context: ReportContext) -> list[str]:
             "redundancy; the measurement noise and the parameter uncertainties cannot be estimated."
         )
     if context.outliers:
-        count, n_rejected = len(context.outliers), max(c.n_rejected for c in fit.comparisons)
+        count, n_rejected = len(context.outliers), fit.n_samples - fit.n_inliers
         texts.append(
-            f"{count} {'outlier' if count == 1 else 'outliers'} among the samples, {n_rejected or 'none'} "
-            "rejected; see the section on outliers."
+            f"{count} {'outlier' if count == 1 else 'outliers'} among the samples, in none of the figures; "
+            f"{n_rejected or 'none'} rejected. See the section on outliers."
         )
     return texts

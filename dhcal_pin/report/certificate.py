@@ -88,7 +88,7 @@ def _records(context: ReportContext) -> list[tuple[str, str]]:
         for name, item in zip(context.data_names, fit.data, strict=True)
     ]
     held_out = sum(len(item.rows) for item in fit.holdout)
-    outliers = sum(len(rows) for rows in fit.outliers)
+    outliers = len(context.outliers)
     records = [
         ("Fitted samples", "; ".join(counts)),
         ("Hold-out samples", str(held_out) if held_out else "none"),

@@ -24,7 +24,7 @@ class ReportContext:
 
     @cached_property
     def outliers(self) -> Sequence[Outlier]:
-        """Outliers among the fitted samples."""
+        """Outliers among the fitted samples, then among the held-out ones."""
         return find_outliers(self.fit)
 
     @cached_property

@@ -49,7 +49,7 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
             error_norms(compute_errors(fit.nominal_refitted, data, fit.nominal_instruments)),
             error_norms(compute_errors(fit.chain, data, fit.instruments)),
         ]
-        for role, data in (("hold-out", fit.holdout), ("fitted", fit.inliers))
+        for role, data in (("hold-out", fit.counted_holdout), ("fitted", fit.counted))
         if data
     }
     for group in in_order(set().union(*(after for _, after in norms.values()))):

@@ -55,7 +55,7 @@ def result_to_dict(
         "iterations": fit.iterations,
         "method": fit.method,
         "samples": fit.n_samples,
-        "samples_holdout": holdout.n_samples if holdout else 0,
+        "samples_holdout": holdout.n_samples + holdout.n_outliers if holdout else 0,
         "rank": fit.rank,
         "parameters_total": len(fit.parameters),
         "condition": fit.condition,
@@ -64,6 +64,15 @@ def result_to_dict(
         **generalization_to_dict(fit.generalization if is_calibration else None),
         "urdf_alone": _accuracies(fitted, holdout, "alone")
         | _generalization_accuracies(fit.generalization if is_calibration else None, "alone"),
+        "accuracy_by_file": {
+            item.source or str(number): {
+                "samples": comparison.n_samples,
+                "outliers": comparison.n_outliers,
+                "before": main_statistics(comparison.before),
+                "after": main_statistics(comparison.after),
+            }
+            for number, (item, comparison) in enumerate(zip(fit.data, fit.file_comparisons, strict=True), 1)
+        },
         "comparisons": [comparison.to_dict() for comparison in fit.comparisons],
         "parameters": parameter_rows(fit),
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},

@@ -63,11 +63,12 @@ def _accuracy_section(context: ReportContext) -> Section:
         sentences.append(_region_sentence(generalization))
         if generalization.region_holdout not in comparisons:
             comparisons.insert(1, generalization.region_holdout)
+    by_file = summary.file_table(context.data_names, context.fit.file_comparisons)
     return Section(
         "accuracy",
         "Accuracy",
         sentences,
-        tables=[summary.accuracy_table(comparisons)],
+        tables=[summary.accuracy_table(comparisons), *([by_file] if by_file else [])],
         figures=partial(figures.accuracy_figures, context),
     )
 
@@ -370,23 +371,24 @@ def _observability_section(context: ReportContext) -> Section:
 
 
 def _outlier_section(context: ReportContext) -> Section:
-    names, rows = context.data_names, []
+    names, rows = (*context.data_names, *context.holdout_names), []
     for outlier in context.outliers[:MAX_OUTLIERS]:
         errors = ", ".join(
             str(Quantity.error(value, ERROR_GROUPS[group].unit))
             for group, value in outlier.error_norms.items()
         )
-        rows.append([names[outlier.item], str(outlier.row), errors, f"{outlier.score:.0f}"])
+        score = "held out" if math.isnan(outlier.score) else f"{outlier.score:.0f}"
+        rows.append([names[outlier.item], str(outlier.row), errors, score])
     threshold = f"{robust.OUTLIER_THRESHOLD:g}"
     if rows:
         n_hidden = len(context.outliers) - len(rows)
         text = (
-            f"Rejected samples, and fitted samples whose standardized residual exceeds {threshold}; a "
-            "normally distributed one does so once in three million."
+            f"Rejected samples, and samples whose standardized residual exceeds {threshold}; a normally "
+            "distributed one does so once in three million. No figure of the accuracy contains them."
             + (f" {n_hidden} more are not listed." if n_hidden else "")
         )
     else:
-        text = f"No fitted sample has a standardized residual above {threshold}."
+        text = f"No sample has a standardized residual above {threshold}."
     items = [
         f"{name}, line {row}: not used, {reason}"
         for name, reasons in context.source.excluded_rows.items()

@@ -46,11 +46,10 @@ class MeasuredSamples:
 
 def sets_of(fit: Result) -> list[Array]:
     """Return the set of each sample of the fitted and the held-out measurements of a result."""
-    fitted = [
-        np.where(np.isin(item.rows, rows), OUTLIER, FITTED)
-        for item, rows in zip(fit.data, fit.outliers, strict=True)
+    return [
+        *(np.where(mask, FITTED, OUTLIER) for mask in fit.is_counted),
+        *(np.where(mask, HELD_OUT, OUTLIER) for mask in fit.is_holdout_counted),
     ]
-    return [*fitted, *(np.full(len(item.rows), HELD_OUT) for item in fit.holdout)]
 
 
 def measured_samples(

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from robots import DATA, MAPS, missing, robot_file
-from sessions import ARMS, Changes, Simulation, nominal_arm
+from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, se3
@@ -313,12 +313,6 @@ def test_few_rows_are_not_examined():
     simulation = Simulation("ur10", 8, 0)
     fit = calibrate(simulation.chain, simulation.measure(Pose), extend="none")
     assert session_of(fit).found == ()
-
-
-def write_csv(path, simulation, data):
-    """Write positions as a measurement file."""
-    header = ",".join([*(f"{name}[rad]" for name in simulation.chain.joint_names), "x[m],y[m],z[m]"])
-    np.savetxt(path, np.hstack([data.q, data.positions()]), "%.9f", ",", header=header, comments="")
 
 
 def test_commands_state_what_happened(tmp_path, capsys):

@@ -48,7 +48,7 @@ class SampleErrors:
     before: Array  # Error norms of the nominal robot, shape (N,) [`unit`]
     after: Array  # Error norms of the calibrated robot, shape (N,) [`unit`]
     is_holdout: Array  # Whether each sample was held out, shape (N,)
-    is_outlier: Array  # Whether each fitted sample is an outlier, shape (N,)
+    is_outlier: Array  # Whether each sample is an outlier, shape (N,)
     index: Array  # Index of each sample among all samples, fitted ones first, shape (N,)
 
     @classmethod
@@ -91,7 +91,7 @@ class SampleErrors:
         fitted = ~self.is_holdout & ~self.is_outlier
         yield "after, fitted", COLORS["sample" if has_holdout else "after"], fitted, factor * self.after
         for label, color, chosen in (
-            ("after, hold-out", COLORS["after"], self.is_holdout),
+            ("after, hold-out", COLORS["after"], self.is_holdout & ~self.is_outlier),
             ("after, outlier", COLORS["outlier"], self.is_outlier),
         ):
             if chosen.any():

@@ -41,7 +41,7 @@ class ResidualTable:
         units: Unit of each component.
         normalised: Normalised residual of each sample, (N,); NaN if its standard deviation is unknown.
         weight: Robust weight of each fitted sample, (N,): 0 if it was rejected; NaN if it was held out.
-        is_outlier: Whether each fitted sample is an outlier, (N,), see `Result.outliers`.
+        is_outlier: Whether each sample is an outlier, (N,), see `Result.is_counted`.
         image: Name of each sample's photograph, (N,); empty if it has none.
     """
 
@@ -144,12 +144,7 @@ def residual_table(fit: Evidence) -> ResidualTable:
                 np.full(starts[-1] - starts[n_fitted], np.nan),
             ]
         ),
-        is_outlier=np.concatenate(
-            [
-                *(np.isin(item.rows, rows) for item, rows in zip(fit.data, fit.outliers, strict=True)),
-                np.zeros(starts[-1] - starts[n_fitted], bool),
-            ]
-        ),
+        is_outlier=~np.concatenate([*fit.is_counted, *fit.is_holdout_counted]),
         image=np.concatenate([item.photographs() for item in data]),
     )
 

@@ -40,10 +40,12 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
     hints = [f"hint: {outcome.hint}"] if outcome.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
+    by_file = summary.file_table([names[path] for path in outcome.fitted], fit.file_comparisons)
     blocks = [
         Block(_robot_lines(fit, names[job.robot], outcome.document["settings"]["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
+        Block(by_file if by_file else [], noun="file", rank=6, n_kept=4, has_space=True),
         Block(fit.hand_eye.table if fit.hand_eye else [], noun="cause", rank=2, n_kept=4, has_space=True),
         _correction_block(fit),
         Block(unidentified, "yellow", noun="note on parameters", rank=0, n_kept=0, has_space=True),
@@ -143,6 +145,9 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
                 if outcome.document["settings"]["loss"] == "auto"
                 else f"{names[path]}: {count} kept in the fit; --loss auto excludes those far from the others"
             )
+    for path, item in outcome.held_out:
+        if rows := [row for row in outcome.held_out_outliers[path] if row in item.rows]:
+            yield f"{names[path]}: {_count_outliers(rows, item)} among the hold-out samples"
 
 
 def _count_outliers(rows: list[int], item: Measurement) -> str:
