@@ -313,17 +313,25 @@ class Chain:
         """Pinocchio's index of the tip frame; it is of type BODY because a joint may have the same name."""
         return self.model.getFrameId(self.tip, pin.FrameType.BODY)
 
+    @property
+    def _link_axes(self) -> Array:
+        """Rotation of each link in the axes of its growth, (k+1, 3, 3)."""
+        return np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
+
+    @property
+    def link_vectors(self) -> Array:
+        """Vector of each link along which it grows, (k+1, 3) [m]."""
+        return (self.link_transforms[:, None, :3, 3] @ self._link_axes)[:, 0]
+
     @cached_property
     def loads(self) -> GravityLoads:
         """Gravity torques of the whole robot with the joint origins of this chain."""
-        links = self.link_transforms
-        axes = np.concatenate([links[:-1, :3, :3], _IDENTITY[None, :3, :3]])
         return GravityLoads(
             self.model,
             self.moving_joints,
             self.mimic_matrix,
             self.mimic_offset,
-            (links[:, None, :3, 3] @ axes)[:, 0],
+            self.link_vectors,
             self.reference_temperature,
             self.tip,
             self.payload,
@@ -498,9 +506,8 @@ class Chain:
     @property
     def growth_vectors(self) -> Array:
         """Motion of each link's end per relative growth, in the axes of its body, shape (k+1, 3) [m]."""
-        axes = np.concatenate([self.link_transforms[:-1, :3, :3], _IDENTITY[None, :3, :3]])
-        loads = self.loads if self.transmission is None else self.transmission.loads
-        return (axes @ loads.link_vectors[..., None])[..., 0]
+        own = self.link_vectors if self.transmission is None else self.transmission.loads.link_vectors
+        return (self._link_axes @ own[..., None])[..., 0]
 
     def growth_motions(self, frames: FrameBatch) -> Array:
         """Compute the tool twist per relative growth of each link, shape (k+1, 6, m).

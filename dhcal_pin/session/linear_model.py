@@ -36,7 +36,7 @@ SCALE_AXES = ("", "x", "y", "z")
 
 def growing_links(chain: Chain) -> Array:
     """Return which links have a length that can grow, (k+1,)."""
-    return np.linalg.norm(chain.loads.link_vectors, axis=1) > MIN_LINK_LENGTH
+    return np.linalg.norm(chain.link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Layout:
         lag = int(scales[-1]) + 1
         grows = growing_links(chain)
         # A robot without lengths only turns.
-        size = float(np.linalg.norm(chain.loads.link_vectors, axis=1).sum()) or 1.0
+        size = float(np.linalg.norm(chain.link_vectors, axis=1).sum()) or 1.0
         of_frame = np.array([1.0] * 3 + [1 / size] * 3)
         of_base, of_tool = (
             np.array([names.index(q.name) for q in parameters]) for parameters in (base(chain), tool(chain))
