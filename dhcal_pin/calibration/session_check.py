@@ -25,6 +25,8 @@ from .reweighting import Fit, reweight
 
 # Logarithm of the evidence that each coefficient of a change costs.
 COST_PER_COEFFICIENT = 5.0
+# Ratio of the noise without changes to that with them above which no comparison with joint errors is needed.
+MIN_GROSS_RATIO = 10.0
 
 
 def confirm_changes(
@@ -32,10 +34,14 @@ def confirm_changes(
 ) -> bool:
     """Return whether changes explain measurements beside all families of joint errors.
 
-    `without` and `fit` are the first fits without and with the changes.
+    `without` and `fit` are the first fits without and with the changes. Joint errors do not imitate changes
+    that are far larger than what they leave.
     """
-    residuals = [_residuals(each, groups, max_iterations) for each in (without, fit)]
-    noise = [np.maximum(1.4826 * np.median(np.abs(r), 1, keepdims=True), MIN_NOISE) for r in residuals[1]]
+    noises = [_noise(_residuals(each)) for each in (without, fit)]
+    if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
+        return True
+    residuals = [_residuals(_extended(each, groups, max_iterations)) for each in (without, fit)]
+    noise = _noise(residuals[1])
     costs = [
         sum(
             float(np.sum(np.minimum(np.sum((r / s) ** 2, 0), len(r) + MAX_SAMPLE_COST)))
@@ -53,10 +59,19 @@ def confirm_changes(
     return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
 
 
-def _residuals(fit: Fit, groups: PriorGroups, max_iterations: int) -> Sequence[Array]:
-    """Return the residuals of a fit with all families of joint errors that are supported, (k, m) each."""
+def _extended(fit: Fit, groups: PriorGroups, max_iterations: int) -> Fit:
+    """Add all families of joint errors that the measurements support."""
     fit = reweight(fit, robust.LOSSES["auto"].stages, groups, max_iterations, None)
-    fit, _ = model_selection.extend(fit, EXTENSIONS, max_iterations, None)
+    return model_selection.extend(fit, EXTENSIONS, max_iterations, None)[0]
+
+
+def _noise(residuals: Sequence[Array]) -> list[Array]:
+    """Estimate the noise of each row of residuals (k, m) each, (k, 1) each."""
+    return [np.maximum(1.4826 * np.median(np.abs(r), 1, keepdims=True), MIN_NOISE) for r in residuals]
+
+
+def _residuals(fit: Fit) -> Sequence[Array]:
+    """Return the residuals of a fit, (k, m) each."""
     problem, x = fit.problem, fit.solution.x
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     return [
