@@ -54,6 +54,8 @@ MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 MAX_CHANCE = 0.025
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
+# Share of outliers above which the samples are rather those of two set-ups, tools or robots.
+MIN_MIXED_SHARE = 1 / 3
 # Probability that chance makes so many outliers follow each other.
 MAX_RUN_CHANCE = 1e-3
 # With fewer independent rows for each direction that they determine, the search for outliers may miss 40 % of
@@ -368,7 +370,10 @@ def _outliers(fit: Evidence) -> list[Finding]:
         return [Finding("caution", run)] if run else []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
     text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers{_outlying_images(fit)}"
-    return [Finding("caution", f"{text}. {run or 'Check the measurements.'}")]
+    remedy = "Check the measurements."
+    if n_outliers > MIN_MIXED_SHARE * fit.n_samples:
+        remedy = "They may be of another set-up, tool or robot: calibrate them by themselves, too."
+    return [Finding("caution", f"{text}. {run or remedy}")]
 
 
 def _consecutive_outliers(fit: Evidence) -> str:

@@ -144,6 +144,16 @@ def test_no_loss_lifts_the_verdict(n_outliers, size):
         assert fits["linear"].verdict.reasons[0].startswith("With --loss auto: 45 of 100 samples")
 
 
+def test_samples_of_two_tools_need_no_more_poses():
+    """Two tools in one file, in a random order: two halves of the samples agree with each other only."""
+    simulation = Simulation("panda", 60, 36)
+    data = simulation.measure(Pose, Changes("tool", 4e-2, 0.1))
+    mixed = data.take(simulation.rng.permutation(60)).replace(rows=np.arange(1, 61))
+    (reason,) = calibrate(simulation.chain, mixed, extend="none").verdict.reasons
+    assert "30 of 60 samples (50 %) are outliers" in reason
+    assert "another set-up, tool or robot" in reason
+
+
 def test_outliers_that_follow_each_other_are_an_event():
     simulation = Simulation("ur10", 100, 11)
     data = simulation.measure(Position)
