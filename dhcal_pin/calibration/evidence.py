@@ -33,7 +33,7 @@ from .evaluation import (
     take_errors,
 )
 from .fitted import FittedModel
-from .good_samples import independent_rows
+from .good_samples import find_hidden_majority, independent_rows
 from .partition import configuration_groups, k_fold
 
 # Number of random folds of the cross-validation.
@@ -91,6 +91,11 @@ class Evidence(FittedModel):
             root = system.sqrt_covariance(problem.weights)[0]
             return independent_rows(linearize_rows(problem, self.solution.x, root), groups) / directions
         return sum(item.residual_dim * len(item.rows) for item in data) / directions
+
+    @cached_property
+    def hidden_majority(self) -> tuple[int, float] | None:
+        """Number of samples that a majority does not agree with, and by what ratio; None without one."""
+        return find_hidden_majority(self.inlier_problem, self.solution.x, configuration_groups(self.inliers))
 
     @property
     def shrinkage_notes(self) -> list[str]:

@@ -63,6 +63,8 @@ MAX_SAMPLES = 200
 MAX_COORDINATES = 200
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
+# Number of majorities that the search for a hidden one extends, and probability that chance makes one.
+N_HIDDEN, MAX_CHANCE = 40, 0.01
 # Largest number of extensions of the good samples.
 MAX_EXTENSIONS = 20
 
@@ -109,6 +111,48 @@ def find_good_samples(
         return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)
     weights = np.where(core.t > threshold, robust.ZERO_WEIGHT, 1.0)
     return GoodSamples([weights[a:b] for a, b in pairwise(starts)], stage)
+
+
+def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int, float] | None:
+    """Find a majority that agrees better than samples of one normal distribution do; None without one.
+
+    With few samples, a fit adapts to many outliers so far that the likelihood does not prefer the good
+    samples. If all m samples had the variance s₀² of a fit to all, the mean square s_g² of n_g chosen ones
+    would be as small with a probability of at most C(m, n_g)·P(χ²_ν ≤ ν·s_g²/s₀²), with ν degrees of freedom.
+
+    Returns the number of other samples, and s₀/s_g.
+    """
+    from scipy.special import gammainc  # lazy import: slow
+
+    system = linearize_and_factor(problem, x, small_angle=False)
+    root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
+    if not 0 < root.shape[1] <= MAX_COORDINATES:
+        return None
+    rows = linearize_rows(problem, x, root)
+    redundancy = rows.counts.sum() / independent_rows(rows, groups)
+
+    def mean_square(is_good: Array, scales: Array) -> tuple[float, float]:
+        squares = rows.residual_squares(rows.solve(is_good[None] * 1.0, scales[None]))[0]
+        fitted = is_good[rows.sample]
+        freedom = float(rows.counts[fitted].sum()) / redundancy - rows.n_determined
+        return float(squares[fitted].sum()) / redundancy / max(freedom, 1e-9), freedom
+
+    everything = np.ones(rows.n_samples, bool)
+    total, freedom = mean_square(everything, np.ones(len(rows.is_estimated)))
+    best, cores = (math.log(MAX_CHANCE), None), []
+    for is_good, noise in search_majorities(rows, groups, n_determined, N_HIDDEN) if freedom > 0 else ():
+        if any((core.t[is_good] <= STRICT_THRESHOLD).all() for core in cores):
+            continue
+        cores.append(core := _extend(rows, is_good, noise, redundancy))
+        chosen = core.t <= robust.REJECTION_THRESHOLD
+        square, freedom = mean_square(chosen, core.scales)
+        if freedom < 1 or not square < total:
+            continue
+        chance = float(gammainc(freedom / 2, freedom * square / total / 2))
+        log_chance = math.log(max(chance, 1e-300)) + _log_choices(len(chosen), int(chosen.sum()))
+        if log_chance < best[0]:
+            best = log_chance, (int(np.sum(~chosen)), float(np.sqrt(total / max(square, MIN_SCALE**2))))
+    return best[1]
 
 
 def _looks_like_noise(problem: Problem, x: Array, groups: Array) -> bool:

@@ -217,8 +217,10 @@ def _noise_class_name(index: int, item: Measurement, group: str, n_rows: int, u:
     return item.residual_groups[group].unit
 
 
-def search_majorities(rows: LinearizedRows, groups: Array, n_determined: int) -> list[tuple[Array, Array]]:
-    """Search fits of least trimmed squares; return the best ones in their order.
+def search_majorities(
+    rows: LinearizedRows, groups: Array, n_determined: int, n_best: int = N_BEST
+) -> list[tuple[Array, Array]]:
+    """Search fits of least trimmed squares; return the n_best best ones in their order.
 
     The groups are labels of the samples' configurations. A fit consists of whether each sample is in the
     majority that agrees best, and the noise scales of the classes.
@@ -228,7 +230,7 @@ def search_majorities(rows: LinearizedRows, groups: Array, n_determined: int) ->
     objective = np.zeros(len(weights))
     for _ in range(N_FIRST_STEPS):
         scales, weights, objective = _concentrate(rows, weights, scales)
-    best = np.argsort(objective, kind="stable")[:N_BEST]
+    best = np.argsort(objective, kind="stable")[:n_best]
     weights, scales = weights[best], scales[best]
     for _ in range(MAX_LAST_STEPS):
         previous = weights
