@@ -63,8 +63,9 @@ MAX_SAMPLES = 200
 MAX_COORDINATES = 200
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
-# Number of majorities that the search for a hidden one extends, and probability that chance makes one.
-N_HIDDEN, MAX_CHANCE = 40, 0.01
+# Number of majorities that the search for a hidden one extends, probability that chance makes one, and largest
+# number of samples.
+N_HIDDEN, MAX_CHANCE, MAX_FEW = 40, 0.01, 100
 # Largest number of extensions of the good samples.
 MAX_EXTENSIONS = 20
 
@@ -124,6 +125,8 @@ def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int
     """
     from scipy.special import gammainc  # lazy import: slow
 
+    if len(groups) > MAX_FEW:
+        return None
     system = linearize_and_factor(problem, x, small_angle=False)
     root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
     if not 0 < root.shape[1] <= MAX_COORDINATES:
