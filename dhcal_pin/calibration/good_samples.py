@@ -63,8 +63,8 @@ MAX_SAMPLES = 200
 MAX_COORDINATES = 200
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
-# Number of majorities that the search for a hidden one extends, probability that chance makes one, and largest
-# number of samples.
+# Number of majorities that the search for a hidden one extends, probability that chance makes one, and
+# largest number of samples.
 N_HIDDEN, MAX_CHANCE, MAX_FEW = 40, 0.01, 100
 # Largest number of extensions of the good samples.
 MAX_EXTENSIONS = 20

@@ -99,7 +99,7 @@ def test_calibrated_files_agree_with_mujoco_and_keep_all_other_bytes(arm, tmp_pa
 
 @ARMS
 def test_file_alone_and_sidecar_hold_two_models(arm, tmp_path):
-    """MuJoCo has the origins that are best without joint errors; with the sidecar it is the complete model."""
+    """MuJoCo has the origins that are best without joint errors; with the sidecar the model is complete."""
     chain, rng = chain_of(arm), np.random.default_rng(2)
     alone, complete = (
         chain.origins @ se3.exp6(1e-3 * rng.normal(size=(len(chain.origins), 6))) for _ in "ab"
