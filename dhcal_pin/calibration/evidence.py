@@ -10,7 +10,9 @@ import numpy as np
 from .._typing import Array
 from ..estimation import robust
 from ..measurements.measured_region import MeasuredRegion
+from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
+from ..plausibility.signs import SignDecision
 from ..session import Session
 from .cameras.board_size import BoardSize
 from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
@@ -56,6 +58,8 @@ class Evidence(FittedModel):
         earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
             if they were.
         session: What happened during the measurement; None if this was not examined.
+        signs: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are
+            those of the URDF.
     """
 
     region_comparison: Comparison | None = None
@@ -66,6 +70,7 @@ class Evidence(FittedModel):
     is_kept_nominal: bool = False
     earlier_diagnosis: Diagnosis | None = None
     session: Session | None = None
+    signs: SignDecision | None = None
 
     @property
     def shrinkage_notes(self) -> list[str]:
@@ -105,7 +110,8 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
-        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data)
+        sets = HAND_BUILT if self.signs else MANUFACTURED
+        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

@@ -1,7 +1,7 @@
 """Edits of a URDF that keep every other byte of the file.
 
 `with_origins` rewrites the values of `xyz` and `rpy` at their byte offsets, which the parser in `urdf`
-recorded. Comments, order, quotes and line ends stay. `with_world` and `with_tool_frame` append a link and a
+recorded. Comments, order, quotes and line ends stay. `with_turned_joints` rewrites axes and limits. `with_world` and `with_tool_frame` append a link and a
 fixed joint for the measuring frame and for the measured point.
 
 Numbers are written with `repr`, the shortest text that reads back as the same double. A rotation has several
@@ -11,7 +11,8 @@ triples of roll, pitch and yaw; the one nearest to that of the file is written (
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from xml.parsers import expat
 
 import numpy as np
@@ -19,7 +20,7 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..se3 import nearest_rpy, to_xyz_rpy
-from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
+from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, scan_tags, xml_attribute
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
 _RIGIDITY_TOL = 1e-9
@@ -27,6 +28,9 @@ _RIGIDITY_TOL = 1e-9
 _ELEMENT = re.compile(rb"<[^ \t\r\n/>]+")
 
 _ATTRIBUTE = re.compile(rb"""[ \t\r\n]+([^ \t\r\n=/>]+)[ \t\r\n]*=[ \t\r\n]*("[^"]*"|'[^']*')""")
+
+# Tags of a joint with limits, and the names of the lower and the upper one.
+_LIMITS = (("limit", "lower", "upper"), ("safety_controller", "soft_lower_limit", "soft_upper_limit"))
 
 # White space before the first child of a joint, from the last line end on.
 _INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
@@ -58,12 +62,42 @@ def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
             )
         if not np.array_equal(origin, joint.origin):
             edits += _origin_edits(urdf, joint, origin)
+    return _edited(urdf.data, edits)
+
+
+def _edited(data: bytes, edits: Sequence[tuple[int, int, bytes]]) -> bytes:
+    """Return data with some spans (start, end) replaced by other bytes."""
     parts, end_of_last = [], 0
     # The sort is stable: two attributes inserted at one offset keep their order.
     for start, end, text in sorted(edits, key=lambda edit: edit[0]):
-        parts += [urdf.data[end_of_last:start], text]
+        parts += [data[end_of_last:start], text]
         end_of_last = end
-    return b"".join([*parts, urdf.data[end_of_last:]])
+    return b"".join([*parts, data[end_of_last:]])
+
+
+def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
+    """Return a URDF in which some joints turn the other way: reversed axes, and exchanged limits."""
+    tags = scan_tags(urdf.data, urdf.source)[2]
+    edits: list[tuple[int, int, bytes]] = []
+    for name in names:
+        joint = tags[name]
+        axis = " ".join(repr(float(-x) + 0.0) for x in urdf.joint(name).axis).encode()
+        if "axis" in joint.children:
+            spans, end, quote = _attribute_spans(urdf.data, joint.children["axis"].start)
+            quote = quote or b'"'
+            edits.append((*spans[b"xyz"], axis) if b"xyz" in spans else (end, end, b" xyz=" + quote + axis + quote))
+        else:
+            start = urdf.joint(name).first_child
+            edits.append((start, start, b'<axis xyz="' + axis + b'"/>'))
+        for child, lower, upper in _LIMITS:
+            if child in joint.children:
+                tag = joint.children[child]
+                spans, _, _ = _attribute_spans(urdf.data, tag.start)
+                for key, other in ((lower, upper), (upper, lower)):
+                    text = repr(-float(tag.attributes.get(other, "0")) + 0.0).encode()
+                    edits += [(*spans[key.encode()], text)] if key.encode() in spans else []
+    data = _edited(urdf.data, edits)
+    return replace(parse_urdf(data, urdf.source), package_dirs=urdf.package_dirs)
 
 
 def with_world(data: bytes, base: Array) -> bytes:
