@@ -76,8 +76,10 @@ class Job:
         default=None,
         metadata={
             "choices": ARMS,
-            "help": "low-cost: a servo arm that was put together by hand (default with --servos): estimate its "
-            "zeros, with the parameter set low-cost, and decide which joints turn the other way; industrial: any "
+            "help": "low-cost: a servo arm that was put together by hand (default with --servos): "
+            "estimate its "
+            "zeros, with the parameter set low-cost, and decide which joints turn the other way; "
+            "industrial: any "
             "other (default)",
         },
     )
@@ -85,7 +87,8 @@ class Job:
         default="auto",
         metadata={
             "metavar": "auto|none|JOINT[,JOINT]",
-            "help": "joints that turn the other way than in the URDF, whose axes are reversed in the output: auto "
+            "help": "joints that turn the other way than in the URDF, whose axes are reversed in the "
+            "output: auto "
             "(decide it from the measurements of a low-cost arm; default), none, or names",
         },
     )

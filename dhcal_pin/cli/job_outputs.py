@@ -96,7 +96,8 @@ class RobotOutput(NamedTuple):
     Attributes:
         help: What the file is, for the help of --output.
         files: Function that makes the files of the robot by path, from the value of --output and all options
-            of the job by name, with the corrected servos as `servo_file`. A format refuses the options that it cannot follow.
+            of the job by name, with the corrected servos as `servo_file`. A format refuses the options that it
+            cannot follow.
     """
 
     help: str
@@ -207,10 +208,13 @@ def require_servos(output: str, servos: ServoFile | None) -> None:
     """Require the servos that the format of an output needs."""
     ending = robot_ending(output)
     if ending in (".json", ".ros2_control.yaml") and servos is None:
-        raise InvalidArgumentError(f"{output}: needs --servos, the file of the servos; expected it, or a .urdf output")
+        raise InvalidArgumentError(
+            f"{output}: needs --servos, the file of the servos; expected it, or a .urdf output"
+        )
     if ending == ".json" and servos is not None and not servos.lerobot:
         raise InvalidArgumentError(
-            f"{output}: --servos {servos.path} is not from LeRobot; expected its .json, or a .toml with the key lerobot"
+            f"{output}: --servos {servos.path} is not from LeRobot; expected its .json, or a .toml with "
+            f"the key lerobot"
         )
 
 
@@ -227,7 +231,10 @@ def companion_paths(output: str, has_servos: bool) -> list[str]:
 
 def name_robot_files(paths: Iterable[str]) -> dict[str, str]:
     """Return the files of a robot by what they are."""
-    names = {path: next((n for e, n in _FILE_NAMES.items() if path.lower().endswith(e)), "camera_file") for path in paths}
+    names = {
+        path: next((n for e, n in _FILE_NAMES.items() if path.lower().endswith(e)), "camera_file")
+        for path in paths
+    }
     found: dict[str, str] = {}
     for name in dict.fromkeys(names.values()):
         found |= numbered(name, [path for path, other in names.items() if other == name])

@@ -180,7 +180,8 @@ def _checked_inputs(job: Job, servos: ServoFile | None) -> list[str]:
         raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
     if servos and (signs := [change for change in job.mend if change.startswith("sign:")]):
         raise InvalidArgumentError(
-            f"--mend {signs[0]}: not allowed with --servos; expected --turned JOINT, which reverses the axis in the URDF"
+            f"--mend {signs[0]}: not allowed with --servos; expected --turned JOINT, which reverses the "
+            f"axis in the URDF"
         )
     measured = [*job.data, *filter(None, [_holdout_file(job)])]
     for number, path in enumerate(measured):

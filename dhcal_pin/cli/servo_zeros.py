@@ -1,7 +1,7 @@
 """Zeros of servos after a calibration: moved from the robot into the servo file.
 
-The estimated zeros of the joints, rounded to whole counts, are added to the joint values that the servos report.
-The robot is the same for these values, with the rest of the zeros in its joint origins.
+The estimated zeros of the joints, rounded to whole counts, are added to the joint values that the servos
+report. The robot is the same for these values, with the rest of the zeros in its joint origins.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import numpy as np
 
 from ..calibration.result import Result
 from ..io.servo_file import ServoFile
-from ..robot.zeros import with_zeros_moved
 
 # Ending of the names of estimated zeros.
 _ZERO = ".offset"
@@ -28,7 +27,7 @@ def move_zeros(fit: Result, servos: ServoFile) -> tuple[Result, ServoFile]:
     region, _ = fit.measured_region, fit.uncertainty
     written = copy.copy(fit)
     vars(written).update(
-        chain=with_zeros_moved(fit.chain, summands), _measured_region=region and region.moved(summands)
+        chain=fit.chain.with_zeros_moved(summands), _measured_region=region and region.moved(summands)
     )
     return written, corrected
 

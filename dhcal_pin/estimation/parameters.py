@@ -45,8 +45,8 @@ from .error_model import ErrorModel, ErrorParameter
 LENGTH_PRIOR = 1e-3
 ANGLE_PRIOR = 5e-3
 OFFSET_PRIOR = np.deg2rad(2.0)
-# The same of low-cost arms, whose plastic links and servos are put together by hand, and of the zeros of their
-# prismatic joints.
+# The same of low-cost arms, whose plastic links and servos are put together by hand, and of the zeros
+# of their prismatic joints.
 LOW_COST = "low-cost"
 LOW_COST_LENGTH_PRIOR, LOW_COST_ANGLE_PRIOR = 3e-3, np.deg2rad(2.0)
 LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR = np.deg2rad(15.0), 1e-2
@@ -282,7 +282,8 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
     "tool": ParameterSet(tool, "pose of the measured point in the tip frame"),
     "offset": ParameterSet(offset, "zero position of each joint"),
     LOW_COST: ParameterSet(
-        low_cost, "axes and zero positions of a low-cost servo arm: zeros 15 deg, lengths 3 mm, directions 2 deg"
+        low_cost,
+        "axes and zero positions of a low-cost servo arm: zeros 15 deg, lengths 3 mm, directions 2 deg",
     ),
     **{
         name: ParameterSet(functools.partial(joint_errors, family=family), family.description)

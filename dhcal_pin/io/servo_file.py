@@ -16,13 +16,13 @@ A servo file is the calibration that LeRobot keeps of an arm (.json), or a TOML 
     zero = 2048                    # count at the zero of the joint; default: half the resolution
     counts_per_turn = 4096         # default: the resolution
 
-With `lerobot`, motors have the keys `joint` and `resolution` only, and those that are not named have the names of
-their joints.
+With `lerobot`, motors have the keys `joint` and `resolution` only, and those that are not named have the
+names of their joints.
 
 In degrees, LeRobot reports (c - m)·360/(resolution - 1) of the count c with the middle m of `range_min` and
 `range_max`; `drive_mode` has no effect in this unit. The count contains the homing offset h already: it is
-actual - h for motors of Feetech, and actual + h for those of Dynamixel. A zero is therefore corrected by h, and a
-wrong sign by the axis in the URDF.
+actual - h for motors of Feetech, and actual + h for those of Dynamixel. A zero is therefore corrected by h, and
+a wrong sign by the axis in the URDF.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ _LEROBOT_KEYS = ("id", "drive_mode", "homing_offset", "range_min", "range_max")
 _RESOLUTION_KEY = toml.whole(2, _MAX_RESOLUTION, is_optional=True)
 HEAD_KEYS: Mapping[str, Key] = {
     "resolution": _RESOLUTION_KEY,
-    "lerobot": toml.text("the path of LeRobot's calibration, relative to this file", "(?s:.+)", is_optional=True),
+    "lerobot": toml.text(
+        "the path of LeRobot's calibration, relative to this file", "(?s:.+)", is_optional=True
+    ),
     "make": toml.choice(MAKES, default="feetech"),
 }
 _NAME_KEYS: Mapping[str, Key] = {
@@ -68,7 +70,12 @@ _NAME_KEYS: Mapping[str, Key] = {
 MOTOR_KEYS: Mapping[str, Key] = {
     **_NAME_KEYS,
     "id": toml.whole(0, 255, is_optional=True),
-    "sign": Key("1 or -1", {"enum": [1, -1]}, lambda value: value in (1, -1) and not isinstance(value, bool), default=1),
+    "sign": Key(
+        "1 or -1",
+        {"enum": [1, -1]},
+        lambda value: value in (1, -1) and not isinstance(value, bool),
+        default=1,
+    ),
     "zero": toml.number(-_MAX_INTEGER, _MAX_INTEGER, is_optional=True),
     "counts_per_turn": toml.number(1, _MAX_RESOLUTION, is_optional=True),
 }
@@ -116,13 +123,15 @@ class ServoFile:
         """Require that a robot has the joint of a servo."""
         if servo.joint not in joints:
             raise UnknownNameError(
-                f"{self.path}: motor {quote(servo.name)} moves joint {quote(servo.joint)}, which {robot} does not "
+                f"{self.path}: motor {quote(servo.name)} moves joint {quote(servo.joint)}, which "
+                f"{robot} does not "
                 f"have; write joint = NAME in [motor.{servo.name}] of a TOML servo file; the joints are "
                 f"{', '.join(joints)}"
             )
 
     def with_zeros_moved(self, angles: Mapping[str, float]) -> tuple[ServoFile, dict[str, float]]:
-        """Add angles to the values of joints, rounded to whole counts; return the rounded angles, too [rad]."""
+        """Add angles to the values of joints, rounded to whole counts; return the rounded angles, too "
+        "[rad]."""
         servos, moved = [], {}
         for servo in self.servos:
             counts = round(angles.get(servo.joint, 0.0) / servo.step)
@@ -146,9 +155,13 @@ class ServoFile:
         """Return LeRobot's calibration with the present homing offsets; every other character stays."""
         text = self.lerobot_text
         for servo in self.servos:
-            name = "|".join({re.escape(json.dumps(servo.name, ensure_ascii=ascii)) for ascii in (True, False)})
+            name = "|".join(
+                {re.escape(json.dumps(servo.name, ensure_ascii=ascii)) for ascii in (True, False)}
+            )
             pattern = rf'((?:{name})\s*:\s*{{[^{{}}]*?"homing_offset"\s*:\s*)-?\d+'
-            text = re.sub(pattern, lambda match, offset=servo.homing_offset: f"{match[1]}{offset}", text, count=1)
+            text = re.sub(
+                pattern, lambda match, offset=servo.homing_offset: f"{match[1]}{offset}", text, count=1
+            )
         written = {name: motor["homing_offset"] for name, motor in json.loads(text).items()}
         if written != {servo.name: servo.homing_offset for servo in self.servos}:
             raise FileFormatError(f"{self.lerobot}: homing offsets were not found; write it as LeRobot does")
@@ -172,7 +185,8 @@ class ServoFile:
     def ros2_control_content(self) -> str:
         """Return parameters of the joints for drivers of `ros2_control`, as YAML."""
         lines = [
-            "# Parameters of joints for ros2_control drivers of servos. Counts as in the measurement: the homing",
+            "# Parameters of joints for ros2_control drivers of servos. Counts as in the measurement: "
+            "the homing",
             "# offsets that the servos store stay as they were.",
             "#   joint [rad] = (position - offset) / gear_ratio",
             "#   position [rad] = (count - resolution/2) * 2*pi/resolution",
@@ -209,7 +223,9 @@ def read_servos(path: PathLike) -> ServoFile:
         servos = ServoFile(path, tuple(_servo(name, keys, head) for name, keys in motors.items()))
     joints = [servo.joint for servo in servos.servos]
     if double := [servo.name for servo in servos.servos if joints.count(servo.joint) > 1]:
-        raise FileFormatError(f"{path}: motors {' and '.join(double)} move the same joint; expected one motor each")
+        raise FileFormatError(
+            f"{path}: motors {' and '.join(double)} move the same joint; expected one motor each"
+        )
     return servos
 
 
@@ -235,7 +251,8 @@ def _from_lerobot(
         raise FileFormatError(f"{lerobot}: not a calibration of LeRobot; {expected}")
     if "motor_names" in content:
         raise FileFormatError(
-            f"{lerobot}: written by an old version of LeRobot; calibrate again with the present one; {expected}"
+            f"{lerobot}: written by an old version of LeRobot; calibrate again with the present one; "
+            f"{expected}"
         )
     for name in motors:
         if name not in content:
@@ -255,7 +272,8 @@ def _from_lerobot(
         number, _, offset, low, high = (int(value) for value in values if value is not None)
         if low >= high:
             raise FileFormatError(
-                f"{lerobot}: motor {quote(name)}: range_min {low} is not below range_max {high}; record the range again"
+                f"{lerobot}: motor {quote(name)}: range_min {low} is not below range_max {high}; record "
+                f"the range again"
             )
         keys = motors.get(name, {})
         own = keys.get("resolution") or resolution or RESOLUTION

@@ -84,7 +84,9 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACT
     equal = tuple(item.initialized(errors.chain) for item in equal)
     is_robot = _is_robot(errors)
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
-    problem = make_problem(errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {})
+    problem = make_problem(
+        errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
+    )
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
     noise = new = _estimate_noise(problem, solution.x)
     for _ in range(_N_ROUNDS):

@@ -116,7 +116,8 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
-    """Return the measurements, at most `_MAX_ITEMS`, from which hypotheses about the joints can be compared."""
+    """Return the measurements, at most `_MAX_ITEMS`, from which hypotheses about the joints can be "
+    "compared."""
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
     items = [item for item in items if item.rig is None]
     return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]

@@ -87,8 +87,10 @@ class SignDecision:
         """Open questions, each with what decides it."""
         if not self.is_compared:
             return [
-                "The signs of the joints were not compared, which needs positions or poses of the tool, at least 8. "
-                "Look which joints turn the other way than in the URDF, and name them: --turned NAME[,NAME] or "
+                "The signs of the joints were not compared, which needs positions or poses of the tool, "
+                "at least 8. "
+                "Look which joints turn the other way than in the URDF, and name them: --turned "
+                "NAME[,NAME] or "
                 "--turned none."
             ]
         return [self._question(each) for each in self.open[:_MAX_LISTED]]
@@ -98,12 +100,16 @@ class SignDecision:
         names = open_signs.joints
         several, first = len(names) > 1, names[0]
         text = (
-            f"The sign{'s' * several} of {', '.join(names)} {'are' if several else 'is'} open: turned the other "
-            f"way{' all together,' if several else ''} with other zeros, the arm fits the measurements about as well. "
+            f"The sign{'s' * several} of {', '.join(names)} {'are' if several else 'is'} open: turned "
+            f"the other "
+            f"way{' all together,' if several else ''} with other zeros, the arm fits the measurements "
+            f"about as well. "
         )
         if open_signs.distance > _MIN_DISTANCE:
             values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
-            pose = ", ".join(f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values)
+            pose = ", ".join(
+                f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values
+            )
             apart = format_quantity(open_signs.distance, "m", 0.1 * open_signs.distance)
             text += f"A measurement at {pose} decides it (the tools are {apart} apart there), or look"
         else:
@@ -112,7 +118,8 @@ class SignDecision:
         as_in_urdf, reversed_ = (self.turned, other) if first in other else (other, self.turned)
         options = [f"--turned {','.join(each) or 'none'}" for each in (as_in_urdf, reversed_)]
         return (
-            f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand rule. If so, add "
+            f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand "
+            f"rule. If so, add "
             f"{options[0]}; if not, add {options[1]}."
         )
 

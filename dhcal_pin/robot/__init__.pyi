@@ -33,4 +33,3 @@ from .urdf import Urdf as Urdf
 from .urdf import UrdfJoint as UrdfJoint
 from .urdf import parse_urdf as parse_urdf
 from .urdf import read_urdf as read_urdf
-from .zeros import with_zeros_moved as with_zeros_moved

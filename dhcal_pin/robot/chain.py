@@ -680,6 +680,30 @@ class Chain:
             tool=self.tool @ motions[-1],
         )
 
+    def with_zeros_moved(self, summands: ArrayLike) -> Chain:
+        """Return the robot that has the same poses at joint positions which are larger by constants.
+
+        With gains or couplings and gravity, the torques are those of positions that differ by these errors of
+        the constants.
+
+        Args:
+            summands: Constant of each joint, shape (n,) [rad or m].
+
+        Returns:
+            Copy of the chain with other joint origins.
+        """
+        d = np.asarray(summands, float)
+        constants = -d if self.transmission is None else -d - self.transmission.linear @ d
+        moving = self.mimic_matrix @ constants
+        vectors = (self.axes * moving[:, None])[:, None] * np.stack([self.prismatic, ~self.prismatic], 1)[
+            ..., None
+        ]
+        motions = {self.origin_frame(j + 1): se3.exp6(twist.ravel()) for j, twist in enumerate(vectors)}
+        moved = self.perturbed_at(motions)
+        if self.transmission is None:
+            return moved
+        return moved.with_transmission(self.transmission.with_zeros_moved(d)).with_current_loads()
+
     def with_base_and_tool(self, base: Array, tool: Array) -> Chain:
         """Return a copy with another base and tool.
 

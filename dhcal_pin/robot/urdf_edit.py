@@ -1,8 +1,9 @@
 """Edits of a URDF that keep every other byte of the file.
 
 `with_origins` rewrites the values of `xyz` and `rpy` at their byte offsets, which the parser in `urdf`
-recorded. Comments, order, quotes and line ends stay. `with_turned_joints` rewrites axes and limits. `with_world` and `with_tool_frame` append a link and a
-fixed joint for the measuring frame and for the measured point.
+recorded. Comments, order, quotes and line ends stay. `with_turned_joints` rewrites axes and limits.
+`with_world` and `with_tool_frame` append a link and a fixed joint for the measuring frame and for the measured
+point.
 
 Numbers are written with `repr`, the shortest text that reads back as the same double. A rotation has several
 triples of roll, pitch and yaw; the one nearest to that of the file is written (`se3.nearest_rpy`).
@@ -85,7 +86,9 @@ def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
         if "axis" in joint.children:
             spans, end, quote = _attribute_spans(urdf.data, joint.children["axis"].start)
             quote = quote or b'"'
-            edits.append((*spans[b"xyz"], axis) if b"xyz" in spans else (end, end, b" xyz=" + quote + axis + quote))
+            edits.append(
+                (*spans[b"xyz"], axis) if b"xyz" in spans else (end, end, b" xyz=" + quote + axis + quote)
+            )
         else:
             start = urdf.joint(name).first_child
             edits.append((start, start, b'<axis xyz="' + axis + b'"/>'))

@@ -40,16 +40,23 @@ def _find_servo(table: DataTable, chain: Chain, servos: ServoFile | None, column
     where = f"{table.header_location}: column '{column.name}[{TICKS}]'"
     if servos is None:
         raise FileFormatError(
-            f"{where} has counts of a servo; expected --servos FILE with LeRobot's calibration (.json) or a servo "
+            f"{where} has counts of a servo; expected --servos FILE with LeRobot's calibration (.json) "
+            f"or a servo "
             "file (.toml)"
         )
     servo = servos.of_column(name)
     if servo is None:
         motors = ", ".join(f"{each.name} (joint {each.joint})" for each in servos.servos)
-        raise UnknownNameError(f"{where}: {servos.path} has no motor of {quote(name)}; its motors are {motors}")
-    servos.require_joint(servo, [joint.name for joint in chain.urdf.joints if joint.type != "fixed"], chain.urdf.source)
+        raise UnknownNameError(
+            f"{where}: {servos.path} has no motor of {quote(name)}; its motors are {motors}"
+        )
+    servos.require_joint(
+        servo, [joint.name for joint in chain.urdf.joints if joint.type != "fixed"], chain.urdf.source
+    )
     if chain.urdf.joint(servo.joint).type == "prismatic":
-        raise FileFormatError(f"{where}: joint {quote(servo.joint)} is prismatic; expected its value, such as [mm]")
+        raise FileFormatError(
+            f"{where}: joint {quote(servo.joint)} is prismatic; expected its value, such as [mm]"
+        )
     return servo
 
 
@@ -65,7 +72,8 @@ def _checked_counts(table: DataTable, column: Column, servo: Servo) -> Array:
             row = int(rows[0])
             text = table.cells[row][column.index].strip()
             raise FileFormatError(
-                f"{table.cell_location(row, column.name)}: {quote(text)} {problem}; expected counts from 0 to "
+                f"{table.cell_location(row, column.name)}: {quote(text)} {problem}; expected counts "
+                f"from 0 to "
                 f"{servo.resolution - 1}"
             )
     return values
