@@ -96,8 +96,8 @@ class RobotOutput(NamedTuple):
     Attributes:
         help: What the file is, for the help of --output.
         files: Function that makes the files of the robot by path, from the value of --output and all options
-            of the job by name, with the corrected servos as `servo_file`. A format refuses the options that it
-            cannot follow.
+            of the job by name, with the corrected servos as `servo_file`. A format refuses the options that
+            it cannot follow.
     """
 
     help: str

@@ -21,8 +21,8 @@ names of their joints.
 
 In degrees, LeRobot reports (c - m)·360/(resolution - 1) of the count c with the middle m of `range_min` and
 `range_max`; `drive_mode` has no effect in this unit. The count contains the homing offset h already: it is
-actual - h for motors of Feetech, and actual + h for those of Dynamixel. A zero is therefore corrected by h, and
-a wrong sign by the axis in the URDF.
+actual - h for motors of Feetech, and actual + h for those of Dynamixel. A zero is therefore corrected by h,
+and a wrong sign by the axis in the URDF.
 """
 
 from __future__ import annotations
@@ -130,13 +130,12 @@ class ServoFile:
             )
 
     def with_zeros_moved(self, angles: Mapping[str, float]) -> tuple[ServoFile, dict[str, float]]:
-        """Add angles to the values of joints, rounded to whole counts; return the rounded angles, too "
-        "[rad]."""
+        """Add angles [rad] to the values of joints, in whole counts; return the angles added."""
         servos, moved = [], {}
         for servo in self.servos:
             counts = round(angles.get(servo.joint, 0.0) / servo.step)
             offset = self._homing_offset(servo, counts)
-            if self.make == "feetech" and offset == -_MAX_FEETECH_OFFSET - 1:
+            if self.make == "feetech" and counts and offset == -_MAX_FEETECH_OFFSET - 1:
                 counts -= 1
                 offset += 1
             servos.append(replace(servo, zero=servo.zero - counts, homing_offset=offset))

@@ -96,7 +96,9 @@ class Diagnosis:
 
 
 def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
-    """Look for a mistake in measurements that explains why they do not fit a robot with errors of some sets.
+    """Look for a mistake in measurements that explains why they do not fit the robot.
+
+    The robot may have errors of one of the parameter sets of `evidence`.
 
     A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
     a robot with other errors can touch an unknown surface exactly, whatever the mistake is. So are image
@@ -116,8 +118,7 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
-    """Return the measurements, at most `_MAX_ITEMS`, from which hypotheses about the joints can be "
-    "compared."""
+    """Return the measurements, at most `_MAX_ITEMS`, that tell hypotheses about joints apart."""
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
     items = [item for item in items if item.rig is None]
     return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]

@@ -2,8 +2,8 @@
 
 `with_origins` rewrites the values of `xyz` and `rpy` at their byte offsets, which the parser in `urdf`
 recorded. Comments, order, quotes and line ends stay. `with_turned_joints` rewrites axes and limits.
-`with_world` and `with_tool_frame` append a link and a fixed joint for the measuring frame and for the measured
-point.
+`with_world` and `with_tool_frame` append a link and a fixed joint for the measuring frame and for the
+measured point.
 
 Numbers are written with `repr`, the shortest text that reads back as the same double. A rotation has several
 triples of roll, pitch and yaw; the one nearest to that of the file is written (`se3.nearest_rpy`).
