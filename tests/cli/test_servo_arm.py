@@ -42,7 +42,9 @@ def arm(tmp_path, monkeypatch):
 
 def test_all_files_give_the_same_poses_for_the_same_counts(arm, run):
     for output in ("arm.json", "arm.ros2_control.yaml"):
-        status, _, err = run(*CALIBRATE, "--servos", "so101.json", "-o", output, "--json", f"{output}.result.json")
+        status, _, err = run(
+            *CALIBRATE, "--servos", "so101.json", "-o", output, "--json", f"{output}.result.json"
+        )
         assert status == 0
         assert "verdict: ok" in err
     result = json.loads(Path("arm.json.result.json").read_text())
@@ -101,7 +103,10 @@ def test_motors_may_have_other_names_than_joints(arm, run):
 def test_signs_can_be_stated(arm, run):
     Path("so101.toml").write_text(read_servos("so101.json").toml_content())
     stated = ",".join(arm.wrong)
-    assert run(*CALIBRATE, "--servos", "so101.toml", "--turned", stated, "-o", "arm.urdf", "--json", "r.json")[0] == 0
+    assert (
+        run(*CALIBRATE, "--servos", "so101.toml", "--turned", stated, "-o", "arm.urdf", "--json", "r.json")[0]
+        == 0
+    )
     assert json.loads(Path("r.json").read_text())["signs"] == {
         "compared": True,
         "turned": list(arm.wrong),
@@ -112,8 +117,16 @@ def test_signs_can_be_stated(arm, run):
 REFUSED = {
     "no servo file": ((), "", ["poses.csv:1", "shoulder_pan[ticks]", "--servos"]),
     "no motor": (("--servos", "few.toml"), "", ["poses.csv:1", "shoulder_lift", "few.toml", "shoulder_pan"]),
-    "no joint": (("--servos", "other.toml"), "", ["other.toml", "'shoulder_pan'", "'pan_joint'", "joint = NAME"]),
-    "fraction": (("--servos", "so101.json"), "2000.5", ["poses.csv:2", "shoulder_pan", "2000.5", "whole number"]),
+    "no joint": (
+        ("--servos", "other.toml"),
+        "",
+        ["other.toml", "'shoulder_pan'", "'pan_joint'", "joint = NAME"],
+    ),
+    "fraction": (
+        ("--servos", "so101.json"),
+        "2000.5",
+        ["poses.csv:2", "shoulder_pan", "2000.5", "whole number"],
+    ),
     "too large": (("--servos", "so101.json"), "4096", ["poses.csv:2", "shoulder_pan", "4096", "0 to 4095"]),
     "negative": (("--servos", "so101.json"), "-1", ["poses.csv:2", "shoulder_pan", "out of range"]),
     "no number": (("--servos", "so101.json"), "x", ["poses.csv:2", "shoulder_pan", "'x'"]),

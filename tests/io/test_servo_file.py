@@ -24,7 +24,9 @@ def test_counts_become_the_degrees_of_lerobot(tmp_path):
     counts = np.array([0, 1, 2047, 2048, 3100, 4095])
     for name, limits in RANGES.items():
         servo = servos.of_column(name)
-        np.testing.assert_allclose(np.rad2deg(servo.angles(counts)), lerobot_degrees(counts, *limits), atol=1e-12)
+        np.testing.assert_allclose(
+            np.rad2deg(servo.angles(counts)), lerobot_degrees(counts, *limits), atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(("make", "sign"), [("feetech", -1), ("dynamixel", 1)])
@@ -51,7 +53,9 @@ def test_a_corrected_homing_offset_adds_the_angle(tmp_path, make, sign):
         lerobot_text(),
         lerobot_text().replace("\n", "\r\n"),
         json.dumps(json.loads(lerobot_text()), separators=(",", ":")),
-        lerobot_text().replace('"gripper"', '"gr\\u00f6\\"{if"').replace('"id"', '"note": "homing_offset: 3", "id"'),
+        lerobot_text()
+        .replace('"gripper"', '"gr\\u00f6\\"{if"')
+        .replace('"id"', '"note": "homing_offset: 3", "id"'),
     ],
 )
 def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
@@ -67,7 +71,9 @@ def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
 
 
 def test_a_homing_offset_stays_within_the_register_of_a_feetech_motor(tmp_path):
-    servos = read_servos(written(tmp_path, "arm.json", lerobot_text({"elbow_flex": 2000, "wrist_flex": -2047})))
+    servos = read_servos(
+        written(tmp_path, "arm.json", lerobot_text({"elbow_flex": 2000, "wrist_flex": -2047}))
+    )
     step = 2 * np.pi / 4095
     corrected, moved = servos.with_zeros_moved({"elbow_flex": -100 * step, "wrist_flex": 1 * step})
     offsets = {servo.name: servo.homing_offset for servo in corrected.servos}
@@ -96,7 +102,7 @@ resolution = 4096
 
 
 def test_ros2_control_parameters_give_the_joint_values(tmp_path):
-    text = '[motor.pan]\nsign = -1\nzero = 1999\n[motor.lift]\ncounts_per_turn = 4095\nid = 2\n'
+    text = "[motor.pan]\nsign = -1\nzero = 1999\n[motor.lift]\ncounts_per_turn = 4095\nid = 2\n"
     servos = read_servos(written(tmp_path, "arm.toml", text))
     parameters = yaml.safe_load(servos.ros2_control_content())
     assert [parameters[name]["offset_counts"] for name in ("pan", "lift")] == [1999, 2048]
@@ -114,14 +120,26 @@ def test_ros2_control_parameters_give_the_joint_values(tmp_path):
         ("a.json", "[]", ["not a calibration of LeRobot", "range_min"]),
         ("a.json", '{"homing_offset": [1], "motor_names": ["a"]}', ["old version"]),
         ("a.json", '{"a": 3}', ["motor 'a'", "id is not an integer"]),
-        ("a.json", lerobot_text().replace("741", "741.5"), ["motor 'shoulder_pan'", "range_min is not an integer"]),
-        ("a.json", lerobot_text().replace("741", "3465"), ["shoulder_pan", "range_min 3465", "range_max 3465"]),
+        (
+            "a.json",
+            lerobot_text().replace("741", "741.5"),
+            ["motor 'shoulder_pan'", "range_min is not an integer"],
+        ),
+        (
+            "a.json",
+            lerobot_text().replace("741", "3465"),
+            ["shoulder_pan", "range_min 3465", "range_max 3465"],
+        ),
         ("a.toml", "", ["motor is missing"]),
         ("a.toml", "[motor.a]\nsgn = 1", ["[motor.a]", "sgn"]),
         ("a.toml", "[motor.a]\nsign = 2", ["sign = 2", "1 or -1"]),
         ("a.toml", '[motor.a]\njoint = "j"\n[motor.b]\njoint = "j"', ["a and b", "same joint"]),
         ("a.toml", 'lerobot = "missing.json"', ["missing.json"]),
-        ("a.toml", 'lerobot = "so101.json"\n[motor.foo]\njoint = "j"', ["[motor.foo]", "unknown motor", "elbow_flex"]),
+        (
+            "a.toml",
+            'lerobot = "so101.json"\n[motor.foo]\njoint = "j"',
+            ["[motor.foo]", "unknown motor", "elbow_flex"],
+        ),
         ("a.toml", 'lerobot = "so101.json"\n[motor.gripper]\nzero = 3', ["[motor.gripper]", "zero"]),
     ],
 )
