@@ -25,7 +25,7 @@ RANGES = {
 
 
 def lerobot_degrees(count: np.ndarray | float, low: int, high: int) -> np.ndarray | float:
-    """Return what LeRobot reports in degrees: 12 bits, range of 4095 steps, zero in the middle of the range."""
+    """Return what LeRobot reports in degrees: 4095 steps a turn, zero in the middle of the range."""
     middle = low + 0.5 * (high - low)
     return 360.0 * (count - middle) / 4095.0
 
@@ -58,6 +58,7 @@ class ServoArm:
     def random(
         cls, rng: np.random.Generator, zero_deg: float = 15.0, wrong: int | None = None, path: Path = SO101
     ) -> ServoArm:
+        """Draw an arm with errors of links, axes and zeros."""
         model = pin.buildModelFromUrdf(str(path))
         for name in JOINTS:
             error = np.concatenate([rng.normal(0, 1.5e-3, 3), rng.normal(0, np.deg2rad(1.0), 3)])

@@ -205,7 +205,18 @@ class ServoFile:
 
 
 def read_servos(path: PathLike) -> ServoFile:
-    """Read a servo file: LeRobot's calibration, or a TOML file."""
+    """Read a servo file.
+
+    Args:
+        path: LeRobot's calibration of an arm (.json), or a TOML file.
+
+    Returns:
+        Servos, for the argument `servos` of `read_measurements`.
+
+    Raises:
+        FileFormatError: The file cannot be read, or its content is invalid.
+        UnknownNameError: A TOML file names a motor that LeRobot's calibration does not have.
+    """
     path = os.fspath(path)
     if path.lower().endswith(".json"):
         return _from_lerobot(path, path, {}, None, "feetech")

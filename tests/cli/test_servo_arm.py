@@ -29,7 +29,7 @@ CALIBRATE = ("calibrate", "so101.urdf", "poses.csv", "--tip", TIP)
 
 @pytest.fixture
 def arm(tmp_path, monkeypatch):
-    """Working folder with a nominal arm, its servo file and 25 measurements; two joints turn the other way."""
+    """Folder with a nominal arm, its servo file and 25 measurements; two joints turn the other way."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(5)
     arm = ServoArm.random(rng, wrong=2)
@@ -83,7 +83,6 @@ def test_the_calibrated_arm_is_accurate_on_other_counts(arm, run):
     options = ("--tip", TIP, "--servos", "arm.servos.toml", "--json", "v.json")
     assert run("validate", "arm.urdf", "other.csv", *options)[0] == 0
     assert json.loads(Path("v.json").read_text())["after"]["position_rms_m"] < 4e-3
-    # The zeros are those of the servos: joint origins keep the angles of the nominal arm, but for axis errors.
     nominal, calibrated = read_robot("so101.urdf", TIP), read_robot("arm.urdf", TIP)
     turned = np.array([name in arm.wrong for name in JOINTS])
     np.testing.assert_array_equal(calibrated.axes, np.where(turned[:, None], -1, 1) * nominal.axes)
