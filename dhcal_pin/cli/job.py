@@ -76,11 +76,9 @@ class Job:
         default=None,
         metadata={
             "choices": ARMS,
-            "help": "low-cost: a servo arm that was put together by hand (default with --servos): "
-            "estimate its "
-            "zeros, with the parameter set low-cost, and decide which joints turn the other way; "
-            "industrial: any "
-            "other (default)",
+            "help": "low-cost: a servo arm that was put together by hand (default with --servos): estimate "
+            "its zeros, with the parameter set low-cost, and decide which joints turn the other way; "
+            "industrial: any other (default)",
         },
     )
     turned: str = field(
@@ -88,8 +86,7 @@ class Job:
         metadata={
             "metavar": "auto|none|JOINT[,JOINT]",
             "help": "joints that turn the other way than in the URDF, whose axes are reversed in the "
-            "output: auto "
-            "(decide it from the measurements of a low-cost arm; default), none, or names",
+            "output: auto (decide it from the measurements of a low-cost arm; default), none, or names",
         },
     )
     extend: str = field(

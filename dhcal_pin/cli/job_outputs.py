@@ -213,8 +213,8 @@ def require_servos(output: str, servos: ServoFile | None) -> None:
         )
     if ending == ".json" and servos is not None and not servos.lerobot:
         raise InvalidArgumentError(
-            f"{output}: --servos {servos.path} is not from LeRobot; expected its .json, or a .toml with "
-            f"the key lerobot"
+            f"{output}: --servos {servos.path} is not from LeRobot; expected its .json, or a .toml with the "
+            "key lerobot"
         )
 
 

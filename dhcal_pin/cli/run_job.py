@@ -29,7 +29,7 @@ from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
-from ..estimation.parameters import select_parameters
+from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
@@ -45,6 +45,7 @@ from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.hypotheses import mend
+from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
@@ -180,8 +181,8 @@ def _checked_inputs(job: Job, servos: ServoFile | None) -> list[str]:
         raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
     if servos and (signs := [change for change in job.mend if change.startswith("sign:")]):
         raise InvalidArgumentError(
-            f"--mend {signs[0]}: not allowed with --servos; expected --turned JOINT, which reverses the "
-            f"axis in the URDF"
+            f"--mend {signs[0]}: not allowed with --servos; expected --turned JOINT, which reverses the axis "
+            "in the URDF"
         )
     measured = [*job.data, *filter(None, [_holdout_file(job)])]
     for number, path in enumerate(measured):
@@ -237,6 +238,7 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
     notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
+    limited = with_wide_limits(chain) if LOW_COST in chain.parameters else chain
     for path in [*job.data, *filter(None, [holdout_file])]:
         read = read_measurement_file(
             path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig, servos=servos
@@ -247,7 +249,7 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
         by_file[path] = measured.data
         notes[path] = list(measured.notes)
         # The values of a mended file are not those of its columns. The verdict looks for mixed-up columns.
-        warnings[path] = [] if job.mend else find_value_warnings(chain, measured)
+        warnings[path] = [] if job.mend else find_value_warnings(limited, measured)
         # Without base and tool it is not known where the robot can place the measured point.
         unreachable[path] = find_unreachable_rows(chain, measured) if has_known_frames else []
         if path == holdout_file:

@@ -123,10 +123,9 @@ class ServoFile:
         """Require that a robot has the joint of a servo."""
         if servo.joint not in joints:
             raise UnknownNameError(
-                f"{self.path}: motor {quote(servo.name)} moves joint {quote(servo.joint)}, which "
-                f"{robot} does not "
-                f"have; write joint = NAME in [motor.{servo.name}] of a TOML servo file; the joints are "
-                f"{', '.join(joints)}"
+                f"{self.path}: motor {quote(servo.name)} moves joint {quote(servo.joint)}, which {robot} "
+                f"does not have; write joint = NAME in [motor.{servo.name}] of a TOML servo file; the joints "
+                f"are {', '.join(joints)}"
             )
 
     def with_zeros_moved(self, angles: Mapping[str, float]) -> tuple[ServoFile, dict[str, float]]:
@@ -184,8 +183,8 @@ class ServoFile:
     def ros2_control_content(self) -> str:
         """Return parameters of the joints for drivers of `ros2_control`, as YAML."""
         lines = [
-            "# Parameters of joints for ros2_control drivers of servos. Counts as in the measurement: "
-            "the homing",
+            "# Parameters of joints for ros2_control drivers of servos. Counts as in the measurement: the "
+            "homing",
             "# offsets that the servos store stay as they were.",
             "#   joint [rad] = (position - offset) / gear_ratio",
             "#   position [rad] = (count - resolution/2) * 2*pi/resolution",
@@ -282,8 +281,8 @@ def _from_lerobot(
         number, _, offset, low, high = (int(value) for value in values if value is not None)
         if low >= high:
             raise FileFormatError(
-                f"{lerobot}: motor {quote(name)}: range_min {low} is not below range_max {high}; record "
-                f"the range again"
+                f"{lerobot}: motor {quote(name)}: range_min {low} is not below range_max {high}; record the "
+                "range again"
             )
         keys = motors.get(name, {})
         own = keys.get("resolution") or resolution or RESOLUTION

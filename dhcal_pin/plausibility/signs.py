@@ -18,7 +18,8 @@ from itertools import combinations
 import numpy as np
 
 from .._typing import Array
-from ..exceptions import UnknownNameError
+from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -35,6 +36,8 @@ MIN_LOG_RATIO = 10.0
 _MAX_TURNED = 2
 # Number of configurations among which the one that decides is chosen, and its smallest useful distance [m].
 _N_CONFIGURATIONS, _MIN_DISTANCE = 1000, 0.01
+# Largest usual zeros, in default standard deviations.
+_LARGEST_ZEROS = 1.5
 # Number of open questions that are stated.
 _MAX_LISTED = 3
 
@@ -87,11 +90,9 @@ class SignDecision:
         """Open questions, each with what decides it."""
         if not self.is_compared:
             return [
-                "The signs of the joints were not compared, which needs positions or poses of the tool, "
-                "at least 8. "
-                "Look which joints turn the other way than in the URDF, and name them: --turned "
-                "NAME[,NAME] or "
-                "--turned none."
+                "The signs of the joints were not compared, which needs positions or poses of the tool, at "
+                "least 8. Look which joints turn the other way than in the URDF, and name them: --turned "
+                "NAME[,NAME] or --turned none."
             ]
         return [self._question(each) for each in self.open[:_MAX_LISTED]]
 
@@ -100,10 +101,9 @@ class SignDecision:
         names = open_signs.joints
         several, first = len(names) > 1, names[0]
         text = (
-            f"The sign{'s' * several} of {', '.join(names)} {'are' if several else 'is'} open: turned "
-            f"the other "
-            f"way{' all together,' if several else ''} with other zeros, the arm fits the measurements "
-            f"about as well. "
+            f"The sign{'s' * several} of {', '.join(names)} {'are' if several else 'is'} open: turned the "
+            f"other way{' all together,' if several else ''} with other zeros, the arm fits the measurements "
+            "about as well. "
         )
         if open_signs.distance > _MIN_DISTANCE:
             values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
@@ -118,9 +118,8 @@ class SignDecision:
         as_in_urdf, reversed_ = (self.turned, other) if first in other else (other, self.turned)
         options = [f"--turned {','.join(each) or 'none'}" for each in (as_in_urdf, reversed_)]
         return (
-            f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand "
-            f"rule. If so, add "
-            f"{options[0]}; if not, add {options[1]}."
+            f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand rule. "
+            f"If so, add {options[0]}; if not, add {options[1]}."
         )
 
 
@@ -130,6 +129,11 @@ def known_signs(chain: Chain, turned: Sequence[str]) -> SignDecision:
         if name not in chain.joint_names:
             raise UnknownNameError(
                 f"--turned {name}: unknown joint; choose from {', '.join(chain.joint_names)}, or write none"
+            )
+        if name not in _names(chain, _own_joints(chain)):
+            raise InvalidArgumentError(
+                f"--turned {name}: other joints mimic it; expected a URDF with the reversed axis and "
+                "multipliers"
             )
     return SignDecision(chain.joint_names, tuple(chain.is_prismatic.tolist()), tuple(turned))
 
@@ -160,11 +164,15 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
 
 def _hypotheses(chain: Chain) -> list[tuple[int, ...]]:
     """List the numbers of the joints that each hypothesis turns around, those with few joints first."""
-    # A joint that others mimic keeps its sign: the multipliers of the others would have to change, too.
-    own = [j for j in range(chain.n_joints) if np.count_nonzero(chain.mimic_matrix[:, j]) == 1]
+    own = _own_joints(chain)
     few = [each for count in range(_MAX_TURNED + 1) for each in combinations(own, count)]
     mirrored = [tuple(j for j in own if j not in each) for each in few]
     return sorted({*few, *mirrored}, key=lambda each: (len(each), each))
+
+
+def _own_joints(chain: Chain) -> list[int]:
+    """List the joints that no other joint mimics; the signs of the others depend on multipliers."""
+    return [j for j in range(chain.n_joints) if np.count_nonzero(chain.mimic_matrix[:, j]) == 1]
 
 
 def _signs(chain: Chain, turned: Sequence[int]) -> Array:
@@ -200,6 +208,11 @@ def turn_joints(chain: Chain, names: Sequence[str]) -> Chain:
     """Return a chain whose joints of these names turn the other way, in its URDF, too."""
     if not names:
         return chain
+    if chain.transmission is not None:
+        raise InvalidArgumentError(
+            f"{chain.urdf.source}: {', '.join(names)} turn the other way, but the sidecar has joint errors "
+            "for the present directions; expected a robot without a sidecar"
+        )
     joint, moving = (np.isin(each, names) for each in (chain.joint_names, chain.moving_joints))
     return replace(
         chain,
@@ -208,3 +221,12 @@ def turn_joints(chain: Chain, names: Sequence[str]) -> Chain:
         lower=np.where(joint, -chain.upper, chain.lower),
         upper=np.where(joint, -chain.lower, chain.upper),
     )
+
+
+def with_wide_limits(chain: Chain) -> Chain:
+    """Return a chain whose limits hold for all values that joints with wrong zeros and signs can report."""
+    extent = np.fmax(np.abs(chain.lower), np.abs(chain.upper))
+    extent = extent + _LARGEST_ZEROS * np.where(
+        chain.is_prismatic, LOW_COST_SLIDE_PRIOR, LOW_COST_OFFSET_PRIOR
+    )
+    return replace(chain, lower=-extent, upper=extent)

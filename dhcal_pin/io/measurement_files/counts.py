@@ -40,9 +40,8 @@ def _find_servo(table: DataTable, chain: Chain, servos: ServoFile | None, column
     where = f"{table.header_location}: column '{column.name}[{TICKS}]'"
     if servos is None:
         raise FileFormatError(
-            f"{where} has counts of a servo; expected --servos FILE with LeRobot's calibration (.json) "
-            f"or a servo "
-            "file (.toml)"
+            f"{where} has counts of a servo; expected --servos FILE (calibrate, validate, inspect) with "
+            "LeRobot's calibration (.json) or a servo file (.toml)"
         )
     servo = servos.of_column(name)
     if servo is None:
@@ -72,8 +71,7 @@ def _checked_counts(table: DataTable, column: Column, servo: Servo) -> Array:
             row = int(rows[0])
             text = table.cells[row][column.index].strip()
             raise FileFormatError(
-                f"{table.cell_location(row, column.name)}: {quote(text)} {problem}; expected counts "
-                f"from 0 to "
-                f"{servo.resolution - 1}"
+                f"{table.cell_location(row, column.name)}: {quote(text)} {problem}; expected counts from 0 "
+                f"to {servo.resolution - 1}"
             )
     return values

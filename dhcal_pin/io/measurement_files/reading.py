@@ -135,7 +135,8 @@ def open_measurement_table(
     from .column_map import read_map  # lazy import, as the following: only for files of other makers
     from .mapped_table import read_mapped_table
 
-    return read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+    table = read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+    return with_joint_values(table, chain, servos)
 
 
 def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:
