@@ -133,8 +133,9 @@ def calibrate(
         session: "auto" looks for what happened during the measurement and accounts for it, see `session`;
             "unordered" does so for samples that are not in the order of measurement, where only files may
             differ; "off" does not. Method "gn" does not either.
-        turned: Names of the joints that turn the other way than in the URDF: their axes are reversed. "auto"
-            compares the signs by evidence for the parameter set "low-cost", and keeps them for others.
+        turned: Names of the joints that turn the other way than in the URDF, or "none": their axes are
+            reversed. "auto" compares the signs by evidence for the parameter set "low-cost", and keeps them
+            for others.
         progress: Called with the name of the current phase, such as "robust weights", the number of its step
             and the largest number of steps.
         executor: Executor of the chunks of many samples.
@@ -173,7 +174,8 @@ def calibrate(
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     signs = None
     if turned != "auto":
-        signs = known_signs(chain, [turned] if isinstance(turned, str) else turned)
+        names = turned.split(",") if isinstance(turned, str) else turned
+        signs = known_signs(chain, [name.strip() for name in names if name != "none"])
     elif LOW_COST in robot_sets:
         if progress:
             progress("signs of the joints", 1, 1)

@@ -229,15 +229,19 @@ def companion_paths(output: str, has_servos: bool) -> list[str]:
     return [path for ending in endings if (path := robot_stem(output) + ending) != output]
 
 
-def name_robot_files(paths: Iterable[str]) -> dict[str, str]:
-    """Return the files of a robot by what they are."""
+def name_robot_files(paths: Iterable[str], output: str) -> dict[str, str]:
+    """Return the files of a robot by what they are; --output has the name of its format otherwise."""
+    other = {output: robot_ending(output)[1:]}
     names = {
-        path: next((n for e, n in _FILE_NAMES.items() if path.lower().endswith(e)), "camera_file")
+        path: next(
+            (name for ending, name in _FILE_NAMES.items() if path.lower().endswith(ending)),
+            other.get(path, "camera_file"),
+        )
         for path in paths
     }
     found: dict[str, str] = {}
     for name in dict.fromkeys(names.values()):
-        found |= numbered(name, [path for path, other in names.items() if other == name])
+        found |= numbered(name, [path for path, each in names.items() if each == name])
     return found
 
 

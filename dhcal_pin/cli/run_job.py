@@ -44,7 +44,7 @@ from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.evidence import HAND_BUILT
-from ..plausibility.hypotheses import mend
+from ..plausibility.hypotheses import JOINT_CHANGES, mend
 from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
@@ -129,7 +129,7 @@ def run_job(
         "known": read_instrument(job.instrument) if job.instrument else None,
         "loss": job.loss,
         "max_iterations": job.max_iterations,
-        "turned": job.turned if job.turned == "auto" else split_commas(job.turned.removeprefix("none")),
+        "turned": job.turned,
         "session": "unordered" if job.unordered and job.session == "auto" else job.session,
         "executor": executor,
     }
@@ -179,10 +179,10 @@ def _checked_inputs(job: Job, servos: ServoFile | None) -> list[str]:
     """Check the paths of a job; return those of its input files."""
     if job.arm and job.parameters:
         raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
-    if servos and (signs := [change for change in job.mend if change.startswith("sign:")]):
+    if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
         raise InvalidArgumentError(
-            f"--mend {signs[0]}: not allowed with --servos; expected --turned JOINT, which reverses the axis "
-            "in the URDF"
+            f"--mend {changes[0]}: not allowed with --servos; expected a corrected servo file, or --turned "
+            "JOINT for a wrong sign"
         )
     measured = [*job.data, *filter(None, [_holdout_file(job)])]
     for number, path in enumerate(measured):
@@ -420,7 +420,7 @@ def _write_job(
         contents[robot_stem(job.output) + SERVO_ENDING] = corrected.toml_content()
         data.notes.setdefault(job.robot, []).extend(describe_moves(servos, corrected))
     source = _provenance(job, sets, data, inputs, contents, hint)
-    files = name_robot_files(map(str, contents))
+    files = name_robot_files(map(str, contents), job.output)
     done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
