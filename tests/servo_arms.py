@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -24,19 +26,19 @@ RANGES = {
 }
 
 
-def lerobot_degrees(count: np.ndarray | float, low: int, high: int) -> np.ndarray | float:
+def lerobot_degrees(count: Any, low: int, high: int) -> Any:
     """Return what LeRobot reports in degrees: 4095 steps a turn, zero in the middle of the range."""
     middle = low + 0.5 * (high - low)
     return 360.0 * (count - middle) / 4095.0
 
 
-def forward_kinematics(urdf: str, q: dict[str, float], tip: str = TIP) -> np.ndarray:
+def forward_kinematics(urdf: str, q: Mapping[str, float], tip: str = TIP) -> np.ndarray:
     """Return the pose of the tip (4, 4) of a URDF text with Pinocchio."""
     model = pin.buildModelFromXML(urdf)
     return _tip_pose(model, q, tip)
 
 
-def _tip_pose(model: pin.Model, q: dict[str, float], tip: str = TIP) -> np.ndarray:
+def _tip_pose(model: pin.Model, q: Mapping[str, float], tip: str = TIP) -> np.ndarray:
     data, values = model.createData(), pin.neutral(model)
     for name, value in q.items():
         values[model.joints[model.getJointId(name)].idx_q] = value

@@ -19,11 +19,18 @@ def written(tmp_path, name, text):
     return path
 
 
+def servo_of(servos, name):
+    """Servo of a motor or joint that the file has."""
+    servo = servos.of_column(name)
+    assert servo is not None
+    return servo
+
+
 def test_counts_become_the_degrees_of_lerobot(tmp_path):
     servos = read_servos(written(tmp_path, "arm.json", lerobot_text()))
     counts = np.array([0, 1, 2047, 2048, 3100, 4095])
     for name, limits in RANGES.items():
-        servo = servos.of_column(name)
+        servo = servo_of(servos, name)
         np.testing.assert_allclose(
             np.rad2deg(servo.angles(counts)), lerobot_degrees(counts, *limits), atol=1e-12
         )
@@ -93,7 +100,7 @@ counts_per_turn = 3000
 resolution = 4096
 """
     servos = read_servos(written(tmp_path, "arm.toml", text))
-    pan, lift = servos.of_column("pan"), servos.of_column("lift")
+    pan, lift = servo_of(servos, "pan"), servo_of(servos, "lift")
     assert servos.of_column("base") is pan
     np.testing.assert_allclose(pan.angles(np.array([500.5, 500.5 - 256])), [0, np.pi / 2])
     np.testing.assert_allclose(lift.angles(np.array([2048, 2048 + 750])), [0, np.pi / 2])
@@ -109,7 +116,7 @@ def test_ros2_control_parameters_give_the_joint_values(tmp_path):
     for name, p in parameters.items():
         counts = np.arange(0, 4096, 65)
         position = (counts - 2048) * 2 * np.pi / 4096
-        expected = servos.of_column(name).angles(counts)
+        expected = servo_of(servos, name).angles(counts)
         np.testing.assert_allclose((position - p["offset"]) / p["gear_ratio"], expected, atol=1e-13)
 
 
