@@ -25,9 +25,13 @@ def move_zeros(fit: Result, servos: ServoFile) -> tuple[Result, ServoFile]:
     summands = np.array([moved.get(name, 0.0) for name in fit.chain.joint_names])
     # What was computed from the measurements stays; only the joint values change.
     region, _ = fit.measured_region, fit.uncertainty
-    written = copy.copy(fit)
+    written, bare = copy.copy(fit), copy.copy(fit.bare)
+    if bare:
+        vars(bare)["chain"] = bare.chain.with_zeros_moved(summands)
     vars(written).update(
-        chain=fit.chain.with_zeros_moved(summands), _measured_region=region and region.moved(summands)
+        chain=fit.chain.with_zeros_moved(summands),
+        bare=bare,
+        _measured_region=region and region.moved(summands),
     )
     return written, corrected
 
