@@ -25,6 +25,7 @@ from .io.measurement_files import read_targets as read_targets
 from .io.rig_file import read_rig as read_rig
 from .io.robot import read_robot as read_robot
 from .io.robot import write_urdf as write_urdf
+from .io.servo_file import read_servos as read_servos
 from .measurements.base import Noise as Noise
 from .measurements.camera import CameraCorners as CameraCorners
 from .measurements.contact import PlaneContact as PlaneContact

@@ -12,7 +12,9 @@ from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
 from ..measurements.measured_region import MeasuredRegion
+from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
+from ..plausibility.signs import SignDecision
 from ..session import Session
 from .cameras.board_size import BoardSize
 from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
@@ -63,6 +65,8 @@ class Evidence(FittedModel):
         session: What happened during the measurement; None if this was not examined.
         with_auto: Function that calibrates with the loss "auto", whose verdict counts, too; None if this
             calibration did.
+        signs: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are
+            those of the URDF.
     """
 
     region_comparison: Comparison | None = None
@@ -74,6 +78,7 @@ class Evidence(FittedModel):
     earlier_diagnosis: Diagnosis | None = None
     session: Session | None = None
     with_auto: Callable[[], Evidence] | None = None
+    signs: SignDecision | None = None
 
     @cached_property
     def rows_per_direction(self) -> float:
@@ -116,7 +121,8 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
-        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data)
+        sets = HAND_BUILT if self.signs else MANUFACTURED
+        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

@@ -69,7 +69,7 @@ from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.folds import FoldSystems, count_rows, factor_partition, solve_columns
-from ..estimation.parameters import EXTENSIONS, PARAMETER_SETS
+from ..estimation.parameters import EXTENSIONS, LOW_COST, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
@@ -743,5 +743,5 @@ def is_restricted(sets: Sequence[str]) -> bool:
     chosen, frames = set(sets), {"base", "tool"}
     # The poses of cameras and boards take the place of base and tool.
     has_frames = frames <= chosen or {"camera", "board"} <= chosen
-    is_full = has_frames and {"minimal", "placement"} & chosen
+    is_full = has_frames and {"minimal", "placement", LOW_COST} & chosen
     return not is_full and not chosen <= frames

@@ -2,7 +2,8 @@
 
 `calibrate` runs these stages in sequence:
 
-1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`).
+1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`). Before that, decide
+   which joints of a low-cost arm turn the other way (`plausibility.signs`).
 2. Initialize unknown base and tool frames and instrument parameters (`estimation.initialization`).
    Find what happened during the measurement, such as a base that moved, and account for it (`session`).
 3. Minimize the cost (`estimation.minimize`)
@@ -32,7 +33,7 @@ from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
-from ..estimation.parameters import EXTENSIONS, fold_harmonics, select_parameters
+from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
 from ..estimation.problem import (
     Problem,
@@ -44,6 +45,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.signs import SignDecision, decide_signs, known_signs
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
@@ -89,6 +91,7 @@ def calibrate(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     max_iterations: int = 100,
     session: SessionOption = "auto",
+    turned: str | Sequence[str] = "auto",
     progress: Progress | None = None,
     executor: TaskExecutor = SERIAL,
 ) -> Result:
@@ -130,6 +133,9 @@ def calibrate(
         session: "auto" looks for what happened during the measurement and accounts for it, see `session`;
             "unordered" does so for samples that are not in the order of measurement, where only files may
             differ; "off" does not. Method "gn" does not either.
+        turned: Names of the joints that turn the other way than in the URDF, or "none": their axes are
+            reversed. "auto" compares the signs by evidence for the parameter set "low-cost", and keeps them
+            for others.
         progress: Called with the name of the current phase, such as "robust weights", the number of its step
             and the largest number of steps.
         executor: Executor of the chunks of many samples.
@@ -155,17 +161,29 @@ def calibrate(
         executor=executor,
     )
     if isinstance(holdout, str) and holdout == "region":
-        result = recalibrate(data, progress=progress)
-        return replace(result, region_comparison=leave_regions_out(result, recalibrate, progress))
+        result = recalibrate(data, turned=turned, progress=progress)
+        again = partial(recalibrate, turned=result.signs.turned if result.signs else turned)
+        return replace(result, region_comparison=leave_regions_out(result, again, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
-    with_auto = partial(recalibrate, data, holdout=holdout, loss="auto") if loss != "auto" else None
+    with_auto = (
+        None if loss == "auto" else partial(recalibrate, data, holdout=holdout, loss="auto", turned=turned)
+    )
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     chain = _at_measured_temperature(chain, data)
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
     require_joint_values((*data, *holdout), [*robot_sets, *free])
+    signs = None
+    if turned != "auto":
+        names = turned.split(",") if isinstance(turned, str) else turned
+        signs = known_signs(chain, [name.strip() for name in names if name != "none"])
+    elif LOW_COST in robot_sets:
+        if progress:
+            progress("signs of the joints", 1, 1)
+        signs = decide_signs(chain, data)
+    chain = signs.apply(chain) if signs else chain
     data, exchanges = exchange_axes(chain, data)
     holdout = reorder(holdout, exchanges)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
@@ -192,16 +210,17 @@ def calibrate(
                 found = without_changes(found)
     data = fit.data
     if method != "lm":
-        return make_result(fit, 1.0, holdout, method)
+        return replace(make_result(fit, 1.0, holdout, method), signs=signs)
     groups = _prior_groups(fit, priors)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress)
-        return replace(calibrate_images(fitting, fit, chain, holdout, exchanges), with_auto=with_auto)
+        images = calibrate_images(fitting, fit, chain, holdout, exchanges)
+        return replace(images, signs=signs, with_auto=with_auto)
     fit = reweight(fit, stages, groups, max_iterations, progress)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress)
+    result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress, signs)
     return replace(result, session=found, with_auto=with_auto)
 
 
@@ -281,17 +300,18 @@ def _calibrate_samples(
     holdout: tuple[Measurement, ...],
     max_iterations: int,
     progress: Progress | None,
+    signs: SignDecision | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     inliers = fit.without_rejected().problem
     shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
-    result = make_result(fit, shrinkage_factor, holdout, "lm")
+    result = replace(make_result(fit, shrinkage_factor, holdout, "lm"), signs=signs)
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = model_selection.extend(fit, families, max_iterations, progress)
     extended = make_result(fit, shrinkage_factor, holdout, "lm")
-    return replace(extended, extension=extension, earlier_diagnosis=result.diagnosis)
+    return replace(extended, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
 
 
 def _initialize(

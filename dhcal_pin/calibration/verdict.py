@@ -118,7 +118,7 @@ def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
     findings = _unmoved_joints(fit)
     if not any(finding.status == "refused" for finding in findings):
-        findings += [*_mixups(fit.diagnosis), *_board_size(fit), *_two_robots(fit)]
+        findings += [*_mixups(fit.diagnosis), *_signs(fit), *_board_size(fit), *_two_robots(fit)]
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
@@ -174,6 +174,11 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
     if not diagnosis.hypotheses:
         return []
     return [Finding("refused", f"{diagnosis.sentence} {diagnosis.remedy}")]
+
+
+def _signs(fit: Evidence) -> list[Finding]:
+    """Advise caution if signs of joints are open, and say what decides them."""
+    return [Finding("caution", question) for question in (fit.signs.questions if fit.signs else ())]
 
 
 def _board_size(fit: Evidence) -> list[Finding]:

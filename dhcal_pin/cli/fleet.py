@@ -39,7 +39,7 @@ from ..io.toml_table import Key, TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
 from .job import Job, option_flags
-from .job_outputs import ROBOT_FORMATS
+from .job_outputs import ROBOT_FORMATS, companion_paths
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .run_job import run_job
@@ -167,7 +167,8 @@ def _real_path(folder: str, path: str) -> str:
 
 def _output_paths(job: Job) -> list[str]:
     """List the files that a job writes."""
-    paths = (sidecar_path(job.output), *job.output_paths)
+    companions = companion_paths(job.output, has_servos=True) if job.servos else [sidecar_path(job.output)]
+    paths = (*companions, *job.output_paths)
     return [path for path in paths if path]
 
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Value of --holdout for regions of joint space that are left out in turn.
 REGION = "region"
+# Values of --arm.
+ARMS = ("industrial", "low-cost")
 # File extension of a manifest of several jobs.
 MANIFEST_ENDING = ".fleet.toml"
 
@@ -54,7 +56,7 @@ class Job:
     output: str = field(
         metadata={
             "flags": ("-o", "--output"),
-            "metavar": "OUT.urdf",
+            "metavar": "OUT",
             "required": True,
             "help": "; ".join(item.help for item in job_outputs.ROBOT_FORMATS.values())
             + "; with a manifest, a summary of all robots (.csv)",
@@ -66,9 +68,27 @@ class Job:
     package_dir: tuple[str, ...] = field(default=(), metadata=options.PACKAGE_DIR)
     columns: str | None = field(default=None, metadata=options.COLUMNS)
     rig: str | None = field(default=None, metadata=options.RIG)
+    servos: str | None = field(default=None, metadata=options.SERVOS)
     skip_bad_rows: bool = field(default=False, metadata=options.SKIP_BAD_ROWS)
     mend: tuple[str, ...] = field(default=(), metadata=options.MEND)
     parameters: str | None = field(default=None, metadata=options.PARAMETERS)
+    arm: str | None = field(
+        default=None,
+        metadata={
+            "choices": ARMS,
+            "help": "low-cost: a servo arm that was put together by hand (default with --servos): estimate "
+            "its zeros, with the parameter set low-cost, and decide which joints turn the other way; "
+            "industrial: any other (default)",
+        },
+    )
+    turned: str = field(
+        default="auto",
+        metadata={
+            "metavar": "auto|none|JOINT[,JOINT]",
+            "help": "joints that turn the other way than in the URDF, whose axes are reversed in the "
+            "output: auto (decide it from the measurements of a low-cost arm; default), none, or names",
+        },
+    )
     extend: str = field(
         default="auto",
         metadata={

@@ -6,17 +6,19 @@ itself. Functions import what they need when they are called, because help pages
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..exceptions import InvalidArgumentError
+from .output_table import numbered
 
 if TYPE_CHECKING:
     from .._typing import PathLike
     from ..calibration.result import Result
     from ..io.camera_files import CameraFrame
+    from ..io.servo_file import ServoFile
     from ..report.provenance import Provenance
     from ..robot.chain import Chain
 
@@ -26,6 +28,7 @@ class Calibrated:
     """Result of a job, from which its output files are made."""
 
     fit: Result  # Result of the calibration
+    written: Result  # The same for the joint values of the files, with corrected zeros of servos
     source: Provenance  # Files, command and settings
     robot: str  # Path of the nominal robot
     reports: tuple[str, ...]  # Paths of all reports
@@ -59,7 +62,7 @@ def curves_content(done: Calibrated, path: str) -> str:
     from ..io.tabular import csv_text  # lazy import, as the following: they load NumPy
     from ..robot.correction_table import correction_columns, joint_corrections
 
-    return csv_text(correction_columns(joint_corrections(done.fit.chain)))
+    return csv_text(correction_columns(joint_corrections(done.written.chain)))
 
 
 def residuals_content(done: Calibrated, path: str) -> str:
@@ -81,6 +84,10 @@ def certificate_content(done: Calibrated, path: str) -> str:
     return certificate.certificate_page(done.fit, certificate.parse_meta(done.meta), done.source)
 
 
+# Ending of the corrected servo file.
+SERVO_ENDING = ".servos.toml"
+
+
 # --- files of the robot ----------------------------------------------------------------------------
 
 
@@ -90,7 +97,7 @@ class RobotOutput(NamedTuple):
     Attributes:
         help: What the file is, for the help of --output.
         files: Function that makes the files of the robot by path, from the value of --output and all options
-            of the job by name.
+            of the job by name, with the corrected servos as `servo_file`.
         require: Function that refuses what the format cannot hold before the calibration, from the nominal
             robot, the value of --output and all options of the job by name.
     """
@@ -183,11 +190,85 @@ def _camera_frames(
     return camera_frames(fit.rig, replace(written, base=base, tool=tool), camera_frame)
 
 
+def lerobot_files(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make LeRobot's calibration with corrected homing offsets, and the URDF for its degrees."""
+    servos: ServoFile = options["servo_file"]
+    return {output: servos.lerobot_content(), **_urdf_beside(fit, output, options)}
+
+
+def ros2_control_files(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make parameters of the joints for drivers of `ros2_control`, and the URDF for their joint values."""
+    servos: ServoFile = options["servo_file"]
+    return {output: servos.ros2_control_content(), **_urdf_beside(fit, output, options)}
+
+
+def _urdf_beside(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make the URDF and its sidecar beside another output."""
+    return urdf_with_sidecar(fit, f"{robot_stem(output)}.urdf", options)
+
+
 # Formats of the calibrated robot by the ending of --output.
 ROBOT_FORMATS = {
-    ".urdf": RobotOutput("corrected URDF", urdf_with_sidecar, _any_robot),
-    ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF", urdf_with_sidecar, _require_mjcf),
+    ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar, _any_robot),
+    ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF (.xml)", urdf_with_sidecar, _require_mjcf),
+    ".json": RobotOutput(
+        "LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files, _any_robot
+    ),
+    ".ros2_control.yaml": RobotOutput(
+        "joint parameters of ros2_control drivers with their URDF (.ros2_control.yaml, needs --servos)",
+        ros2_control_files,
+        _any_robot,
+    ),
 }
+# Endings of the files of a robot, and what they are called in the JSON document.
+_FILE_NAMES = {
+    ".calibration.toml": "sidecar",
+    SERVO_ENDING: "servos",
+    ".ros2_control.yaml": "ros2_control",
+    ".json": "lerobot",
+    ".urdf": "urdf",
+}
+
+
+def require_servos(output: str, servos: ServoFile | None) -> None:
+    """Require the servos that the format of an output needs."""
+    ending = robot_ending(output)
+    if ending in (".json", ".ros2_control.yaml") and servos is None:
+        raise InvalidArgumentError(
+            f"{output}: needs --servos, the file of the servos; expected it, or a .urdf output"
+        )
+    if ending == ".json" and servos is not None and not servos.lerobot:
+        raise InvalidArgumentError(
+            f"{output}: --servos {servos.path} is not from LeRobot; expected its .json, or a .toml with the "
+            "key lerobot"
+        )
+
+
+def robot_stem(output: str) -> str:
+    """Return the path of --output without the ending of its format."""
+    return output[: -len(robot_ending(output))]
+
+
+def companion_paths(output: str, has_servos: bool) -> list[str]:
+    """List the files that are written beside --output; those of a camera are not among them."""
+    endings = [".urdf", ".calibration.toml", SERVO_ENDING] if has_servos else [".calibration.toml"]
+    return [path for ending in endings if (path := robot_stem(output) + ending) != output]
+
+
+def name_robot_files(paths: Iterable[str], output: str) -> dict[str, str]:
+    """Return the files of a robot by what they are; --output has the name of its format otherwise."""
+    other = {output: robot_ending(output)[1:]}
+    names = {
+        path: next(
+            (name for ending, name in _FILE_NAMES.items() if path.lower().endswith(ending)),
+            other.get(path, "camera_file"),
+        )
+        for path in paths
+    }
+    found: dict[str, str] = {}
+    for name in dict.fromkeys(names.values()):
+        found |= numbered(name, [path for path, each in names.items() if each == name])
+    return found
 
 
 def robot_ending(path: str) -> str:

@@ -128,6 +128,11 @@ PACKAGE_DIR: dict[str, Any] = {
     "folders above the URDF, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH)",
 }
 COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files in another layout"}
+SERVOS: dict[str, Any] = {
+    "metavar": "FILE",
+    "help": "servo file of columns NAME[ticks] with counts: LeRobot's calibration of the arm (.json), or "
+    ".toml",
+}
 SKIP_BAD_ROWS: dict[str, Any] = {
     "help": "skip rows that lack a number or a name, instead of an error that lists them"
 }

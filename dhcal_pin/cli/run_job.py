@@ -29,34 +29,47 @@ from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
-from ..estimation.parameters import select_parameters
+from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
+from ..io.servo_file import ServoFile, read_servos
 from ..io.settings import parse_payload, read_bounds, read_priors
-from ..io.sidecar import read_instrument, sidecar_path
+from ..io.sidecar import read_instrument
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.hypotheses import mend
+from ..plausibility.evidence import HAND_BUILT
+from ..plausibility.hypotheses import JOINT_CHANGES, mend
+from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections
 from .job import REGION, Job
-from .job_outputs import ROBOT_FORMATS, Calibrated, robot_ending
+from .job_outputs import (
+    ROBOT_FORMATS,
+    SERVO_ENDING,
+    Calibrated,
+    companion_paths,
+    name_robot_files,
+    require_servos,
+    robot_ending,
+    robot_stem,
+)
 from .options import split_commas
-from .output_table import file_contents, numbered, paths_by_name, require_endings
+from .output_table import file_contents, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
     is_same_file,
     require_writable_outputs,
     write_outputs,
 )
+from .servo_zeros import describe_moves, move_zeros
 
 # Warning about an empty table of --curves.
 NO_CORRECTIONS = (
@@ -95,13 +108,16 @@ def run_job(
     job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
 ) -> CalibrationOutcome:
     """Calibrate one robot and write its outputs, in this process or another; no messages are shown."""
-    inputs = _checked_inputs(job)
+    servos = read_servos(job.servos) if job.servos else None
+    inputs = _checked_inputs(job, servos)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
+    if job.arm == "low-cost" or (servos and job.arm is None and job.parameters is None):
+        chain = replace(chain, parameters=HAND_BUILT)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
     sets = chain.parameters if job.parameters is None else job.parameters
-    data = _read_data(chain, job, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
+    data = _read_data(chain, job, servos, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
     if job.parameters is None:
         sets = default_sets(chain, list(data.fit.values()))
     restrictions: dict[str, Any] = {
@@ -115,6 +131,7 @@ def run_job(
         "known": read_instrument(job.instrument) if job.instrument else None,
         "loss": job.loss,
         "max_iterations": job.max_iterations,
+        "turned": job.turned,
         "session": "unordered" if job.unordered and job.session == "auto" else job.session,
         "executor": executor,
     }
@@ -134,7 +151,7 @@ def run_job(
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []
     hint = _add_warnings(job, fit, data, sets, on_images)
-    return _write_job(job, fit, sets, data, inputs, hint)
+    return _write_job(job, fit, sets, data, inputs, hint, servos)
 
 
 # --- input -----------------------------------------------------------------------------------------
@@ -160,8 +177,15 @@ def _holdout_file(job: Job) -> str | None:
     return job.holdout
 
 
-def _checked_inputs(job: Job) -> list[str]:
+def _checked_inputs(job: Job, servos: ServoFile | None) -> list[str]:
     """Check the paths of a job; return those of its input files."""
+    if job.arm and job.parameters:
+        raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
+    if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
+        raise InvalidArgumentError(
+            f"--mend {changes[0]}: not allowed with --servos; expected a corrected servo file, or --turned "
+            "JOINT for a wrong sign"
+        )
     measured = [*job.data, *filter(None, [_holdout_file(job)])]
     for number, path in enumerate(measured):
         if any(is_same_file(path, other) for other in measured[:number]):
@@ -170,11 +194,13 @@ def _checked_inputs(job: Job) -> list[str]:
             )
     settings = [job.priors] if job.priors not in (None, "default", "none") else []
     settings += [path for path in (job.bounds, job.instrument, job.columns, job.rig) if path]
+    settings += dict.fromkeys(filter(None, (servos.path, servos.lerobot))) if servos else []
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
-    robot_ending(job.output)
+    require_servos(job.output, servos)
     require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    require_writable_outputs([*job.output_paths, sidecar_path(job.output)], protected)
+    companions = companion_paths(job.output, servos is not None)
+    require_writable_outputs([*job.output_paths, *companions], protected)
     require_endings(job.outputs)
     if job.meta:
         from ..report import certificate  # lazy import: only for certificates
@@ -204,7 +230,7 @@ def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> Meas
     return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
 
 
-def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
+def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frames: bool) -> _JobData:
     """Read all measurements and split them by their `set` columns and by --holdout."""
     holdout_file = _holdout_file(job)
     fit: list[Measurement] = []
@@ -214,15 +240,18 @@ def _read_data(chain: Chain, job: Job, has_known_frames: bool) -> _JobData:
     notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
+    limited = with_wide_limits(chain) if LOW_COST in chain.parameters else chain
     for path in [*job.data, *filter(None, [holdout_file])]:
-        read = read_measurement_file(path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig)
+        read = read_measurement_file(
+            path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig, servos=servos
+        )
         if not job.mend:
             require_joint_units(chain, read)
         measured = _mended(chain, read, job.mend)
         by_file[path] = measured.data
         notes[path] = list(measured.notes)
         # The values of a mended file are not those of its columns. The verdict looks for mixed-up columns.
-        warnings[path] = [] if job.mend else find_value_warnings(chain, measured)
+        warnings[path] = [] if job.mend else find_value_warnings(limited, measured)
         # Without base and tool it is not known where the robot can place the measured point.
         unreachable[path] = find_unreachable_rows(chain, measured) if has_known_frames else []
         if path == holdout_file:
@@ -309,6 +338,8 @@ def _calibrate(
         raise NotObservableError(f"{error}{_held_out_images(data)}") from None
     if job.holdout == REGION:
         without_holdout: dict[str, Any] = {**settings, "holdout": ()}
+        if fit.signs:
+            without_holdout["turned"] = fit.signs.turned
         regions = leave_regions_out(
             fit,
             lambda part: procedure.calibrate(chain, part, sets, **without_holdout),
@@ -327,8 +358,8 @@ def _add_warnings(job: Job, fit: Result, data: _JobData, sets: str, on_images: S
         # A warning about the columns of a file already explains a poor fit.
         data.warnings[path] += texts if not data.warnings[path] else []
     hint = _family_hint(fit, data, sets, job)
-    data.warnings.setdefault(job.robot, []).extend([*on_images, *find_lattices(fit)])
-
+    turned = [fit.signs.note] if fit.signs and fit.signs.turned else []
+    data.warnings.setdefault(job.robot, []).extend([*turned, *on_images, *find_lattices(fit)])
     if job.curves and not joint_corrections(fit.chain) and _is_kept(job, fit):
         data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
     return hint
@@ -373,17 +404,26 @@ def _is_kept(job: Job, fit: Result) -> bool:
 
 
 def _write_job(
-    job: Job, fit: Result, sets: str, data: _JobData, inputs: Sequence[str], hint: str
+    job: Job,
+    fit: Result,
+    sets: str,
+    data: _JobData,
+    inputs: Sequence[str],
+    hint: str,
+    servos: ServoFile | None,
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
     is_kept = _is_kept(job, fit)
     ending = robot_ending(job.output)
-    contents = ROBOT_FORMATS[ending].files(fit, job.output, vars(job)) if is_kept else {}
+    written, corrected = move_zeros(fit, servos) if servos and is_kept else (fit, None)
+    options = {**vars(job), "servo_file": corrected}
+    contents = ROBOT_FORMATS[ending].files(written, job.output, options) if is_kept else {}
+    if servos and corrected:
+        contents[robot_stem(job.output) + SERVO_ENDING] = corrected.toml_content()
+        data.notes.setdefault(job.robot, []).extend(describe_moves(servos, corrected))
     source = _provenance(job, sets, data, inputs, contents, hint)
-    robot_paths = list(map(str, contents))
-    files = dict(zip((ending[1:], "sidecar"), robot_paths, strict=False))
-    files |= numbered("camera_file", robot_paths[len(files) :])
-    done = Calibrated(fit, source, job.robot, job.report, job.meta)
+    files = name_robot_files(map(str, contents), job.output)
+    done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
     contents |= file_contents(outputs, done)

@@ -28,6 +28,7 @@ from ..io.measurement_files.reading import (
     open_measurement_table,
     parse_measurements,
 )
+from ..io.servo_file import ServoFile
 from ..io.tables import Column, DataTable, read_table
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
@@ -87,12 +88,13 @@ def inspect_file(
     chain: Chain | None = None,
     columns: PathLike | None = None,
     rig: MountedRig | None = None,
+    servos: ServoFile | None = None,
 ) -> FileInspection:
     """Say what a measurement file contains."""
     if chain is None:
         table = read_table(source)
         return _inspect_table(table, None)
-    table = open_measurement_table(source, chain, columns)
+    table = open_measurement_table(source, chain, columns, servos)
     try:
         file = parse_measurements(table, chain, skip_bad_rows=True, rig=rig)
     except DhcalError as error:

@@ -13,6 +13,7 @@ Geometric sets, for R revolute and P prismatic joints:
 - `placement`: 6 parameters for each joint origin; complete, and redundant along and about the joint axes.
 - `base`, `tool`: 6 parameters each, outside the robot.
 - `offset`: the zero position of each joint.
+- `low-cost`: `minimal` and `offset` with the priors of a low-cost arm, whose joints may turn the other way.
 
 Sets of the transmission: one set for each of `robot.error_families.FAMILIES`.
 
@@ -28,7 +29,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +45,11 @@ from .error_model import ErrorModel, ErrorParameter
 LENGTH_PRIOR = 1e-3
 ANGLE_PRIOR = 5e-3
 OFFSET_PRIOR = np.deg2rad(2.0)
+# The same of low-cost arms, whose plastic links and servos are put together by hand, and of the zeros
+# of their prismatic joints.
+LOW_COST = "low-cost"
+LOW_COST_LENGTH_PRIOR, LOW_COST_ANGLE_PRIOR = 3e-3, np.deg2rad(2.0)
+LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR = np.deg2rad(15.0), 1e-2
 # Prior standard deviations of base and tool [m, rad]: anywhere in a room.
 FRAME_LENGTH_PRIOR = 10.0
 FRAME_ANGLE_PRIOR = 10.0
@@ -189,6 +195,17 @@ def offset(chain: Chain) -> list[ErrorParameter]:
     return out
 
 
+def low_cost(chain: Chain) -> list[ErrorParameter]:
+    """Build the errors of each joint's axis and zero position, with the priors of a low-cost arm."""
+    geometry = {"m": LOW_COST_LENGTH_PRIOR, "rad": LOW_COST_ANGLE_PRIOR}
+    zeros = {"m": LOW_COST_SLIDE_PRIOR, "rad": LOW_COST_OFFSET_PRIOR}
+    return [
+        replace(parameter, prior=priors[parameter.unit])
+        for parameters, priors in ((minimal(chain), geometry), (offset(chain), zeros))
+        for parameter in parameters
+    ]
+
+
 def _joint_twist(axis: Sequence[float], is_prismatic: bool) -> tuple[float, ...]:
     """Return the twist [v, ω] of a joint's own motion."""
     return (*axis, *_ZERO) if is_prismatic else (*_ZERO, *axis)
@@ -264,6 +281,10 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
     "base": ParameterSet(base, "pose of the robot's base in the measuring frame"),
     "tool": ParameterSet(tool, "pose of the measured point in the tip frame"),
     "offset": ParameterSet(offset, "zero position of each joint"),
+    LOW_COST: ParameterSet(
+        low_cost,
+        "axes and zero positions of a low-cost servo arm: zeros 15 deg, lengths 3 mm, directions 2 deg",
+    ),
     **{
         name: ParameterSet(functools.partial(joint_errors, family=family), family.description)
         for name, family in FAMILIES.items()

@@ -23,6 +23,8 @@ from .robot import write_urdf as write_urdf
 from .robot_format import ConvertedRobot as ConvertedRobot
 from .robot_format import RobotFormat as RobotFormat
 from .robot_format import RobotSource as RobotSource
+from .servo_file import ServoFile as ServoFile
+from .servo_file import read_servos as read_servos
 from .settings import parse_payload as parse_payload
 from .settings import read_bounds as read_bounds
 from .settings import read_priors as read_priors

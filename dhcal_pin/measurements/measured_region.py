@@ -69,6 +69,15 @@ class MeasuredRegion:
         reach = float(np.quantile(np.concatenate(distances), RADIUS_QUANTILE)) if distances else 0.0
         return replace(self, reach=max(self.radius, reach))
 
+    def moved(self, summands: Array) -> MeasuredRegion:
+        """Return the same region for joint values that are larger by summands, (n,) [rad or m]."""
+        return replace(
+            self,
+            lower=self.lower + summands,
+            upper=self.upper + summands,
+            configurations=self.configurations + summands,
+        )
+
     def distances(self, q: Array) -> Array:
         """Compute the distances of configurations from the nearest one that represents the region."""
         centres, out = self.configurations, np.empty(len(q))

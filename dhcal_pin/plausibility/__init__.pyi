@@ -9,3 +9,5 @@ from .hypotheses import list_hypotheses as list_hypotheses
 from .hypotheses import mend as mend
 from .mixups import Diagnosis as Diagnosis
 from .mixups import diagnose_mixups as diagnose_mixups
+from .signs import SignDecision as SignDecision
+from .signs import decide_signs as decide_signs

@@ -25,14 +25,14 @@ Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import initialize_frames, make_problem
-from ..estimation.parameters import select_parameters
+from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem
 from ..estimation.solver import minimize
@@ -42,12 +42,14 @@ from ..measurements.position import PointMeasurement
 from ..robot.chain import BASE_FRAME, Chain
 
 # Errors that the robot may have; base and tool are free, so that instrument and target may be anywhere.
-_PARAMETERS = "minimal,base,tool"
+MANUFACTURED = "minimal,base,tool"
+HAND_BUILT = f"{LOW_COST},base,tool"
 # Widths w of the priors, and logarithm of the standard deviation of ln w.
 _WIDTHS = 2.0 ** np.arange(-1, 5)
 _LOG_WIDTH_STD = 1.5
-# Width of the priors while the robot is fitted: errors of some centimetres and degrees.
-_FIT_WIDTH = 4.0
+# Width of the priors while the robot is fitted: errors of some centimetres and degrees. The priors of a
+# low-cost arm are as wide as its errors.
+_FIT_WIDTHS = {MANUFACTURED: 4.0, HAND_BUILT: 1.0}
 # Noise scales σ around the residuals of the fit.
 _NOISE_SCALES = 10.0 ** np.arange(-1, 5.01, 0.25)
 # Largest number of iterations of a fit, and of one of base and tool alone.
@@ -71,16 +73,20 @@ class Evidence:
     width: float  #: Errors of the robot, in default standard deviations.
     length_scale: float  #: Standard deviation of a length residual [m]; NaN if no lengths are measured.
     angle_scale: float  #: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
+    #: Robot that was fitted, with base and tool; None without a fit.
+    chain: Chain | None = field(default=None, repr=False, compare=False)
 
 
-def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:
-    """Fit a robot with small errors to measurements and compute the evidence."""
+def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Evidence:
+    """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
-    errors = initialize_frames(select_parameters(chain, _PARAMETERS), equal, {}, _N_FRAME_ITERATIONS)
+    errors = initialize_frames(select_parameters(chain, sets), equal, {}, _N_FRAME_ITERATIONS)
     equal = tuple(item.initialized(errors.chain) for item in equal)
     is_robot = _is_robot(errors)
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
-    problem = make_problem(errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTH, 1.0)), {})
+    problem = make_problem(
+        errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
+    )
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
     noise = new = _estimate_noise(problem, solution.x)
     for _ in range(_N_ROUNDS):
@@ -98,7 +104,11 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement]) -> Evidence:
         noise.min_factor,
     )
     return Evidence(
-        log - noise.log_determinant, width, factor * noise.length_scale, factor * noise.angle_scale
+        log - noise.log_determinant,
+        width,
+        factor * noise.length_scale,
+        factor * noise.angle_scale,
+        errors.at(solution.x[: len(errors.parameters)]),
     )
 
 

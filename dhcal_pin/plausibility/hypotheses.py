@@ -31,6 +31,8 @@ from ..units import ANGLES, LENGTHS
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
+# Beginnings of the keys of hypotheses about the joint columns.
+JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Largest lag [rows or s] and change of a scale that can be undone.

@@ -19,7 +19,7 @@ from ..estimation.initialization import positions_at_end
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .evidence import Evidence, fit_evidence
+from .evidence import MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import Hypothesis, RowShift, list_hypotheses
 
 # Evidence of too few measurements: nothing is known about them.
@@ -95,26 +95,33 @@ class Diagnosis:
         return f"Correct the measurements, or add {' or '.join(keys)}."
 
 
-def diagnose_mixups(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
+def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
     """Look for a mistake in measurements that explains why they do not fit the robot.
+
+    The robot may have errors of one of the parameter sets of `evidence`.
 
     A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
     a robot with other errors can touch an unknown surface exactly, whatever the mistake is. So are image
     coordinates, which the mistakes listed here do not concern.
     """
-    items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
-    items = [item for item in items if item.rig is None]
-    items = sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
+    items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    diagnosis = _diagnose(chain, items)
+    diagnosis = _diagnose(chain, items, sets)
     if diagnosis.hypotheses or not diagnosis.is_suspicious or len(items) < 2:
         return diagnosis
-    separate = [(item, _diagnose(chain, [item])) for item in items]
+    separate = [(item, _diagnose(chain, [item], sets)) for item in items]
     for item, one in separate:
         if one.hypotheses:
             return replace(one, source=item.source)
     return replace(diagnosis, fits_separately=not any(one.is_suspicious for _, one in separate))
+
+
+def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
+    """Return the measurements, at most `_MAX_ITEMS`, that tell hypotheses about joints apart."""
+    items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
+    items = [item for item in items if item.rig is None]
+    return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
 
 
 def _is_surface_contact(item: Measurement) -> bool:
@@ -122,14 +129,19 @@ def _is_surface_contact(item: Measurement) -> bool:
     return item.is_contact and item.residual_dim == 1
 
 
-def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
-    """Look for one mistake in all of the measurements."""
-    samples, neighbourhood = _draw_samples(data)
+def has_enough_rows(samples: Sequence[Measurement]) -> bool:
+    """Return whether samples have enough rows for the unknowns of frames and instrument."""
     n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
     n_instrument = len({parameter.name for item in samples for parameter in item.instrument_parameters})
-    if n_rows < _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument):
+    return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
+
+
+def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis:
+    """Look for one mistake in all of the measurements."""
+    samples, neighbourhood = draw_samples(data)
+    if not has_enough_rows(samples):
         return Diagnosis(NO_EVIDENCE)
-    before = fit_evidence(chain, samples)
+    before = fit_evidence(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before)
     scored: list[tuple[Hypothesis, Evidence, float]] = []
@@ -137,7 +149,7 @@ def _diagnose(chain: Chain, data: Sequence[Measurement]) -> Diagnosis:
     for hypothesis in list_hypotheses(chain, samples):
         changed = _apply(hypothesis, samples, neighbourhood)
         if changed is not None and nominal_distance(chain, changed) <= largest:
-            after = fit_evidence(chain, changed)
+            after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append((hypothesis, after, log))
     best = max((log for _, _, log in scored), default=-np.inf)
@@ -205,7 +217,7 @@ def _apply(
     return kept if _count(kept) >= _MIN_SHIFTED_SHARE * _count(samples) else None
 
 
-def _draw_samples(data: Sequence[Measurement]) -> tuple[list[Measurement], list[Measurement]]:
+def draw_samples(data: Sequence[Measurement]) -> tuple[list[Measurement], list[Measurement]]:
     """Draw samples of each measurement; return them, and the same with the rows above and below each."""
     samples, neighbourhood = [], []
     for measured in data:

@@ -78,6 +78,7 @@ def result_to_dict(
         "priors": {estimate.name: estimate.prior for estimate in fit.estimates if not estimate.fixed},
         "extension": fit.extension.to_dict() if fit.extension else None,
         "session": session_to_dict(fit.session),
+        "signs": fit.signs.to_dict() if fit.signs else None,
         "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
         "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
         "shrinkage_factor": fit.shrinkage_factor,

@@ -105,6 +105,15 @@ def _session_section(context: ReportContext) -> Section | None:
     return Section("session", "Session", session.sentences, figures=partial(figures.session_figures, context))
 
 
+def _signs_section(context: ReportContext) -> Section | None:
+    """Return which joints turn the other way; None if this was not examined."""
+    signs = context.fit.signs
+    if signs is None:
+        return None
+    note = signs.note or "all joints turn as in the URDF"
+    return Section("signs", "Signs of the joints", [f"{note[0].upper()}{note[1:]}.", *signs.questions])
+
+
 def _residual_section(context: ReportContext) -> Section:
     rows, sentences, profiles = [], [], context.joint_profiles
     for profile in profiles:
@@ -524,6 +533,7 @@ SECTIONS: Sequence[tuple[Callable[[ReportContext], Section | None], Sequence[Ren
     (_accuracy_section, _REPORT),
     (images.image_section, _REPORT),
     (_session_section, _REPORT),
+    (_signs_section, _REPORT),
     (_residual_section, _REPORT),
     (_transmission_section, _REPORT),
     (_joint_section, _REPORT),

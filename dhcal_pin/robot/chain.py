@@ -711,6 +711,35 @@ class Chain:
             tool=self.tool @ motions[-1],
         )
 
+    def with_zeros_moved(self, summands: ArrayLike) -> Chain:
+        """Return the robot that has the same poses at joint positions which are larger by constants.
+
+        With gains and thermal growth together, the poses differ by the product of these errors and the
+        constants.
+
+        Args:
+            summands: Constant of each joint, shape (n,) [rad or m].
+
+        Returns:
+            Copy of the chain with other joint origins.
+        """
+        d = np.asarray(summands, float)
+        linear = np.zeros_like(d) if self.transmission is None else self.transmission.linear @ d
+        moved = replace(self._with_joints_turned(-d - linear), urdf_origins=self.urdf_origins)
+        if self.urdf_origins is not None:
+            moved = replace(moved, urdf_origins=self.urdf_alone._with_joints_turned(-d).origins)
+        if self.transmission is None:
+            return moved
+        return moved.with_transmission(self.transmission.with_zeros_moved(d)).with_current_loads()
+
+    def _with_joints_turned(self, constants: Array) -> Chain:
+        """Return a copy whose joint origins are moved along the joints by constants, (n,) [rad or m]."""
+        moving = (self.mimic_matrix @ constants)[:, None] * self.axes
+        twists = np.concatenate([moving, moving], 1) * np.repeat([self.prismatic, ~self.prismatic], 3, 0).T
+        return self.perturbed_at(
+            {self.origin_frame(j + 1): se3.exp6(twist) for j, twist in enumerate(twists)}
+        )
+
     def with_base_and_tool(self, base: Array, tool: Array) -> Chain:
         """Return a copy with another base and tool.
 

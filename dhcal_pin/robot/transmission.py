@@ -249,6 +249,19 @@ class Transmission:
         order = int(harmonic_orders(entries, len(self.linear)).max(initial=0))
         return self if order <= self.order else replace(self, min_order=order)
 
+    def with_zeros_moved(self, summands: Array) -> Transmission:
+        """Return the same errors as functions of joint positions q' = q + d, but for the constant -A·d.
+
+        S·sin(k·q) + C·cos(k·q) becomes a sum of sine and cosine of k·q' with S' = S·cos(k·d) + C·sin(k·d) and
+        C' = C·cos(k·d) - S·sin(k·d). The summands d have shape (n,).
+        """
+        moved = replace(self, coefficients=self.coefficients.copy())
+        (sine, cosine), n_orders = self.harmonics.swapaxes(0, 1), len(self.harmonics)
+        phase = np.arange(1, n_orders + 1)[:, None] * summands
+        moved.harmonics[:, 0] = sine * np.cos(phase) + cosine * np.sin(phase)
+        moved.harmonics[:, 1] = cosine * np.cos(phase) - sine * np.sin(phase)
+        return moved
+
     def with_coefficients_added(self, entries: Array, changes: Array) -> Transmission:
         """Return a copy with increments added to some coefficients."""
         coefficients = self.coefficients.copy()

@@ -1,8 +1,9 @@
 """Edits of a URDF that keep every other byte of the file.
 
 `with_origins` rewrites the values of `xyz` and `rpy` at their byte offsets, which the parser in `urdf`
-recorded. Comments, order, quotes and line ends stay. `with_world` and `with_tool_frame` append a link and a
-fixed joint for the measuring frame and for the measured point.
+recorded. Comments, order, quotes and line ends stay. `with_turned_joints` rewrites axes and limits.
+`with_world` and `with_tool_frame` append a link and a fixed joint for the measuring frame and for the
+measured point.
 
 Numbers are written with `repr`, the shortest text that reads back as the same double. A rotation has several
 triples of roll, pitch and yaw; the one nearest to that of the file is written (`se3.nearest_rpy`).
@@ -11,7 +12,8 @@ triples of roll, pitch and yaw; the one nearest to that of the file is written (
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from xml.parsers import expat
 
 import numpy as np
@@ -20,10 +22,13 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..se3 import nearest_rotation, nearest_rpy, to_xyz_rpy
 from .formats.xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
-from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, xml_attribute
+from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, scan_tags, xml_attribute
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
 _RIGIDITY_TOL = 1e-9
+
+# Tags of a joint with limits, and the names of the lower and the upper one.
+_LIMITS = (("limit", "lower", "upper"), ("safety_controller", "soft_lower_limit", "soft_upper_limit"))
 
 # White space before the first child of a joint, from the last line end on.
 _INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
@@ -64,6 +69,33 @@ def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
     return edited(
         urdf.data, [edit for joint, origin in changed for edit in _origin_edits(urdf, joint, origin)]
     )
+
+
+def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
+    """Return a URDF in which some joints turn the other way: reversed axes, and exchanged limits."""
+    tags = scan_tags(urdf.data, urdf.source)[2]
+    edits: list[Edit] = []
+    for name in names:
+        joint = tags[name]
+        axis = number_text(-urdf.joint(name).axis)
+        if "axis" in joint.children:
+            spans, end, quotes = attribute_spans(urdf.data, joint.children["axis"].start)
+            edits.append(
+                Edit(*spans[b"xyz"].value, axis)
+                if b"xyz" in spans
+                else Edit(end, end, attribute_text(b"xyz", axis, quotes or b'"'))
+            )
+        else:
+            start = urdf.joint(name).first_child
+            edits.append(Edit(start, start, b'<axis xyz="' + axis + b'"/>'))
+        for child, lower, upper in _LIMITS:
+            if child in joint.children:
+                tag = joint.children[child]
+                spans, _, _ = attribute_spans(urdf.data, tag.start)
+                for key, other in ((lower, upper), (upper, lower)):
+                    text = number_text([-float(tag.attributes.get(other, "0"))])
+                    edits += [Edit(*spans[key.encode()].value, text)] if key.encode() in spans else []
+    return replace(parse_urdf(edited(urdf.data, edits), urdf.source), package_dirs=urdf.package_dirs)
 
 
 def with_world(data: bytes, base: Array) -> bytes:

@@ -18,6 +18,8 @@ from dhcal_pin.io.dh_file import HEAD_KEYS as DH_KEYS
 from dhcal_pin.io.dh_file import JOINT_KEYS, POSE_TABLES
 from dhcal_pin.io.measurement_files import column_map
 from dhcal_pin.io.rig_file import board_keys, camera_keys
+from dhcal_pin.io.servo_file import HEAD_KEYS as SERVO_KEYS
+from dhcal_pin.io.servo_file import MOTOR_KEYS
 from dhcal_pin.io.settings import BOUNDS, PRIOR
 from dhcal_pin.io.sidecar import SIDECAR_KEYS
 from dhcal_pin.io.toml_table import Key, table_by_name, table_of, table_schema
@@ -83,6 +85,10 @@ def schemas() -> dict[str, dict[str, Any]]:
         "fleet": ("Manifest of several robots (.fleet.toml)", _fleet_schema()),
         "priors": ("Prior standard deviations (--priors FILE.toml)", table_by_name(PRIOR).schema),
         "rig": ("Cameras and boards (--rig RIG.toml)", _rig_schema()),
+        "servos": (
+            "Servo file (--servos FILE.toml)",
+            table_schema({**SERVO_KEYS, "motor": table_by_name(table_of(MOTOR_KEYS))}),
+        ),
         "sidecar": ("Sidecar (.calibration.toml)", table_schema(SIDECAR_KEYS)),
         "study": (
             "Study (.study.toml)",

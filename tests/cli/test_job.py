@@ -22,9 +22,12 @@ VALUES = {
     "package_dir": '["meshes", "more"]',
     "columns": '"map.toml"',
     "rig": '"rig.toml"',
+    "servos": '"servos.toml"',
     "skip_bad_rows": "true",
     "mend": '["sign:a", "rows:above"]',
     "parameters": '"dh"',
+    "arm": '"low-cost"',
+    "turned": '"none"',
     "extend": '"gain"',
     "fix": '"d2"',
     "free": '"d3"',
@@ -56,8 +59,9 @@ VALUES = {
 }
 ARGUMENTS = (
     "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --root link0 --package-dir meshes "
-    "--package-dir more --columns map.toml --rig rig.toml --skip-bad-rows --mend sign:a --mend rows:above "
-    "--parameters dh --extend gain --fix d2 --free d3 --holdout 0.3 --session off --unordered --method gn "
+    "--package-dir more --columns map.toml --rig rig.toml --servos servos.toml --skip-bad-rows --mend sign:a "
+    "--mend rows:above --parameters dh --arm low-cost --turned none --extend gain --fix d2 --free "
+    "d3 --holdout 0.3 --session off --unordered --method gn "
     "--loss tukey "
     "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "
     "--in-place --world-joint --tool-frame tcp --camera-frame eye --camera-files cam --force "

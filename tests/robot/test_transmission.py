@@ -44,6 +44,22 @@ def random_conditions(arm: Chain, m: int, rng: np.random.Generator) -> Condition
     return Conditions(q, **drawn)
 
 
+@pytest.mark.parametrize(
+    "sets", ["gain,coupling,harmonics,curves,backlash,compliance", "harmonics,compliance,thermal"]
+)
+def test_moved_zeros_keep_the_poses(sets):
+    rng = np.random.default_rng(0)
+    arm, _ = drawn(ur10(), f"{sets},minimal,offset", rng)
+    alone, _ = drawn(ur10(), "minimal,offset", rng)
+    arm = replace(arm, urdf_origins=alone.origins).with_current_loads()
+    conditions = random_conditions(arm, 6, rng)
+    summands = rng.uniform(-0.4, 0.4, arm.n_joints)
+    moved, q = arm.with_zeros_moved(summands), conditions.q
+    same = replace(conditions, q=q + summands)
+    np.testing.assert_allclose(moved.poses(same), arm.poses(conditions), atol=1e-12)
+    np.testing.assert_allclose(moved.urdf_alone.poses(q + summands), arm.urdf_alone.poses(q), atol=1e-12)
+
+
 def test_actual_positions_follow_the_formula():
     """By a fresh Pinocchio model and plain arithmetic, a joint at a time."""
     rng = np.random.default_rng(0)

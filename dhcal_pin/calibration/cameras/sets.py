@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from ...estimation.parameters import LOW_COST
 from ...exceptions import InvalidArgumentError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
@@ -19,8 +20,9 @@ RIG_SETS = {
     "board": "pose of each board of the rig in its link",
     "intrinsics": "focal lengths, image centre and distortion of each camera, unless the rig fixes them",
 }
-# Sets that are estimated by default from image coordinates.
-DEFAULT_SETS = "placement,offset,camera,board,intrinsics"
+# Sets that are estimated by default from image coordinates; those of the arm are others for a low-cost arm.
+_ARM_SETS = "placement,offset"
+DEFAULT_SETS = f"{_ARM_SETS},camera,board,intrinsics"
 # Sets that are estimated by default from images of which only the pose of the tip is known.
 HAND_EYE_SETS = "camera,board,intrinsics"
 # Largest number of corners of all boards that are estimated to judge whether boards are as stated.
@@ -42,7 +44,9 @@ def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
     """Return the parameter sets that are estimated by default."""
     if not has_images(data):
         return chain.parameters
-    return DEFAULT_SETS if has_joint_values(data) else HAND_EYE_SETS
+    if not has_joint_values(data):
+        return HAND_EYE_SETS
+    return DEFAULT_SETS.replace(_ARM_SETS, LOW_COST) if LOW_COST in chain.parameters else DEFAULT_SETS
 
 
 def has_joint_values(data: Sequence[Measurement]) -> bool:

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, add_urdf_options
+from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, SERVOS, add_urdf_options
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 
@@ -19,6 +19,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
     )
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--servos", **SERVOS)
     parser.add_argument("--rig", **RIG)
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
@@ -29,6 +30,7 @@ def run(args: Namespace) -> int:
     from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
     from ...io import read_robot
     from ...io.rig_file import read_rig
+    from ...io.servo_file import read_servos
     from ...measurements.mounting import mount_rig
     from ...report.provenance import file_digests
     from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
@@ -39,8 +41,10 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
     if args.rig and not args.robot:
         raise InvalidArgumentError("--rig: needs --robot, whose links carry the cameras and boards")
+    if args.servos and not args.robot:
+        raise InvalidArgumentError("--servos: needs --robot, whose joints the servos move")
     robots = [args.robot] if args.robot else []
-    settings = [path for path in (args.columns, args.rig) if path]
+    settings = [path for path in (args.columns, args.rig, args.servos) if path]
     inputs = [*robots, *existing_sidecars(robots), *args.data, *settings]
     require_writable_outputs([args.json], inputs)
     chain = (
@@ -49,7 +53,8 @@ def run(args: Namespace) -> int:
         else None
     )
     rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
-    inspections = [inspect_file(path, chain, args.columns, rig) for path in args.data]
+    servos = read_servos(args.servos) if args.servos else None
+    inspections = [inspect_file(path, chain, args.columns, rig, servos) for path in args.data]
     robot = None
     if chain is not None:
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SKIP_BAD_ROWS, add_urdf_options
+from ..options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SERVOS, SKIP_BAD_ROWS, add_urdf_options
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--servos", **SERVOS)
     parser.add_argument(
         "--rig",
         **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
@@ -175,20 +176,23 @@ def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
     from ..outputs import existing_sidecars  # lazy import: loads Pinocchio
 
     nominal = [args.nominal] if args.nominal else []
-    others = filter(None, (sidecar, args.columns, args.rig))
+    others = filter(None, (sidecar, args.columns, args.rig, args.servos))
     return [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
 
 
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
-    from ...io import read_instrument, read_measured_region, read_measurement_file, read_robot
+    from ...io import read_instrument, read_measured_region, read_measurement_file, read_robot, read_servos
     from ...measurements.position import require_common_reference_target
 
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
     rig, estimated = _mounted_rig(args, sidecar, chain)
     predictor = _predictor(chain, sidecar, args) if args.map else None
+    servos = read_servos(args.servos) if args.servos else None
     files = [
-        read_measurement_file(path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig)
+        read_measurement_file(
+            path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig, servos=servos
+        )
         for path in args.data
     ]
     instrument = read_instrument(sidecar) if sidecar else {}

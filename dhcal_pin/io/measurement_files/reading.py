@@ -30,6 +30,7 @@ from ...measurements.pose import Pose
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS, Condition
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
+from ..servo_file import ServoFile
 from ..tables import Column, DataTable, format_lines, read_table
 from .columns import (
     AFTER,
@@ -50,6 +51,7 @@ from .columns import (
     needs_column_map,
     value_table,
 )
+from .counts import with_joint_values
 from .tool_poses import solve_tool_poses
 
 # Comment that declares that the rows of a file are in the order of measurement.
@@ -88,6 +90,7 @@ def read_measurements(
     *,
     skip_bad_rows: bool = False,
     rig: MountedRig | None = None,
+    servos: ServoFile | None = None,
 ) -> Measurement:
     """Read all samples of a measurement file.
 
@@ -98,11 +101,14 @@ def read_measurements(
         skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
             error.
         rig: Cameras and boards of image coordinates, on the chain.
+        servos: Servos whose counts are in columns `NAME[ticks]`, see `dhcal_pin.io.read_servos`.
 
     Returns:
         Samples of the kind that the columns select.
     """
-    return read_measurement_file(source, chain, columns, skip_bad_rows=skip_bad_rows, rig=rig).data
+    return read_measurement_file(
+        source, chain, columns, skip_bad_rows=skip_bad_rows, rig=rig, servos=servos
+    ).data
 
 
 def read_measurement_file(
@@ -112,20 +118,25 @@ def read_measurement_file(
     *,
     skip_bad_rows: bool = False,
     rig: MountedRig | None = None,
+    servos: ServoFile | None = None,
 ) -> MeasurementFile:
     """Read a measurement file with its division into fitted and held-out samples."""
     check_joint_names(chain)
-    return parse_measurements(open_measurement_table(source, chain, columns), chain, skip_bad_rows, rig)
+    table = open_measurement_table(source, chain, columns, servos)
+    return parse_measurements(table, chain, skip_bad_rows, rig)
 
 
-def open_measurement_table(source: PathLike | Any, chain: Chain, columns: PathLike | None) -> DataTable:
-    """Read the table of a measurement file, through a column map if one is given."""
+def open_measurement_table(
+    source: PathLike | Any, chain: Chain, columns: PathLike | None, servos: ServoFile | None = None
+) -> DataTable:
+    """Read the table of a measurement file, through a column map and a servo file if they are given."""
     if columns is None:
-        return read_table(source)
+        return with_joint_values(read_table(source), chain, servos)
     from .column_map import read_map  # lazy import, as the following: only for files of other makers
     from .mapped_table import read_mapped_table
 
-    return read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+    table = read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+    return with_joint_values(table, chain, servos)
 
 
 def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:

@@ -1,0 +1,50 @@
+"""Zeros of servos after a calibration: moved from the robot into the servo file.
+
+The estimated zeros of the joints, rounded to whole counts, are added to the joint values that the servos
+report. The robot is the same for these values, with the rest of the zeros in its joint origins.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+
+from ..calibration.result import Result
+from ..io.servo_file import ServoFile
+
+# Ending of the names of estimated zeros.
+_ZERO = ".offset"
+
+
+def move_zeros(fit: Result, servos: ServoFile) -> tuple[Result, ServoFile]:
+    """Return the result for the joint values of corrected servos, and these servos."""
+    values = zip(fit.errors.parameters, fit.x, strict=False)
+    zeros = {p.name.removesuffix(_ZERO): float(x) for p, x in values if p.name.endswith(_ZERO)}
+    corrected, moved = servos.with_zeros_moved(zeros)
+    summands = np.array([moved.get(name, 0.0) for name in fit.chain.joint_names])
+    # What was computed from the measurements stays; only the joint values change.
+    region, _ = fit.measured_region, fit.uncertainty
+    written, bare = copy.copy(fit), copy.copy(fit.bare)
+    if bare:
+        vars(bare)["chain"] = bare.chain.with_zeros_moved(summands)
+    vars(written).update(
+        chain=fit.chain.with_zeros_moved(summands),
+        bare=bare,
+        _measured_region=region and region.moved(summands),
+    )
+    return written, corrected
+
+
+def describe_moves(before: ServoFile, after: ServoFile) -> list[str]:
+    """Say by how many counts the zeros move; empty if none does."""
+    moves = {a.name: round(a.zero - b.zero) for a, b in zip(after.servos, before.servos, strict=True)}
+    moves = {name: count for name, count in moves.items() if count}
+    if not moves:
+        return []
+    counts = ", ".join(f"{name} {count:+d}" for name, count in moves.items())
+    limits = (
+        "; in LeRobot the position limits move with them, so approach the ends slowly, and do not record the "
+        "ranges again, whose middle is the zero"
+    )
+    return [f"zeros of the servos move by whole counts: {counts}{limits if after.lerobot else ''}"]

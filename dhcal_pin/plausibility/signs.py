@@ -1,0 +1,232 @@
+"""Signs of the joints of a low-cost arm, decided by the evidence of measurements.
+
+A servo that is mounted the other way round has the wrong sign. Each hypothesis turns around no joint, one or
+two joints, or all joints but these, as a mirrored arm does. Its evidence is that of an arm with the zeros,
+lengths and axis directions of a low-cost arm (`evidence`). The signs as they were read are kept unless
+another hypothesis explains the measurements better by the factor exp(`MIN_LOG_RATIO`). All hypotheses within
+this factor of the best one are open questions. The configuration that decides an open question is the one at
+which the arms of the two hypotheses, each with its own base and tool, place the tool farthest from each
+other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
+from ..exceptions import InvalidArgumentError, UnknownNameError
+from ..formatting import format_quantity
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from ..robot.sampling import joint_range
+from ..robot.urdf_edit import with_turned_joints
+from .evidence import HAND_BUILT, Evidence, fit_evidence
+from .hypotheses import Hypothesis, JointChange
+from .mixups import comparable_items, draw_samples, has_enough_rows
+
+# Logarithm of the ratio of evidence above which a sign is decided. Where the signs of simulated arms are
+# decided wrongly, with few or similar poses, it is below 3; with 25 different poses it is above 15.
+MIN_LOG_RATIO = 10.0
+# Number of joints that are turned around together, or that are not in a mirrored arm.
+_MAX_TURNED = 2
+# Number of configurations among which the one that decides is chosen, and its smallest useful distance [m].
+_N_CONFIGURATIONS, _MIN_DISTANCE = 1000, 0.01
+# Largest usual zeros, in default standard deviations.
+_LARGEST_ZEROS = 1.5
+# Number of open questions that are stated.
+_MAX_LISTED = 3
+
+
+@dataclass(frozen=True)
+class OpenSigns:
+    """Signs that measurements leave open."""
+
+    joints: tuple[str, ...]  #: Joints that may all turn the other way.
+    #: Value of each joint of the arm at which the two arms differ most [rad or m], as the file states them.
+    configuration: tuple[float, ...]
+    distance: float  #: Distance of the tools of the two arms there [m].
+
+
+@dataclass(frozen=True)
+class SignDecision:
+    """Joints of an arm that turn the other way, and what is open."""
+
+    joint_names: tuple[str, ...]  #: Names of all joints.
+    is_prismatic: tuple[bool, ...]  #: Whether each of them is prismatic.
+    turned: tuple[str, ...] = ()  #: Joints that turn the other way.
+    open: tuple[OpenSigns, ...] = ()  #: Open questions, the most likely one first.
+    is_compared: bool = True  #: Whether the measurements are enough to compare signs.
+
+    def apply(self, chain: Chain) -> Chain:
+        """Return the arm with the axes of the turned joints reversed."""
+        return turn_joints(chain, self.turned)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the decision for the JSON document."""
+        return {
+            "compared": self.is_compared,
+            "turned": list(self.turned),
+            "open": [{"joints": list(each.joints), "distance_m": each.distance} for each in self.open],
+        }
+
+    @property
+    def note(self) -> str:
+        """Sentence on the joints that were turned around; empty if there are none."""
+        if not self.turned:
+            return ""
+        verb = "joints turn" if len(self.turned) > 1 else "joint turns"
+        return (
+            f"the {verb} the other way: {', '.join(self.turned)}; the written robot has the reversed axis, "
+            "so that the joint values stay as they are"
+        )
+
+    @property
+    def questions(self) -> list[str]:
+        """Open questions, each with what decides it."""
+        if not self.is_compared:
+            return [
+                "The signs of the joints were not compared, which needs positions or poses of the tool, at "
+                "least 8. Look which joints turn the other way than in the URDF, and name them: --turned "
+                "NAME[,NAME] or --turned none."
+            ]
+        return [self._question(each) for each in self.open[:_MAX_LISTED]]
+
+    def _question(self, open_signs: OpenSigns) -> str:
+        """State an open question and what decides it."""
+        names = open_signs.joints
+        several, first = len(names) > 1, names[0]
+        text = (
+            f"The sign{'s' * several} of {', '.join(names)} {'are' if several else 'is'} open: turned the "
+            f"other way{' all together,' if several else ''} with other zeros, the arm fits the measurements "
+            "about as well. "
+        )
+        if open_signs.distance > _MIN_DISTANCE:
+            values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
+            pose = ", ".join(
+                f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values
+            )
+            apart = format_quantity(open_signs.distance, "m", 0.1 * open_signs.distance)
+            text += f"A measurement at {pose} decides it (the tools are {apart} apart there), or look"
+        else:
+            text += "No position of the tool decides it: look"
+        other = tuple(name for name in self.joint_names if (name in self.turned) != (name in names))
+        as_in_urdf, reversed_ = (self.turned, other) if first in other else (other, self.turned)
+        options = [f"--turned {','.join(each) or 'none'}" for each in (as_in_urdf, reversed_)]
+        return (
+            f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand rule. "
+            f"If so, add {options[0]}; if not, add {options[1]}."
+        )
+
+
+def known_signs(chain: Chain, turned: Sequence[str]) -> SignDecision:
+    """Return the decision that some joints are known to turn the other way."""
+    for name in turned:
+        if name not in chain.joint_names:
+            raise UnknownNameError(
+                f"--turned {name}: unknown joint; choose from {', '.join(chain.joint_names)}, or write none"
+            )
+        if name not in _names(chain, _own_joints(chain)):
+            raise InvalidArgumentError(
+                f"--turned {name}: other joints mimic it; expected a URDF with the reversed axis and "
+                "multipliers"
+            )
+    return SignDecision(chain.joint_names, tuple(chain.is_prismatic.tolist()), tuple(turned))
+
+
+def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
+    """Decide which joints of a low-cost arm turn the other way."""
+    undecided = replace(known_signs(chain, ()), is_compared=False)
+    samples = draw_samples(comparable_items(data))[0]
+    if not samples or not has_enough_rows(samples):
+        return undecided
+    fits: dict[tuple[int, ...], Evidence] = {}
+    for turned in _hypotheses(chain):
+        change = JointChange.of(chain.n_joints, signs=_signs(chain, turned).astype(int).tolist())
+        changed = Hypothesis("", "", change).apply(samples)
+        assert changed is not None
+        fits[turned] = fit_evidence(chain, changed, HAND_BUILT)
+    ranked = sorted(fits, key=lambda turned: -fits[turned].log)
+    limit = fits[ranked[0]].log - MIN_LOG_RATIO
+    chosen = () if fits[()].log >= limit else ranked[0]
+    others = [turned for turned in ranked if turned != chosen and fits[turned].log >= limit]
+    return replace(
+        undecided,
+        is_compared=True,
+        turned=_names(chain, chosen),
+        open=tuple(_open_signs(chain, chosen, other, fits) for other in others),
+    )
+
+
+def _hypotheses(chain: Chain) -> list[tuple[int, ...]]:
+    """List the numbers of the joints that each hypothesis turns around, those with few joints first."""
+    own = _own_joints(chain)
+    few = [each for count in range(_MAX_TURNED + 1) for each in combinations(own, count)]
+    mirrored = [tuple(j for j in own if j not in each) for each in few]
+    return sorted({*few, *mirrored}, key=lambda each: (len(each), each))
+
+
+def _own_joints(chain: Chain) -> list[int]:
+    """List the joints that no other joint mimics; the signs of the others depend on multipliers."""
+    return [j for j in range(chain.n_joints) if np.count_nonzero(chain.mimic_matrix[:, j]) == 1]
+
+
+def _signs(chain: Chain, turned: Sequence[int]) -> Array:
+    """Return the sign of each joint, (n,)."""
+    return np.where(np.isin(np.arange(chain.n_joints), turned), -1.0, 1.0)
+
+
+def _names(chain: Chain, numbers: Sequence[int]) -> tuple[str, ...]:
+    """Return the names of joints."""
+    return tuple(chain.joint_names[j] for j in numbers)
+
+
+def _open_signs(
+    chain: Chain, chosen: tuple[int, ...], other: tuple[int, ...], fits: dict[tuple[int, ...], Evidence]
+) -> OpenSigns:
+    """Find the configuration at which the arms of two hypotheses differ most."""
+    lower, upper = joint_range(chain)
+    q = np.random.default_rng(0).uniform(lower, upper, (_N_CONFIGURATIONS, chain.n_joints))
+    positions = []
+    for turned in (chosen, other):
+        arm = fits[turned].chain
+        assert arm is not None
+        # Limits hold for the joint values of the robot itself.
+        positions.append(arm.poses(q * _signs(chain, chosen) * _signs(chain, turned))[:, :3, 3])
+    distances = np.linalg.norm(positions[0] - positions[1], axis=1)
+    best = int(np.argmax(distances))
+    read = q[best] * _signs(chain, chosen)
+    different = sorted({*chosen} ^ {*other})
+    return OpenSigns(_names(chain, different), tuple(read.tolist()), float(distances[best]))
+
+
+def turn_joints(chain: Chain, names: Sequence[str]) -> Chain:
+    """Return a chain whose joints of these names turn the other way, in its URDF, too."""
+    if not names:
+        return chain
+    if chain.transmission is not None:
+        raise InvalidArgumentError(
+            f"{chain.urdf.source}: {', '.join(names)} turn the other way, but the sidecar has joint errors "
+            "for the present directions; expected a robot without a sidecar"
+        )
+    joint, moving = (np.isin(each, names) for each in (chain.joint_names, chain.moving_joints))
+    return replace(
+        chain,
+        urdf=with_turned_joints(chain.urdf, names),
+        axes=np.where(moving[:, None], -chain.axes, chain.axes) + 0.0,  # turns -0.0 into 0.0
+        lower=np.where(joint, -chain.upper, chain.lower),
+        upper=np.where(joint, -chain.lower, chain.upper),
+    )
+
+
+def with_wide_limits(chain: Chain) -> Chain:
+    """Return a chain whose limits hold for all values that joints with wrong zeros and signs can report."""
+    extent = np.fmax(np.abs(chain.lower), np.abs(chain.upper))
+    extent = extent + _LARGEST_ZEROS * np.where(
+        chain.is_prismatic, LOW_COST_SLIDE_PRIOR, LOW_COST_OFFSET_PRIOR
+    )
+    return replace(chain, lower=-extent, upper=extent)

@@ -1,0 +1,159 @@
+"""Servo files: LeRobot's calibration against its formula, TOML, corrected zeros, and errors."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from servo_arms import RANGES, lerobot_degrees, lerobot_text
+
+from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.io import read_servos
+
+
+def written(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_bytes(text.encode())
+    return path
+
+
+def servo_of(servos, name):
+    """Servo of a motor or joint that the file has."""
+    servo = servos.of_column(name)
+    assert servo is not None
+    return servo
+
+
+def test_counts_become_the_degrees_of_lerobot(tmp_path):
+    servos = read_servos(written(tmp_path, "arm.json", lerobot_text()))
+    counts = np.array([0, 1, 2047, 2048, 3100, 4095])
+    for name, limits in RANGES.items():
+        servo = servo_of(servos, name)
+        np.testing.assert_allclose(
+            np.rad2deg(servo.angles(counts)), lerobot_degrees(counts, *limits), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(("make", "sign"), [("feetech", -1), ("dynamixel", 1)])
+def test_a_corrected_homing_offset_adds_the_angle(tmp_path, make, sign):
+    written(tmp_path, "arm.json", lerobot_text())
+    toml = written(tmp_path, "arm.toml", f'lerobot = "arm.json"\nmake = "{make}"\n')
+    servos = read_servos(toml)
+    wanted = dict(zip(RANGES, np.deg2rad([15.0, -20.0, 3.0, 0.01, 179.0, 0.0]), strict=True))
+    corrected, moved = servos.with_zeros_moved(wanted)
+    old, new = json.loads(servos.lerobot_text), json.loads(corrected.lerobot_content())
+    for name, limits in RANGES.items():
+        actual = 2000 - sign * old[name]["homing_offset"]  # The servo is where it reported 2000 counts.
+        reported = actual + sign * new[name]["homing_offset"]
+        change = lerobot_degrees(reported, *limits) - lerobot_degrees(2000, *limits)
+        turns = np.round(change / (4096 / 4095 * 360)) * 4096 / 4095 * 360
+        np.testing.assert_allclose(np.deg2rad(change - turns), moved[name], atol=1e-12)
+        assert abs(moved[name] - wanted[name]) <= np.pi / 4095 + 1e-12
+        assert abs(new[name]["homing_offset"]) <= 2047 or make == "dynamixel"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        lerobot_text(),
+        lerobot_text().replace("\n", "\r\n"),
+        json.dumps(json.loads(lerobot_text()), separators=(",", ":")),
+        lerobot_text()
+        .replace('"gripper"', '"gr\\u00f6\\"{if"')
+        .replace('"id"', '"note": "homing_offset: 3", "id"'),
+    ],
+)
+def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
+    servos = read_servos(written(tmp_path, "arm.json", text))
+    assert servos.with_zeros_moved({})[0].lerobot_content() == text
+    corrected, _ = servos.with_zeros_moved({"elbow_flex": np.deg2rad(9.0), "wrist_roll": -0.2})
+    by_hand = text
+    # 9 degrees are 102.4 of 4095 steps, -0.2 rad are -130.3.
+    for before, after in ((-50, -152), (150, 280)):
+        for space in (" ", ""):
+            by_hand = by_hand.replace(f'"homing_offset":{space}{before},', f'"homing_offset":{space}{after},')
+    assert corrected.lerobot_content() == by_hand
+
+
+def test_a_homing_offset_stays_within_the_register_of_a_feetech_motor(tmp_path):
+    servos = read_servos(
+        written(tmp_path, "arm.json", lerobot_text({"elbow_flex": 2000, "wrist_flex": -2047}))
+    )
+    step = 2 * np.pi / 4095
+    corrected, moved = servos.with_zeros_moved({"elbow_flex": -100 * step, "wrist_flex": 1 * step})
+    offsets = {servo.name: servo.homing_offset for servo in corrected.servos}
+    assert (offsets["elbow_flex"], offsets["wrist_flex"]) == (2100 - 4096, -2047)
+    assert moved["wrist_flex"] == 0.0
+
+
+def test_toml_files_give_sign_zero_and_joint(tmp_path):
+    text = """resolution = 1024
+[motor.base]
+joint = "pan"
+id = 3
+sign = -1
+zero = 500.5
+[motor.lift]
+counts_per_turn = 3000
+resolution = 4096
+"""
+    servos = read_servos(written(tmp_path, "arm.toml", text))
+    pan, lift = servo_of(servos, "pan"), servo_of(servos, "lift")
+    assert servos.of_column("base") is pan
+    np.testing.assert_allclose(pan.angles(np.array([500.5, 500.5 - 256])), [0, np.pi / 2])
+    np.testing.assert_allclose(lift.angles(np.array([2048, 2048 + 750])), [0, np.pi / 2])
+    again = read_servos(written(tmp_path, "again.toml", servos.toml_content()))
+    assert again.servos == servos.servos
+
+
+def test_ros2_control_parameters_give_the_joint_values(tmp_path):
+    text = "[motor.pan]\nsign = -1\nzero = 1999\n[motor.lift]\ncounts_per_turn = 4095\nid = 2\n"
+    servos = read_servos(written(tmp_path, "arm.toml", text))
+    parameters = yaml.safe_load(servos.ros2_control_content())
+    assert [parameters[name]["offset_counts"] for name in ("pan", "lift")] == [1999, 2048]
+    for name, p in parameters.items():
+        counts = np.arange(0, 4096, 65)
+        position = (counts - 2048) * 2 * np.pi / 4096
+        expected = servo_of(servos, name).angles(counts)
+        np.testing.assert_allclose((position - p["offset"]) / p["gear_ratio"], expected, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.json", "{", ["not JSON"]),
+        ("a.json", "[]", ["not a calibration of LeRobot", "range_min"]),
+        ("a.json", '{"homing_offset": [1], "motor_names": ["a"]}', ["old version"]),
+        ("a.json", '{"a": 3}', ["motor 'a'", "id is not an integer"]),
+        (
+            "a.json",
+            lerobot_text().replace("741", "741.5"),
+            ["motor 'shoulder_pan'", "range_min is not an integer"],
+        ),
+        (
+            "a.json",
+            lerobot_text().replace("741", "3465"),
+            ["shoulder_pan", "range_min 3465", "range_max 3465"],
+        ),
+        ("a.toml", "", ["motor is missing"]),
+        ("a.toml", "[motor.a]\nsgn = 1", ["[motor.a]", "sgn"]),
+        ("a.toml", "[motor.a]\nsign = 2", ["sign = 2", "1 or -1"]),
+        ("a.toml", '[motor.a]\njoint = "j"\n[motor.b]\njoint = "j"', ["a and b", "same joint"]),
+        ("a.toml", 'lerobot = "missing.json"', ["missing.json"]),
+        (
+            "a.toml",
+            'lerobot = "so101.json"\n[motor.foo]\njoint = "j"',
+            ["[motor.foo]", "unknown motor", "elbow_flex"],
+        ),
+        ("a.toml", 'lerobot = "so101.json"\n[motor.gripper]\nzero = 3', ["[motor.gripper]", "zero"]),
+    ],
+)
+def test_errors_name_file_motor_and_what_is_expected(tmp_path, name, text, words):
+    written(tmp_path, "so101.json", lerobot_text())
+    with pytest.raises(DhcalError) as caught:
+        read_servos(written(tmp_path, name, text))
+    message = str(caught.value)
+    assert all(word in message for word in words), message
+    assert "\n" not in message
