@@ -42,6 +42,14 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     sqrt_covariance = "..."            # rows of little-endian doubles in base64
     unbounded_directions = "..."
     frame_part = "..."                 # absent if the measurements determine base and tool
+
+    [uncertainty.compact]              # in place of these three: `estimation.compact_uncertainty`
+    step = 2e-7                        # unit of `leading` and `of_joint` [rad]
+    leading = "..."                    # rows of 16-bit integers, compressed (xz), in base64
+    of_joint = "..."
+    geometry = "..."                   # rows of 32-bit floats, compressed, in base64
+    angle_std = "..."
+    gauge = "..."
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
     model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
     model_std_rad = 1e-4               # the same of the orientation
@@ -69,9 +77,10 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
+import lzma
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -79,6 +88,7 @@ import numpy as np
 import tomli_w
 
 from .._typing import Array, PathLike
+from ..estimation.compact_uncertainty import MAX_COMPACT_COLUMNS, CompactUncertainty, compact, compact_rows
 from ..estimation.parameters import PARAMETER_SETS, fold_harmonics
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import FileFormatError, UnknownNameError
@@ -153,12 +163,22 @@ _JOINT_KEYS = {
     **dict.fromkeys(_JOINT_TERM_KEYS, _COEFFICIENT),
     _COUPLING: toml.table_by_name(_COEFFICIENT),
 }
+# Types of the numbers of a compact uncertainty, whose texts are compressed.
+_COMPACT_TYPES = {
+    "leading": "<i2",
+    "of_joint": "<i2",
+    "geometry": "<f4",
+    "angle_std": "<f4",
+    "gauge": "<f4",
+}
 _UNCERTAINTY_KEYS = {
     "joints": _NAMES,
     "terms": _NAMES,
-    "sqrt_covariance": _BASE64,
-    "unbounded_directions": _BASE64,
+    # Either the first three of these or the last one.
+    "sqrt_covariance": replace(_BASE64, is_optional=True),
+    "unbounded_directions": replace(_BASE64, is_optional=True),
     "frame_part": replace(_BASE64, is_optional=True),
+    "compact": toml.table_of({"step": toml.number(above=0), **dict.fromkeys(_COMPACT_TYPES, _BASE64)}),
     "temperature": toml.number(1, default=1.0),
     "model_std_m": toml.number(0, default=0.0),
     "model_std_rad": toml.number(0, default=0.0),
@@ -198,6 +218,8 @@ _HARMONIC_LINES = re.compile(r"^ {4}\[\n +(\d+),\n +(\S+),\n +(\S+),\n {4}\]", r
 _BASE64_LINES, _TEXT_NUMBER = re.compile(r"[A-Za-z0-9+/=\n]*\n"), re.compile(r'"""\n(\d+)\n"""')
 # Decimals of the numbers [m or rad] that the hash of the joints depends on.
 _DIGEST_DECIMALS = 12
+# What stands between the first and the last name of successive terms.
+_RANGE = " ... "
 # Length of the lines of base64 text [characters].
 _LINE_LENGTH = 76
 
@@ -220,7 +242,7 @@ _UNCERTAINTY_HEADER = """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
 # a prior determine; frame_part: what of both is only another pose of base or tool, which the measurements
 # leave free. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then the
-# terms. Little-endian doubles in base64.
+# terms. Little-endian doubles in base64. compact: the same for hundreds of terms, in fewer numbers.
 """
 _MEASURED_HEADER = """\
 # measured: configurations that represent the measured region of joint space. A configuration is in the region
@@ -425,10 +447,21 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     indices = _coefficient_indices(chain)
     if not isinstance(terms, list):
         raise table.error("terms", "expected a list of names")
+    terms = _unfolded(terms, list(indices))
     if unknown := [name for name in terms if not isinstance(name, str) or name not in indices]:
         choices = ", ".join(fold_harmonics(indices))
         raise UnknownNameError(f"{table.where}: terms has {quote(unknown[0])}; choose from {choices}")
     n_rows = 6 * (len(chain.moving_joints) + 1) + len(terms)
+    entries = np.array([indices[name] for name in terms], int)
+    if terms and chain.transmission is None:
+        chain = chain.with_transmission(Transmission.zero(chain.loads))
+    model_std = (values["model_std_m"], values["model_std_rad"])
+    nothing = np.empty((n_rows, 0))
+    known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std)
+    if values["compact"] is not None:
+        return _read_compact(table.table("compact"), values["compact"], known)
+    if missing := [key for key in ("sqrt_covariance", "unbounded_directions") if values[key] is None]:
+        raise table.error(missing[0], "expected base64 text, or a table [uncertainty.compact]")
     columns = {
         key: _decode_rows(values[key], n_rows, f"{table.where}: {key}")
         for key in ("sqrt_covariance", "unbounded_directions", "frame_part")
@@ -437,11 +470,57 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     n_columns = columns["sqrt_covariance"].shape[1] + columns["unbounded_directions"].shape[1]
     if "frame_part" in columns and columns["frame_part"].shape[1] != n_columns:
         raise table.error("frame_part", f"expected {n_columns} columns, as in the other two arrays together")
-    entries = np.array([indices[name] for name in terms], int)
-    if terms and chain.transmission is None:
-        chain = chain.with_transmission(Transmission.zero(chain.loads))
-    model_std = (values["model_std_m"], values["model_std_rad"])
-    return Uncertainty(chain, entries, temperature=values["temperature"], model_std=model_std, **columns)
+    return replace(known, **columns)
+
+
+def _read_compact(table: TomlTable, values: Mapping[str, Any], known: Uncertainty) -> Uncertainty:
+    """Read the table [uncertainty.compact] of an uncertainty without columns."""
+    arrays: dict[str, Array] = {}
+    for key, n_rows in compact_rows(known).items():
+        where = f"{table.where}: {key}"
+        # The coordinates of free frames are further rows.
+        n_rows += arrays["gauge"].shape[1] if key == "geometry" else 0
+        data = _decompress(_decode(values[key], where), 4 * n_rows * MAX_COMPACT_COLUMNS, where)
+        arrays[key] = _as_rows(data, n_rows, _COMPACT_TYPES[key], where)
+    found = CompactUncertainty(values["step"], **arrays)
+    if problem := found.problem:
+        raise table.error(*problem)
+    return found.expand(known)
+
+
+def _decompress(data: bytes, max_bytes: int, where: str) -> bytes:
+    """Decompress an array of at most a number of bytes."""
+    try:
+        decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MAX_SIDECAR_BYTES << 2)
+        content = decompressor.decompress(data, max_bytes + 1)
+    except lzma.LZMAError:
+        content = None
+    if content is None or len(content) > max_bytes or not decompressor.eof:
+        raise FileFormatError(f"{where} is not a compressed array; calibrate again to replace it")
+    return content
+
+
+def _folded(terms: Sequence[str], order: Sequence[str]) -> list[str]:
+    """Write successive names of an order as `FIRST ... LAST`."""
+    position = {name: number for number, name in enumerate(order)}
+    runs: list[list[str]] = []
+    for name in terms:
+        if runs and position[name] == position[runs[-1][-1]] + 1:
+            runs[-1].append(name)
+        else:
+            runs.append([name])
+    return [name for run in runs for name in (run if len(run) < 3 else [f"{run[0]}{_RANGE}{run[-1]}"])]
+
+
+def _unfolded(terms: Sequence[Any], order: Sequence[str]) -> list[Any]:
+    """Replace each `FIRST ... LAST` by the names of an order from the first to the last one."""
+    position = {name: number for number, name in enumerate(order)}
+    names: list[Any] = []
+    for term in terms:
+        first, _, last = term.partition(_RANGE) if isinstance(term, str) else (term, "", "")
+        is_range = first in position and last in position
+        names += order[position[first] : position[last] + 1] if is_range else [term]
+    return names
 
 
 def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
@@ -470,16 +549,26 @@ def _coefficient_indices(chain: Chain) -> dict[str, int]:
 
 
 def _decode_rows(text: Any, n_rows: int, where: str) -> Array:
-    """Decode base64 text to an array with n rows."""
+    """Decode base64 text to an array of doubles with n rows."""
+    return _as_rows(_decode(text, where), n_rows, "<f8", where)
+
+
+def _decode(text: Any, where: str) -> bytes:
+    """Decode base64 text."""
     try:
-        data = base64.b64decode("".join(text.split()), validate=True)
+        return base64.b64decode("".join(text.split()), validate=True)
     except (AttributeError, binascii.Error, ValueError):
         raise FileFormatError(f"{where} is not base64 text; calibrate again to replace it") from None
-    if len(data) % (8 * n_rows):
+
+
+def _as_rows(data: bytes, n_rows: int, number: str, where: str) -> Array:
+    """Return the numbers of an array with n rows."""
+    size = np.dtype(number).itemsize
+    if len(data) % (size * n_rows) if n_rows else data:
         raise FileFormatError(
-            f"{where} does not hold {n_rows} rows of doubles; calibrate again to replace it"
+            f"{where} does not hold {n_rows} rows of {8 * size}-bit numbers; calibrate again to replace it"
         )
-    rows = np.frombuffer(data, "<f8").reshape(n_rows, -1).astype(float)
+    rows = np.frombuffer(data, number).reshape(n_rows, -1 if n_rows else 0).astype(float)
     if not np.isfinite(rows).all():
         raise FileFormatError(f"{where} has numbers that are not finite; calibrate again to replace it")
     return rows
@@ -507,7 +596,7 @@ def sidecar_text(
         "joint": _transmission_content(chain),
         **_link_content(chain),
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
-        "uncertainty": _uncertainty_content(uncertainty),
+        "uncertainty": _uncertainty_content(uncertainty, measured_region),
         "measured": _measured_content(chain, measured_region),
         **(rig_content(rig.cameras, rig.boards) if rig else {}),
     }
@@ -588,20 +677,30 @@ def _link_content(chain: Chain) -> dict[str, Any]:
     return content
 
 
-def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
+def _uncertainty_content(uncertainty: Uncertainty | None, region: MeasuredRegion | None) -> dict[str, Any]:
     """Return the table [uncertainty]; empty if the noise, and with it the covariance, is unknown."""
     if uncertainty is None or not np.isfinite(uncertainty.sqrt_covariance).all():
         return {}
-    names = {index: name for name, index in _coefficient_indices(uncertainty.chain).items()}
+    indices = _coefficient_indices(uncertainty.chain)
+    names = {index: name for name, index in indices.items()}
+    measured = np.empty((0, uncertainty.chain.n_joints)) if region is None else region.configurations
+    found = compact(uncertainty, measured)
+    if found is None:
+        columns: dict[str, Any] = {
+            "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
+            "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
+            **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
+        }
+    else:
+        texts = {key: _encode_compressed(getattr(found, key), kind) for key, kind in _COMPACT_TYPES.items()}
+        columns = {"compact": {"step": found.step, **texts}}
     return {
         "joints": list(uncertainty.chain.moving_joints),
-        "terms": [names[int(index)] for index in uncertainty.entries],
-        "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
-        "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
-        **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
+        "terms": _folded([names[int(index)] for index in uncertainty.entries], list(indices)),
         "temperature": uncertainty.temperature,
         "model_std_m": uncertainty.model_std[0],
         "model_std_rad": uncertainty.model_std[1],
+        **columns,
     }
 
 
@@ -621,6 +720,15 @@ def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, 
 
 
 def _encode_rows(rows: Array) -> str:
-    """Encode an array as lines of base64 text."""
-    text = base64.b64encode(np.ascontiguousarray(rows, "<f8").tobytes()).decode()
+    """Encode an array of doubles as lines of base64 text."""
+    return _encode(np.ascontiguousarray(rows, "<f8").tobytes())
+
+
+def _encode_compressed(rows: Array, number: str) -> str:
+    """Compress an array and encode it as lines of base64 text."""
+    return _encode(lzma.compress(np.ascontiguousarray(rows, number).tobytes(), check=lzma.CHECK_CRC32))
+
+
+def _encode(data: bytes) -> str:
+    text = base64.b64encode(data).decode()
     return "\n".join([*(text[i : i + _LINE_LENGTH] for i in range(0, len(text), _LINE_LENGTH)), ""])
