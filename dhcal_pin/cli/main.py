@@ -27,6 +27,7 @@ COMMANDS = (
     Command("calibrate", "calibrate", "estimate the errors of a robot and write the corrected URDF"),
     Command("inspect", "inspect", "say what measurement files contain, without a fit"),
     Command("validate", "validate", "compute the accuracy of a robot model on measurements"),
+    Command("diff", "diff", "compare two calibrations of one robot"),
     Command("recheck", "recheck", "check with a few poses whether a robot is still calibrated"),
     Command("convert", "convert", "convert a robot file to another format, or a bag of ROS to measurements"),
     Command("view", "view", "show the nominal and the calibrated robot on one offline web page"),

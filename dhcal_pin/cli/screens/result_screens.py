@@ -15,6 +15,7 @@ from ...formatting import Quantity, Table
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
+from ...report.difference import difference_table
 from ...report.provenance import short_names
 from .screen import Block, Screen, list_first
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ...cameras.rig import Rig
     from ...compensation import Compensation
     from ...detection import BoardDetection
+    from ...diagnostics import Difference
     from ...io import TargetPoses
     from ...paper.jacobian_check import Agreement
     from ...planning import Plan
@@ -281,6 +283,20 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
             files_block(files),
             Block([size_sentence(plan)], has_space=True),
             Block([comparison], "bold", is_verdict=True),
+        ]
+    )
+
+
+def difference_screen(difference: Difference, files: Iterable[object]) -> Screen:
+    """Describe the difference of two calibrations."""
+    style = {"equal": "green", "different": "red"}.get(difference.verdict, "yellow")
+    first, *others = difference.sentences
+    return Screen(
+        [
+            Block(difference_table(difference), title="distance of the tools, with the best base and tool"),
+            files_block(files),
+            Block(others, noun="remark", rank=1, has_space=True),
+            Block([f"{difference.verdict}: {first}"], style, is_verdict=True),
         ]
     )
 
