@@ -93,8 +93,8 @@ def _add_calibration_options(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--recheck",
         action="store_true",
-        help="plan a check of a calibrated robot for `dhcal recheck`: poses that reveal a change of the zero of "
-        "a joint, of the base or of the tool",
+        help="plan a check of a calibrated robot for `dhcal recheck`: poses that reveal a change of the zero "
+        "of a joint, of the base or of the tool",
     )
     parser.add_argument(
         "--repeat",

@@ -4,8 +4,8 @@ Base and tool of the second robot are those that minimize the displacements of i
 one, so that another set-up of the instrument or another reflector makes no difference.
 
 The displacements d of the tool at m configurations have the covariance C = S·Sᵀ, where S joins the roots of
-both calibrations. Displacements by base and tool, the columns of G, are removed from both: with an orthonormal
-basis Q of G and P = I - Q·Qᵀ,
+both calibrations. Displacements by base and tool, the columns of G, are removed from both: with an
+orthonormal basis Q of G and P = I - Q·Qᵀ,
 
     χ² = (P·d)ᵀ·(P·C·P)⁺·(P·d)
 
@@ -177,8 +177,8 @@ class Difference:
             ]
         low, high = self.usual
         texts = [
-            f"Reduced chi-square {self.reduced:.2f} with {self.freedom} degrees of freedom; equal robots have "
-            f"{low:.2f} to {high:.2f}."
+            f"Reduced chi-square {self.reduced:.2f} with {self.freedom} degrees of freedom; equal robots "
+            f"have {low:.2f} to {high:.2f}."
         ]
         if self.unexplained > MIN_UNEXPLAINED:
             part = Quantity.error(self.unexplained, "m")
@@ -212,7 +212,7 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
         second: The other one.
 
     Returns:
-        Distances of the tools after the best common base and tool, and whether the uncertainties explain them.
+        Distances of the tools with the best common base and tool, and whether the uncertainties explain them.
 
     Raises:
         InvalidArgumentError: They are different robots.

@@ -1,7 +1,8 @@
 """Plans that reveal changes of a robot: of a calibrated one, and during a session.
 
-The likely changes of a calibrated robot are those of the zero of each joint and of the poses of base and tool.
-Poses with the smallest mean variance of these changes, in units of the sizes that must be seen, reveal them.
+The likely changes of a calibrated robot are those of the zero of each joint and of the poses of base and
+tool. Poses with the smallest mean variance of these changes, in units of the sizes that must be seen, reveal
+them.
 
 A session reveals changes if some poses are measured several times: at its begin, middle and end.
 """

@@ -12,9 +12,9 @@ With the columns A of a change, its coefficients β with the prior N(0, w²·D²
     r = A·β + ε,    cov(ε) = Σ = σ²·I + S·Sᵀ
 
 the likelihood of a hypothesis is that of r under N(0, Σ + w²·A·D²·Aᵀ), averaged over widths w, and over σ if
-the noise is not known. The ratio B of this likelihood to that without a change has the mean 1 if nothing
-changed. By Markov's inequality it exceeds 1/α with a probability of at most α. The robot has changed if the
-mean of the ratios exceeds 1/α. The change is named if its share of the sum of all ratios is large enough.
+the noise is not known. The robot has changed if the mean of the ratios of these likelihoods to that without a
+change exceeds a limit. Few robots that did not change exceed it: the limit is a quantile of the mean for
+residuals that are drawn from N(0, Σ). The change is named if its share of the sum of all ratios is large.
 
 Changes may be large: the model is linearized again at the estimate of each hypothesis.
 
@@ -70,7 +70,7 @@ UNDETERMINED_SIZE = 10.0
 # Fewest samples; three positions determine the pose of the base.
 MIN_SAMPLES = 4
 # Largest number of rows; a check needs few, and their covariance is a full matrix.
-MAX_ROWS = 1200
+MAX_ROWS = 600
 # A change is revealed if it is this many times its standard deviation.
 REVEALED_RATIO = 5.0
 # Displacement of the tool that a check must reveal [m].
@@ -201,8 +201,8 @@ def recheck(
     n_rows = sum(item.residual_dim * len(item.rows) for item in data)
     if n_rows > MAX_ROWS:
         raise InvalidArgumentError(
-            f"recheck: {n_rows} measured values; expected at most {MAX_ROWS}: five to ten poses suffice, and more "
-            "are worth a calibration"
+            f"recheck: {n_rows} measured values; expected at most {MAX_ROWS}: five to ten poses suffice, and "
+            "more are worth a calibration"
         )
     if noise is not None:
         data = [_with_noise(item, noise) for item in data]
@@ -304,7 +304,7 @@ class _CheckModel:
     def blocks(self) -> list[Block]:
         """Blocks of columns that may change together, without those whose changes do not show."""
         found = [b for b in self.layout.blocks if b.kind in ("joint", "base", "tool")]
-        effects = np.linalg.norm(self._scaled(self.rows, self.likely_noise), axis=0) * LARGEST_CHANGE
+        effects = np.linalg.norm(self._scaled(self.rows, self.usual_noise), axis=0) * LARGEST_CHANGE
         seen = [replace(b, sizes=np.where(effects[b.columns] > MIN_EFFECT, b.sizes, 0.0)) for b in found]
         seen = [b for b in seen if b.sizes.any()]
         columns, sizes = (np.concatenate([getattr(b, key) for b in seen]) for key in ("columns", "sizes"))
@@ -315,6 +315,11 @@ class _CheckModel:
         """Joints whose zeros do not move what is measured."""
         seen = {block.of for block in self.blocks}
         return [name for name in self.chain.joint_names if name not in seen]
+
+    @property
+    def usual_noise(self) -> int:
+        """Index of the stated noise, or of the middle of the noises that are possible."""
+        return len(self.noise_factors) // 2
 
     @cached_property
     def likely_noise(self) -> int:
@@ -331,7 +336,7 @@ class _CheckModel:
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
     def log_likelihoods(self, columns: Array, sets: Sequence[Array]) -> Array:
-        """Return the logarithm of the likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
         square, nothing = WIDTHS[:, None] ** 2, self.null_likelihoods(sets)
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):
@@ -356,12 +361,11 @@ class _CheckModel:
         return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
 
     def estimate(self, block: Block) -> tuple[Array, Array, Array]:
-        """Estimate a change; return its coefficients, and columns and residual of the model linearized there."""
+        """Estimate a change; return its coefficients, and columns and residual linearized there."""
         changes = np.zeros(self.layout.n_columns)
         rows, sizes = self.rows, block.sizes
         for _ in range(MAX_ITERATIONS):
-            # The middle of unknown noises: the estimate hardly depends on it.
-            scaled = self._scaled(rows, len(self.noise_factors) // 2)
+            scaled = self._scaled(rows, self.usual_noise)
             a = scaled[:, block.columns] * sizes
             prior = np.eye(len(sizes)) / WIDTHS[-1] ** 2
             held = np.divide(changes[block.columns], sizes, out=np.zeros(len(sizes)), where=sizes > 0)

@@ -115,7 +115,8 @@ def test_command(tmp_path: Path, capsys):
     report = tmp_path / "d.html"
     assert main(["diff", *names, "--tip", "tool0", "--report", str(report), "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["verdict"] == "equal" and found["joint_space"]["position_rms_m"] < 5 * NOISE
+    assert found["verdict"] == "equal"
+    assert found["joint_space"]["position_rms_m"] < 5 * NOISE
     assert "Distance of the tools" in report.read_text()
     (tmp_path / "other.urdf").write_bytes(
         (Path(__file__).parents[2] / "urdf" / "experiment.urdf").read_bytes()

@@ -56,15 +56,15 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis of instrument and robot repeatability (default: the columns sigma of "
-        "DATA, else estimated from the measurements)",
+        help="standard deviation per axis of instrument and robot repeatability (default: the columns sigma "
+        "of DATA, else estimated from the measurements)",
     )
     parser.add_argument(
         "--size",
         metavar="LENGTH",
         default="1mm",
-        help="smallest motion of the tool that the check must reveal; if it cannot, the answer is `cannot say` "
-        "(default: %(default)s)",
+        help="smallest motion of the tool that the check must reveal; if it cannot, the answer is `cannot "
+        "say` (default: %(default)s)",
     )
     parser.add_argument(
         "--history", metavar="FILE.jsonl", help="add the check to this file, one JSON line each"
