@@ -57,6 +57,8 @@ COLORS = {
     "level-4": "#c8b866",
     "level-5": "#fee838",
 }
+# Colours of the verdicts of checks of a robot.
+CHECK_COLORS = {"ok": "after", "changed": "outlier", "cannot say": "before"}
 # Half width of a 95 % band in standard deviations.
 BAND_SIGMAS = 1.96
 # Number of levels of a map, from small to large standard deviations.
@@ -236,6 +238,22 @@ def plot_change(
     ax.fill_between(numbers, low, high, color=COLORS["after"], alpha=0.3, linewidth=0, step="mid")
     ax.step(numbers, factor * values, color=COLORS["after"], linewidth=1.6, where="mid")
     ax.set(xlabel="sample", ylabel=f"{of}, {unit_name}")
+    return ax
+
+
+def plot_checks(
+    days: Array, residuals: Array, expected: Array, verdicts: Sequence[str], ax: Axes | None = None
+) -> Axes:
+    """Plot the residuals [m] of checks of a robot over the days before the last one, by verdict."""
+    ax = _axes(ax)
+    factor, unit_name = shown_unit("m")
+    ax.plot(days, factor * residuals, color=COLORS["grid"], linewidth=1.2)
+    ax.plot(days, factor * expected, color=COLORS["text"], linewidth=1.2, linestyle="--")
+    for verdict, color in CHECK_COLORS.items():
+        chosen = np.array([each == verdict for each in verdicts])
+        plot_dots(ax, days[chosen], factor * residuals[chosen], COLORS[color], DOT_SIZES[1], label=verdict)
+    ax.set(xlabel="days before the last check", ylabel=f"RMS, {unit_name}")
+    ax.set_ylim(bottom=0.0)
     return ax
 
 

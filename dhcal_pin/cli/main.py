@@ -18,7 +18,7 @@ class Command(NamedTuple):
     """One command of `dhcal`."""
 
     name: str  # Word on the command line
-    module: str  # Module of `commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`
+    module: str  # Module of `cli.commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`
     help: str  # One line for `dhcal --help`
 
 
@@ -27,13 +27,17 @@ COMMANDS = (
     Command("calibrate", "calibrate", "estimate the errors of a robot and write the corrected URDF"),
     Command("inspect", "inspect", "say what measurement files contain, without a fit"),
     Command("validate", "validate", "compute the accuracy of a robot model on measurements"),
-    Command("convert", "convert", "convert a robot file to another format, or a bag of ROS to measurements"),
+    Command("diff", "robots.diff", "compare two calibrations of one robot"),
+    Command("recheck", "recheck", "check with a few poses whether a robot is still calibrated"),
+    Command(
+        "convert", "robots.convert", "convert a robot file to another format, or a bag of ROS to measurements"
+    ),
     Command("view", "view", "show the nominal and the calibrated robot on one offline web page"),
-    Command("check", "check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
+    Command("check", "robots.check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
     Command("plan", "plan", "choose the poses to measure and predict the resulting accuracy"),
     Command("simulate", "simulate", "simulate measurements of a robot with known errors"),
-    Command("compensate", "compensate", "compute joint values and targets that correct the errors"),
-    Command("export", "export", "write the calibrated model as C or Python code for other programs"),
+    Command("compensate", "robots.compensate", "compute joint values and targets that correct the errors"),
+    Command("export", "robots.export", "write the calibrated model as C or Python code for other programs"),
     Command("detect", "detect", "find the corners of boards in images and write their image coordinates"),
     Command("board", "board", "draw a board to print, at its true scale"),
     Command("app", "app", "serve a page on this computer that calibrates a robot from dropped files"),

@@ -20,6 +20,7 @@ from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
 from ..io.tables import read_table
 from ..measurements.base import Noise
 from ..measurements.mounting import MountedRig, mount_rig
+from ..planning.changes import N_VISITS, change_options, repeated_count
 from ..planning.planner import MAX_CANDIDATES
 from ..planning.views import PlannedImages, with_measured_poses
 from ..robot.chain import Chain
@@ -29,7 +30,7 @@ from ..robot.urdf import read_urdf
 from ..units import ANGLES, LENGTHS, parse_noise
 from .options import split_commas
 from .outputs import existing_sidecars
-from .plan_options import DEFAULT_IMAGE_SIGMA, DEFAULT_SIGMA, N_CANDIDATES, N_IMAGE_CANDIDATES
+from .plan_options import DEFAULT_IMAGE_SIGMA, DEFAULT_SIGMA, N_CANDIDATES, N_IMAGE_CANDIDATES, N_RECHECKED
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
@@ -62,7 +63,7 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
         "priors": read_priors(args.priors) or "default",
         "fix": split_commas(args.fix),
         "free": split_commas(args.free),
-        "criterion": args.criterion,
+        "criterion": args.criterion or "D",
         "data": data,
         "known": read_instrument(args.instrument) if args.instrument else None,
         "prior_uncertainty": read_uncertainty(sidecar, chain) if sidecar else None,
@@ -73,7 +74,20 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
         "margin": Noise(*parse_noise(args.margin, "--margin")),
         "seed": args.seed,
     }
-    return keywords, rows
+    return keywords | (change_options(chain) if args.recheck else {}), rows
+
+
+def planned_count(args: Namespace) -> tuple[int, int]:
+    """Return the number of different poses to plan, and how many of them are repeated."""
+    if args.recheck:
+        for option in ("rig", "data", "parameters", "priors", "criterion"):
+            if getattr(args, option):
+                raise InvalidArgumentError(f"--{option}: not allowed with --recheck")
+    elif args.count is None:
+        raise InvalidArgumentError("the number of poses is missing; expected -n, such as -n 40")
+    count = args.count or N_RECHECKED
+    repeated = repeated_count(count) if args.repeat else 0
+    return count - (N_VISITS - 1) * repeated, repeated
 
 
 def _read_candidates(args: Namespace, chain: Chain) -> tuple[int | Array, Array]:

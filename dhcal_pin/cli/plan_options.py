@@ -10,6 +10,8 @@ from . import options
 DEFAULT_SIGMA = "0.1mm,0.01deg"
 # Standard deviation of detected corners and the same robot, used with --rig.
 DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
+# Poses of a check.
+N_RECHECKED = 10
 # Random candidates; images have more rows each, and more of their candidates are good.
 N_CANDIDATES, N_IMAGE_CANDIDATES = 5000, 2000
 
@@ -18,7 +20,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal plan`."""
     parser.add_argument("robot", **options.ROBOT)
     parser.add_argument(
-        "-n", "--count", type=options.POSITIVE_INTEGER, required=True, metavar="N", help="number of poses"
+        "-n",
+        "--count",
+        type=options.POSITIVE_INTEGER,
+        metavar="N",
+        help=f"number of poses; {N_RECHECKED} with --recheck if it is not given",
     )
     parser.add_argument(
         "-o",
@@ -85,10 +91,21 @@ def _add_measurement_options(parser: ArgumentParser) -> None:
 def _add_calibration_options(parser: ArgumentParser) -> None:
     """Declare the goal, and the calibration for which the poses are planned."""
     parser.add_argument(
+        "--recheck",
+        action="store_true",
+        help="plan a check of a calibrated robot for `dhcal recheck`: poses that reveal a change of the zero "
+        "of a joint, of the base or of the tool",
+    )
+    parser.add_argument(
+        "--repeat",
+        action="store_true",
+        help="measure up to three of the poses at the begin, in the middle and at the end, so that a change "
+        "during the measurement can be found; they count among the N poses",
+    )
+    parser.add_argument(
         "--criterion",
         metavar="C",
-        default="D",
-        help="optimality criterion (default: %(default)s): {criteria}",
+        help="optimality criterion (default: D): {criteria}",
     )
     parser.add_argument(
         "--task",

@@ -4,6 +4,9 @@ from .curves import JointCurve as JointCurve
 from .curves import find_lattices as find_lattices
 from .curves import fitted_coverage as fitted_coverage
 from .curves import joint_curves as joint_curves
+from .difference import Calibrated as Calibrated
+from .difference import Difference as Difference
+from .difference import compare as compare
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import find_extrapolation as find_extrapolation
 from .frames import FRAMES_WARNING as FRAMES_WARNING

@@ -67,7 +67,7 @@ def _gauge_directions(uncertainty: Uncertainty, undetermined: Array, lever: floa
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_COMPARED, chain.n_joints))
     left, s, right = np.linalg.svd(_effects(uncertainty, undetermined, q, lever), full_matrices=False)
     has_effect = s > NO_EFFECT_RTOL * max(s[0], np.linalg.norm(undetermined, 2) * lever)
-    frames, frame_s, _ = np.linalg.svd(_frame_effects(chain, q, lever), full_matrices=False)
+    frames, frame_s, _ = np.linalg.svd(frame_effects(chain, q, lever), full_matrices=False)
     frames = frames[:, frame_s > NO_EFFECT_RTOL * frame_s[0]]
     # Principal angles between both spaces of effects.
     outside = left[:, has_effect] - frames @ (frames.T @ left[:, has_effect])
@@ -83,7 +83,7 @@ def _effects(uncertainty: Uncertainty, directions: Array, q: Array, lever: float
     return twists.reshape(-1, directions.shape[1])
 
 
-def _frame_effects(chain: Chain, q: Array, lever: float) -> Array:
+def frame_effects(chain: Chain, q: Array, lever: float) -> Array:
     """Return the displacements of the tool by twists of base and tool at q, (6m, 12) [m]."""
     poses = chain.poses(q)
     out = np.zeros((len(q), 6, 12))

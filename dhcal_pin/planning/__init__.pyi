@@ -1,5 +1,7 @@
 """Public names of dhcal_pin.planning; `__init__.py` loads each on first use."""
 
+from .changes import change_options as change_options
+from .changes import with_repeats as with_repeats
 from .curve_prediction import CurvePrediction as CurvePrediction
 from .information import Information as Information
 from .information import PlannedCalibration as PlannedCalibration

@@ -305,16 +305,21 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
             text = f"Map of the measured position errors over {plane[0]} and {plane[1]}: RMS {rms}."
             measured = partial(plot, points, errors)
             panels.append(Panel(f"errors-{plane}", f"Measured error, {view}", text, measured, SQUARE_PANEL))
-    edges = 1e3 * levels
-    decimals = max(0, 1 - math.floor(math.log10(edges[1])))
-    texts = [f"{low:.{decimals}f}–{high:.{decimals}f} mm" for low, high in pairwise(edges)]
-    texts[-1] = f"above {edges[-2]:.{decimals}f} mm"
-    legend = [LegendEntry(text, f"level-{k}", "cell") for k, text in enumerate(texts)]
+    legend = level_legend(levels)
     if len(finite) < len(workspace.std):
         legend.append(LegendEntry("not predictable", "unknown", "cell"))
     if len(workspace.measured):
         legend.append(LegendEntry("measured samples", "measured", "dots"))
     return [FigureGroup(panels, legend=legend, layout="wide")]
+
+
+def level_legend(levels: Array) -> list[LegendEntry]:
+    """Return the meaning of the colours of a map with these edges between its levels [m]."""
+    edges = 1e3 * levels
+    decimals = max(0, 1 - math.floor(math.log10(edges[1])))
+    texts = [f"{low:.{decimals}f}–{high:.{decimals}f} mm" for low, high in pairwise(edges)]
+    texts[-1] = f"above {edges[-2]:.{decimals}f} mm"
+    return [LegendEntry(text, f"level-{k}", "cell") for k, text in enumerate(texts)]
 
 
 def plane_points(plane: str) -> tuple[str, ...]:

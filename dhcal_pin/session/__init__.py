@@ -1,7 +1,17 @@
 """What happened during a session: events, drift, lag and scale, found from the order of the samples."""
 
 from .facts import History, Session, histories
+from .recheck import Recheck, recheck
 from .scale import find_scale
 from .search import can_have_session, find_session
 
-__all__ = ["History", "Session", "can_have_session", "find_scale", "find_session", "histories"]
+__all__ = [
+    "History",
+    "Recheck",
+    "Session",
+    "can_have_session",
+    "find_scale",
+    "find_session",
+    "histories",
+    "recheck",
+]

@@ -10,9 +10,10 @@ import pytest
 from robots import paper, robot_file
 
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_robot, read_uncertainty, write_urdf
+from dhcal_pin.io import read_configurations, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import KINDS, Noise
 from dhcal_pin.planning import Information, PlannedCalibration, plan
 from dhcal_pin.planning.criteria import DOptimality
@@ -433,3 +434,20 @@ def test_progress_names_each_phase_once(candidates):
     assert [step for _, step, _ in calls] == [1, 2, 3, 4, 5, 6]
     assert {total for _, _, total in calls} == {6}
     assert len({phase for phase, _, _ in calls}) == 6
+
+
+def test_poses_are_repeated_at_begin_middle_and_end(tmp_path):
+    path = tmp_path / "poses.csv"
+    robot = str(robot_file(ARMS["ur10"][0]))
+    command = ["plan", robot, "--tip", "tool0", "--repeat", "--candidates", "200", "-o", str(path)]
+    assert main([*command, "-n", "20"]) == 0
+    q = read_configurations(path, arm("ur10"))
+    assert q.shape == (20, 6)
+    repeated = q[:3]
+    starts = [i for i in range(18) if np.array_equal(q[i : i + 3], repeated)]
+    assert starts[0] == 0
+    assert starts[-1] == 17
+    assert abs(starts[1] - 8.5) <= 1
+    assert len(starts) == 3
+    assert len(np.unique(q, axis=0)) == 14
+    assert main([*command, "-n", "4"]) == 2

@@ -12,16 +12,17 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 def run(args: Namespace) -> int:
     """Choose poses, write them and show the predicted accuracy."""
     from ...io import read_robot  # lazy import, as the following: they are slow to load
-    from ...planning import plan
+    from ...planning import plan, with_repeats
     from ...programs import require_program_ending
     from ...report.provenance import file_digests
     from ..output_table import chosen_files, file_contents, require_endings
     from ..outputs import require_writable_outputs, write_outputs
-    from ..plan_input import input_paths, planned_kind, read_input
+    from ..plan_input import input_paths, planned_count, planned_kind, read_input
     from ..plan_outputs import OUTPUTS, Planned, plan_document
     from ..screens import console
     from ..screens.result_screens import plan_screen
 
+    count, n_repeated = planned_count(args)
     kind, inputs, files = planned_kind(args), input_paths(args), chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in files], inputs)
     require_endings(files)
@@ -29,8 +30,10 @@ def run(args: Namespace) -> int:
         require_program_ending(path)
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
     given, rows = read_input(args, chain, kind)
-    with console.show_progress(f"choosing {args.count} poses") as progress:
-        result = plan(chain, args.count, progress=progress, **given)
+    with console.show_progress(f"choosing {count} poses") as progress:
+        result = plan(chain, count, progress=progress, **given)
+    if n_repeated:
+        result = with_repeats(result, chain, n_repeated, given["space"], given["margin"])
     done = Planned(result, chain, given, rows, args, file_digests(inputs))
     contents = file_contents(files, done)
     write_outputs(contents, args.json, plan_document(done))

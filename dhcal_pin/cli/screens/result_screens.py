@@ -11,10 +11,11 @@ import numpy as np
 from ...calibration.evaluation import Accuracy
 from ...calibration.summary import STATISTIC_LABELS, statistic
 from ...diagnostics.inspection import FileInspection, column_table
-from ...formatting import Table
+from ...formatting import Quantity, Table
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
+from ...report.difference import difference_table
 from ...report.provenance import short_names
 from .screen import Block, Screen, list_first
 
@@ -23,10 +24,12 @@ if TYPE_CHECKING:
     from ...cameras.rig import Rig
     from ...compensation import Compensation
     from ...detection import BoardDetection
+    from ...diagnostics import Difference
     from ...io import TargetPoses
     from ...paper.jacobian_check import Agreement
     from ...planning import Plan
     from ...robot import Chain
+    from ...session import Recheck
     from ...studies import StudyGrid
 
 
@@ -224,7 +227,8 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
     """Describe the predicted error over the number of poses, and compare a plan with random poses."""
     from ...report.plan import size_sentence  # lazy import: only this command needs it
 
-    sizes, count = plan.sizes.tolist(), len(plan.q)
+    # Without the repetitions of poses.
+    sizes, count = plan.sizes.tolist(), int(plan.random_sizes[-1])
     random_errors = dict(zip(plan.random_sizes.tolist(), plan.random_errors.tolist(), strict=True))
     selected = {*random_errors, count, sizes[-1]}
     selected |= {plan.recommended_size} if plan.recommended_size else set()
@@ -279,6 +283,60 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
             files_block(files),
             Block([size_sentence(plan)], has_space=True),
             Block([comparison], "bold", is_verdict=True),
+        ]
+    )
+
+
+def difference_screen(difference: Difference, files: Iterable[object]) -> Screen:
+    """Describe the difference of two calibrations."""
+    style = {"equal": "green", "different": "red"}.get(difference.verdict, "yellow")
+    first, *others = difference.sentences
+    return Screen(
+        [
+            Block(difference_table(difference), title="distance of the tools, with the best base and tool"),
+            files_block(files),
+            Block(others, noun="remark", rank=1, has_space=True),
+            Block([f"{difference.verdict}: {first}"], style, is_verdict=True),
+        ]
+    )
+
+
+# Styles of the verdicts of a check, and smallest share of the evidence of a sample that is shown.
+MIN_SHOWN_SHARE = 0.01
+VERDICT_STYLES = {"ok": "green", "changed": "red", "cannot say": "yellow"}
+
+
+def recheck_screen(result: Recheck, files: Iterable[object]) -> Screen:
+    """Describe whether a robot is still calibrated."""
+    rows = [
+        [
+            each.name,
+            f"{100 * each.share:.0f} %",
+            Quantity(each.size, each.unit, each.std, is_small=True) if each.std else "",
+            Quantity.error(each.std, each.unit) if each.std else "",
+        ]
+        for each in result.hypotheses
+        if each.kind != "sample" or each.share >= MIN_SHOWN_SHARE
+    ]
+    table = Table(["change", "share", "size", "std"], rows)
+    expected = f"; expected {Quantity.error(result.expected_rms, 'm')}" if result.expected_rms > 0 else ""
+    residual = f"distance of the measured positions: {Quantity.error(result.residual_rms, 'm')} RMS{expected}"
+    return Screen(
+        [
+            Block(
+                table,
+                title=f"what {result.samples} samples say if something changed",
+                noun="change",
+                n_kept=4,
+            ),
+            Block([residual]),
+            files_block(files),
+            Block(
+                [f"{result.verdict}: {result.reasons[0]}", *result.reasons[1:]],
+                VERDICT_STYLES[result.verdict],
+                is_verdict=True,
+                has_space=True,
+            ),
         ]
     )
 

@@ -86,7 +86,7 @@ def correct_staubli_arm(path: PathLike, nominal: Chain) -> tuple[Chain, list[str
         InvalidArgumentError: The robot has other joints.
     """
     offsets = read_joint_offsets(path)
-    if len(offsets) != len(nominal.moving_joints) or nominal.prismatic[np.nonzero(offsets)].any():
+    if len(offsets) != len(nominal.moving_joints) or nominal.prismatic[np.array(offsets) != 0].any():
         raise InvalidArgumentError(
             f"{path}: has offsets of {len(offsets)} turning joints; expected a robot with these joints, and "
             f"{nominal.urdf.source} has {', '.join(nominal.moving_joints)}"

@@ -1,0 +1,125 @@
+"""`dhcal recheck`: is a robot still calibrated?"""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...exceptions import InvalidArgumentError
+from ..options import COLUMNS, DATA, JSON, ROBOT, add_urdf_options
+from ..output_table import Output
+
+if TYPE_CHECKING:
+    from ...io.check_history import Check
+    from ...session import Recheck
+
+EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
+
+# Exit status of each verdict.
+STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
+
+
+class Checked(NamedTuple):
+    """Result of a check, from which its output files are made."""
+
+    result: Recheck
+    robot: str
+    checks: list[Check]  # The checks of the history and this one
+
+
+def _history_content(done: Checked, path: str) -> str:
+    from ...io.check_history import history_text  # lazy import: only for histories
+
+    return history_text(done.checks)
+
+
+def _plot_content(done: Checked, path: str) -> str:
+    from ...report.check_history import history_page  # lazy import: only for pages
+
+    return history_page(done.robot, done.checks)
+
+
+OUTPUTS: dict[str, Output[Checked]] = {
+    "json": Output(None),
+    "history": Output(_history_content, "a history", (".jsonl",)),
+    "plot": Output(_plot_content, "a plot of the history", (".html",), (".htm",)),
+}
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal recheck`."""
+    parser.add_argument("robot", **{**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"})
+    parser.add_argument("data", **DATA)
+    add_urdf_options(parser)
+    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument(
+        "--sigma",
+        metavar="LENGTH[,ANGLE]",
+        help="standard deviation per axis of instrument and robot repeatability (default: the columns sigma "
+        "of DATA, else estimated from the measurements)",
+    )
+    parser.add_argument(
+        "--size",
+        metavar="LENGTH",
+        default="1mm",
+        help="smallest motion of the tool that the check must reveal; if it cannot, the answer is `cannot "
+        "say` (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--history", metavar="FILE.jsonl", help="add the check to this file, one JSON line each"
+    )
+    parser.add_argument(
+        "--plot", metavar="H.html", help="page with the checks of --history over time (.html)"
+    )
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Check whether a robot is still calibrated, write the answer and show it."""
+    from ...io import existing_sidecar, read_instrument, read_measurement_file, read_robot, robot_name
+    from ...io.check_history import Check, read_history
+    from ...io.sidecar import read_uncertainty  # lazy import, as the following: they load Pinocchio
+    from ...measurements import Noise
+    from ...report.provenance import file_digests
+    from ...session import recheck
+    from ...units import parse_noise
+    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
+    from ..outputs import require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import recheck_screen
+
+    sidecar = existing_sidecar(args.robot)
+    inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
+    outputs = chosen_files(vars(args), OUTPUTS)
+    require_writable_outputs([file.path for file in outputs], inputs)
+    require_endings(outputs)
+    if args.plot and not args.history:
+        raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")
+    noise = Noise(*parse_noise(args.sigma, "--sigma")) if args.sigma else None
+    size = parse_noise(args.size, "--size")[0]
+    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    if sidecar is None:
+        raise InvalidArgumentError(
+            f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
+            "NAME.calibration.toml"
+        )
+    files = [read_measurement_file(path, chain, args.columns) for path in args.data]
+    earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
+    data, known = [file.data for file in files], read_instrument(sidecar)
+    used = {parameter.name for item in data for parameter in item.instrument_parameters}
+    known = {name: value for name, value in known.items() if name in used}
+    result = recheck(chain, data, read_uncertainty(sidecar, chain), known=known, noise=noise, size=size)
+    now = Check.of(result, args.robot, args.data)
+    written = paths_by_name(outputs)
+    document: dict[str, Any] = result.to_dict() | {
+        "time": now.time,
+        "robot": args.robot,
+        "files": written,
+        "inputs": file_digests(inputs),
+    }
+    contents = file_contents(outputs, Checked(result, robot_name(args.robot), [*earlier, now]))
+    write_outputs(contents, args.json, document)
+    shown = [path for name, path in written.items() if name != "json"]
+    console.show(recheck_screen(result, shown), args.verbosity)
+    return STATUS[result.verdict]

@@ -1,0 +1,82 @@
+"""`dhcal diff`: compare two calibrations of one robot."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, NamedTuple
+
+from ...options import JSON, ROBOT, add_urdf_options
+from ...output_table import Output
+
+if TYPE_CHECKING:
+    from ....diagnostics import Calibrated, Difference
+
+EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
+
+
+class Compared(NamedTuple):
+    """Result of a comparison, from which its output files are made."""
+
+    difference: Difference
+    names: list[str]
+    inputs: dict[str, str]
+
+
+def _report_content(done: Compared, path: str) -> str:
+    from ....report.difference import difference_page  # lazy import: only for reports
+
+    return difference_page(done.names, done.difference, done.inputs)
+
+
+OUTPUTS: dict[str, Output[Compared]] = {
+    "json": Output(None),
+    "report": Output(_report_content, "the report of a difference", (".html",), (".htm",)),
+}
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the arguments of `dhcal diff`."""
+    text = "{} robot: a calibrated robot with its sidecar, or the nominal one"
+    parser.add_argument("first", metavar="A", type=ROBOT["type"], help=text.format("one"))
+    parser.add_argument("second", metavar="B", type=ROBOT["type"], help=text.format("the other"))
+    add_urdf_options(parser)
+    parser.add_argument("--report", metavar="F.html", help="report with maps and both robots in 3-D (.html)")
+    parser.add_argument("--json", **JSON)
+
+
+def run(args: Namespace) -> int:
+    """Compare two robots, write the difference and show it."""
+    from ....diagnostics import compare  # lazy import, as the following: they load Pinocchio
+    from ....io import robot_name
+    from ....report.provenance import file_digests
+    from ...output_table import chosen_files, file_contents, paths_by_name, require_endings
+    from ...outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ...screens import console
+    from ...screens.result_screens import difference_screen
+
+    robots = [args.first, args.second]
+    inputs, outputs = [*robots, *existing_sidecars(robots)], chosen_files(vars(args), OUTPUTS)
+    require_writable_outputs([file.path for file in outputs], inputs)
+    require_endings(outputs)
+    difference = compare(*(_read(path, args) for path in robots))
+    done = Compared(difference, [robot_name(path) for path in robots], file_digests(inputs))
+    files = paths_by_name(outputs)
+    document = difference.to_dict() | {"files": files, "inputs": done.inputs}
+    write_outputs(file_contents(outputs, done), args.json, document)
+    shown = [path for name, path in files.items() if name != "json"]
+    console.show(difference_screen(difference, shown), args.verbosity)
+    return 0
+
+
+def _read(path: str, args: Namespace) -> Calibrated:
+    """Read a robot and what its sidecar says of its calibration."""
+    from ....diagnostics import Calibrated  # lazy import, as the following: they load Pinocchio
+    from ....io import existing_sidecar, read_measured_region, read_robot, read_uncertainty
+
+    chain, sidecar = (
+        read_robot(path, args.tip, package_dirs=args.package_dir, root=args.root),
+        existing_sidecar(path),
+    )
+    if sidecar is None:
+        return Calibrated(chain, source=path)
+    return Calibrated(chain, read_uncertainty(sidecar, chain), read_measured_region(sidecar, chain), path)

@@ -1,0 +1,391 @@
+"""Difference of two calibrations of one robot, after the best common base and tool.
+
+Base and tool of the second robot are those that minimize the displacements of its tool from that of the first
+one, so that another set-up of the instrument or another reflector makes no difference.
+
+The displacements d of the tool at m configurations have the covariance C = S·Sᵀ, where S joins the roots of
+both calibrations. Displacements by base and tool, the columns of G, are removed from both: with an
+orthonormal basis Q of G and P = I - Q·Qᵀ,
+
+    χ² = (P·d)ᵀ·(P·C·P)⁺·(P·d)
+
+has a χ² distribution with k = rank(P·S) degrees of freedom if both calibrations are of the same robot, their
+models describe it, and their uncertainties are right. Reduced chi-square is χ²/k. It scatters by √(2/k).
+
+If it is too large, joints are named in turn: that whose zero, or whose placement and joint errors, reduces χ²
+most beyond what each coefficient must reduce.
+
+Reference: W. Baarda, S-transformations and criterion matrices, Netherlands Geodetic Commission, 1973.
+
+Shapes: m configurations, n joints, c components of a displacement: 3, or 6 with angles times a length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from .. import se3
+from .._typing import Array
+from ..estimation.frame_gauge import frame_effects
+from ..estimation.uncertainty import Uncertainty
+from ..exceptions import InvalidArgumentError
+from ..formatting import Quantity
+from ..measurements.measured_region import MeasuredRegion, draw_joint_space
+from ..robot.chain import Chain
+
+# Number of configurations at which the robots are compared.
+N_COMPARED = 200
+# Fewest configurations of a common measured region.
+MIN_REGION = 10
+# Largest distance of the tools relative to the spread of the tool points: beyond, they are different robots.
+MAX_RELATIVE_DISTANCE = 0.1
+# Orientations count if their standard deviation, as a motion at the lever, is at most this many times that of
+# the positions: else priors limit it.
+MAX_STD_RATIO = 2.5
+# Standard deviations below this part of their median are those of rounding and of second-order effects.
+MIN_STD_RATIO = 0.02
+# Singular values below this part of the largest one are zero up to rounding.
+RANK_RTOL = 1e-3
+# Largest part of the effect of a joint error outside of what the uncertainties contain.
+MAX_OUTSIDE = 1e-3
+# Effects of base and tool below this part of the largest one are none.
+EFFECT_RTOL = 1e-6
+# Probability of a chi-square below which two calibrations are different.
+DIFFERENT_P = 0.01
+# Smallest reduction of chi-square by each coefficient of a joint that is named.
+MIN_REDUCTION = 12.0
+# Displacement that no uncertainty explains and that counts as a difference of the models [m].
+MIN_UNEXPLAINED = 1e-5
+# Orders of the harmonics of a joint that its errors may contain.
+ORDERS = (1, 2)
+MAX_ITERATIONS = 10
+STEP_TOL = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """Robot with what its calibration says of it.
+
+    Attributes:
+        chain: Robot.
+        uncertainty: Uncertainty of its calibration; None if it is not known.
+        region: Measured region; None if it is not known.
+        source: File of the robot.
+    """
+
+    chain: Chain
+    uncertainty: Uncertainty | None = None
+    region: MeasuredRegion | None = None
+    source: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """Distances of two tools in m configurations.
+
+    Attributes:
+        position: Distances of the tool points, (m,) [m].
+        orientation: Angles between the tools, (m,) [rad]; None if one calibration does not determine them.
+        expected: RMS distance that the uncertainties explain [m]; None if they are not known.
+    """
+
+    position: Array
+    orientation: Array | None
+    expected: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return RMS, 95th percentile and maximum for a JSON document."""
+        out: dict[str, Any] = {"configurations": len(self.position), "expected_position_rms_m": self.expected}
+        for name, unit, values in (
+            ("position", "m", self.position),
+            ("orientation", "rad", self.orientation),
+        ):
+            for key, function in STATISTICS.items():
+                out[f"{name}_{key}_{unit}"] = None if values is None else float(function(values))
+        return out
+
+
+# Statistics of distances by their keys.
+STATISTICS = {
+    "rms": lambda values: np.sqrt(np.mean(values**2)),
+    "p95": lambda values: np.quantile(values, 0.95),
+    "max": np.max,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """Difference of two calibrations of one robot.
+
+    Attributes:
+        first: First robot.
+        second: Second robot, with the base and tool that fit those of the first one best.
+        region: Distances in the measured region of both; None without a common one.
+        everywhere: Distances in configurations drawn from the joint limits.
+        q: These configurations, (m, n) [rad or m].
+        chi_square: Chi-square of the difference; None if no uncertainty is known.
+        freedom: Its degrees of freedom.
+        unexplained: RMS distance that no uncertainty can explain [m].
+        joints: Joints that differ, that of the largest part of chi-square first, and these parts.
+    """
+
+    first: Chain
+    second: Chain
+    region: Distances | None
+    everywhere: Distances
+    q: Array
+    chi_square: float | None = None
+    freedom: int = 0
+    unexplained: float = 0.0
+    joints: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def reduced(self) -> float | None:
+        """Reduced chi-square."""
+        return None if self.chi_square is None else self.chi_square / max(self.freedom, 1)
+
+    @property
+    def p_value(self) -> float | None:
+        """Probability of a chi-square at least this large without a difference."""
+        return None if self.chi_square is None else float(stats.chi2.sf(self.chi_square, self.freedom))
+
+    @property
+    def usual(self) -> tuple[float, float]:
+        """Interval that contains the reduced chi-square of 95 % of equal robots."""
+        low, high = (float(stats.chi2.ppf(p, self.freedom)) / max(self.freedom, 1) for p in (0.025, 0.975))
+        return low, high
+
+    @property
+    def verdict(self) -> str:
+        """Whether the robots are "equal" or "different" within their uncertainties, or "unknown"."""
+        if self.p_value is None:
+            return "unknown"
+        is_other = self.unexplained > max(MIN_UNEXPLAINED, self.everywhere.expected or 0.0)
+        return "different" if self.p_value < DIFFERENT_P or is_other else "equal"
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the difference means."""
+        if self.reduced is None:
+            return [
+                "No calibration states its uncertainty, so that nothing says how large a difference may be."
+            ]
+        low, high = self.usual
+        texts = [
+            f"Reduced chi-square {self.reduced:.2f} with {self.freedom} degrees of freedom; equal robots "
+            f"have {low:.2f} to {high:.2f}."
+        ]
+        if self.unexplained > MIN_UNEXPLAINED:
+            part = Quantity.error(self.unexplained, "m")
+            texts.append(f"{part} RMS is of errors that only one of the models has.")
+        if self.joints:
+            texts.append(f"These joints differ: {', '.join(self.joints)}.")
+        return texts
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the difference for a JSON document."""
+        return {
+            "verdict": self.verdict,
+            "reasons": self.sentences,
+            "measured_region": self.region and self.region.to_dict(),
+            "joint_space": self.everywhere.to_dict(),
+            "chi_square": self.chi_square,
+            "degrees_of_freedom": self.freedom,
+            "reduced_chi_square": self.reduced,
+            "reduced_chi_square_95": None if self.reduced is None else list(self.usual),
+            "p_value": self.p_value,
+            "unexplained_rms_m": self.unexplained,
+            "joints": [{"name": name, "chi_square": value} for name, value in self.joints.items()],
+        }
+
+
+def compare(first: Calibrated, second: Calibrated) -> Difference:
+    """Compare two calibrations of one robot.
+
+    Args:
+        first: One calibration, or the nominal robot.
+        second: The other one.
+
+    Returns:
+        Distances of the tools with the best common base and tool, and whether the uncertainties explain them.
+
+    Raises:
+        InvalidArgumentError: They are different robots.
+    """
+    a, b = first.chain, second.chain
+    for what in ("joint_names", "tip"):
+        if getattr(a, what) != getattr(b, what):
+            values = [x if isinstance(x, str) else ", ".join(x) for x in (getattr(a, what), getattr(b, what))]
+            name = "joints" if what == "joint_names" else what
+            raise InvalidArgumentError(
+                f"{second.source}: another robot: its {name}: {values[1]}; expected those of {first.source}: "
+                f"{values[0]}"
+            )
+    everywhere = draw_joint_space(a)
+    q_all, q_region = everywhere[:N_COMPARED], _common_region(first, second)
+    points = a.poses(q_all)[:, :3, 3]
+    lever = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1)))) or 1.0
+    pair = (first.uncertainty, second.uncertainty)
+    roots = [u for u in pair if u is not None]
+    is_turned = all(_determines_orientation(u, q_all, lever) for u in roots)
+    n_components = 6 if is_turned else 3
+    q = q_all if q_region is None else q_region
+    b = _aligned(a, replace(b, base=a.base, tool=a.tool), q, lever, n_components)
+
+    def distances(q: Array) -> Distances:
+        d = _displacements(a, b, q, 1.0)
+        expected = _expected(a, b, pair, q, lever, n_components)
+        angles = np.linalg.norm(d[:, 3:], axis=1) if is_turned else None
+        return Distances(np.linalg.norm(d[:, :3], axis=1), angles, expected)
+
+    whole = distances(q_all)
+    rms = float(STATISTICS["rms"](whole.position))
+    if rms > MAX_RELATIVE_DISTANCE * lever:
+        raise InvalidArgumentError(
+            f"{second.source}: another robot: its tool is {1e3 * rms:.3g} mm RMS from that of {first.source} "
+            "after the best base and tool; expected two calibrations of one robot"
+        )
+    difference = Difference(a, b, None if q_region is None else distances(q_region), whole, everywhere)
+    if not roots:
+        return difference
+    return _tested(difference, pair, q_all, lever, n_components)
+
+
+def _common_region(first: Calibrated, second: Calibrated) -> Array | None:
+    """Return the configurations in the measured regions of both robots, (m, n); None if there are few."""
+    regions = [each.region for each in (first, second) if each.region is not None]
+    if not regions:
+        return None
+    q = np.concatenate([region.configurations for region in regions])
+    q = q[np.all([region.contains(q) for region in regions], 0)]
+    return q[:: -(-len(q) // N_COMPARED)] if len(q) >= MIN_REGION else None
+
+
+def _displacements(a: Chain, b: Chain, q: Array, lever: float) -> Array:
+    """Return the displacements of the tool of b from that of a, (m, 6) [m]."""
+    of_a, of_b = a.poses(q), b.poses(q)
+    turns = [se3.log3(turn) for turn in of_b[:, :3, :3] @ of_a[:, :3, :3].swapaxes(1, 2)]
+    return np.hstack([of_b[:, :3, 3] - of_a[:, :3, 3], lever * np.array(turns)])
+
+
+def _aligned(a: Chain, b: Chain, q: Array, lever: float, n_components: int) -> Chain:
+    """Return b with the base and tool with which its tool is nearest to that of a."""
+    for _ in range(MAX_ITERATIONS):
+        effects = frame_effects(b, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+        d = _displacements(a, b, q, lever)[:, :n_components].ravel()
+        step = -np.linalg.lstsq(effects, d, rcond=EFFECT_RTOL)[0]
+        b = replace(b, base=se3.exp6(step[:6]) @ b.base, tool=b.tool @ se3.exp6(step[6:]))
+        if np.abs(effects @ step).max() < STEP_TOL:
+            break
+    return b
+
+
+def _effects(chain: Chain, uncertainty: Uncertainty, q: Array, lever: float) -> Array:
+    """Return the root of the covariance of the tool's displacements with the frames of a chain, (m, 6, r)."""
+    moved = replace(uncertainty, chain=chain)
+    out = moved.tool_twists(chain.forward_kinematics(q), uncertainty.sqrt_covariance)
+    out[:, 3:] *= lever
+    return out
+
+
+def _without_frames(chain: Chain, q: Array, lever: float, n_components: int, columns: Array) -> Array:
+    """Remove what base and tool explain of displacements (m, 6, c), (m·components, c)."""
+    g = frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+    u, s, _ = np.linalg.svd(g, full_matrices=False)
+    u = u[:, s > EFFECT_RTOL * s[0]]
+    flat = columns[:, :n_components].reshape(-1, columns.shape[2])
+    return flat - u @ (u.T @ flat)
+
+
+def _determines_orientation(uncertainty: Uncertainty, q: Array, lever: float) -> bool:
+    """Return whether the measurements determine the orientation of the tool, up to another base and tool."""
+    chain = uncertainty.chain
+    effects = _effects(chain, uncertainty, q, lever)
+    turn = _without_frames(chain, q, lever, 6, effects).reshape(len(q), 6, -1)[:, 3:]
+    position = _without_frames(chain, q, lever, 3, effects)
+    return bool(np.linalg.norm(turn) <= MAX_STD_RATIO * np.linalg.norm(position))
+
+
+def _root(
+    a: Chain, b: Chain, pair: tuple[Uncertainty | None, Uncertainty | None], q: Array, lever: float, n: int
+) -> Array:
+    """Return the root of the covariance of the displacements without base and tool, (m·n, r)."""
+    parts = [_effects(c, u, q, lever) for c, u in zip((a, b), pair, strict=True) if u is not None]
+    return _without_frames(a, q, lever, n, np.concatenate(parts, 2))
+
+
+def _expected(a, b, pair, q: Array, lever: float, n: int) -> float | None:
+    """Return the RMS distance that the uncertainties explain [m]."""
+    if pair == (None, None):
+        return None
+    root = _root(a, b, pair, q, lever, n).reshape(len(q), n, -1)[:, :3]
+    return float(np.sqrt(np.sum(root**2) / len(q)))
+
+
+def _tested(difference: Difference, pair, q: Array, lever: float, n: int) -> Difference:
+    """Return a difference with its chi-square, and the joints that differ."""
+    a, b = difference.first, difference.second
+    u, s, _ = np.linalg.svd(_root(a, b, pair, q, lever, n), full_matrices=False)
+    usual = np.median(s[s > RANK_RTOL * s[0]])
+    rank = int(np.sum(s > MIN_STD_RATIO * usual))
+    whiten = (u[:, :rank] / s[:rank]).T
+    d = _without_frames(a, q, lever, n, _displacements(a, b, q, lever)[..., None])
+    left = d - u[:, :rank] @ (u[:, :rank].T @ d)
+    z = (whiten @ d)[:, 0]
+    difference = replace(
+        difference,
+        chi_square=float(z @ z),
+        freedom=rank,
+        unexplained=float(np.sqrt(np.sum(left**2) / len(q))),
+    )
+    if difference.verdict != "different":
+        return difference
+    columns = []
+    for name, effects in _joint_effects(a, q, lever):
+        own = _without_frames(a, q, lever, n, effects)
+        outside = np.sum((own - u[:, :rank] @ (u[:, :rank].T @ own)) ** 2, 0)
+        columns.append((name, whiten @ own[:, outside < MAX_OUTSIDE * np.sum(own**2, 0)]))
+    return replace(difference, joints=_named_joints(columns, z))
+
+
+def _joint_effects(chain: Chain, q: Array, lever: float) -> Iterator[tuple[str, Array]]:
+    """Yield displacements by the zero of each joint, and by its placement and its errors, (m, 6, c) each."""
+    frames, n_bodies = chain.forward_kinematics(q), len(chain.moving_joints) + 1
+    bodies = Uncertainty(chain, np.zeros(0, int), np.eye(6 * n_bodies), np.empty((6 * n_bodies, 0)))
+    placements = bodies.tool_twists(frames, bodies.sqrt_covariance)
+    placements[:, 3:] *= lever
+    motions = chain.joint_jacobian(frames)
+    motions[:, 3:] *= lever
+    for i, name in enumerate(chain.joint_names):
+        terms = [np.ones(len(q)), q[:, i]]
+        if not chain.is_prismatic[i]:
+            terms += [f(k * q[:, i]) for k in ORDERS for f in (np.sin, np.cos)]
+        errors = motions[i].T[:, :, None] * np.stack(terms, 1)[:, None]
+        # The placement of a joint is a motion of the body in front of it.
+        body = chain.moving_joints.index(name)
+        yield name, errors[..., :1]
+        yield name, np.concatenate([placements[..., 6 * body : 6 * body + 6], errors], 2)
+
+
+def _named_joints(columns: Sequence[tuple[str, Array]], z: Array) -> dict[str, float]:
+    """Return the joints that differ, and the part of chi-square that each explains beyond those before it."""
+    named: dict[str, float] = {}
+    used, left = np.zeros((len(z), 0)), z
+    while True:
+        trials = []
+        for name, own in columns:
+            u, s, _ = np.linalg.svd(own - used @ (used.T @ own), full_matrices=False)
+            basis = u[:, s > RANK_RTOL * np.linalg.norm(own)]
+            gain = float(np.sum((basis.T @ left) ** 2))
+            trials.append((gain - MIN_REDUCTION * basis.shape[1], name, gain, basis))
+        score, name, gain, basis = max(trials, key=lambda trial: trial[0])
+        if score <= 0:
+            return named
+        named[name] = named.get(name, 0.0) + gain
+        used = np.hstack([used, basis])
+        left = left - basis @ (basis.T @ left)

@@ -1,0 +1,556 @@
+"""Check of a calibrated robot with a few measurements: is it still calibrated, and if not, what changed?
+
+Hypotheses about n rows of whitened residuals r:
+
+- nothing changed;
+- one thing changed: the zero of a joint, the pose of the base, the pose of the tool, all of them together
+  (the robot), or one sample is wrong.
+
+With the columns A of a change, its coefficients β with the prior N(0, w²·D²), where D moves the tool by about
+1 m, the root S of what the calibration leaves uncertain, and the noise σ,
+
+    r = A·β + ε,    cov(ε) = Σ = σ²·I + S·Sᵀ
+
+the likelihood of a hypothesis is that of r under N(0, Σ + w²·A·D²·Aᵀ), averaged over widths w, and over σ if
+the noise is not known. The robot has changed if the mean of the ratios of these likelihoods to that without a
+change exceeds a limit. Few robots that did not change exceed it: the limit is a quantile of the mean for
+residuals that are drawn from N(0, Σ). The change is named if its share of the sum of all ratios is large.
+
+Changes may be large: the model is linearized again at the estimate of each hypothesis.
+
+Reference: R. E. Kass and A. E. Raftery, Bayes Factors, J. American Statistical Association 90, 1995.
+
+Shapes: N samples of k rows, c coefficients of a hypothesis, p columns of the linear model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from .. import se3
+from .._kernels import apply_observation_matrix
+from .._typing import Array
+from ..estimation.error_model import ErrorModel
+from ..estimation.initialization import make_problem
+from ..estimation.uncertainty import Uncertainty
+from ..exceptions import InvalidArgumentError
+from ..formatting import format_quantity
+from ..measurements.base import Measurement, Noise
+from ..robot.chain import Chain
+from ..robot.conditions import Conditions
+from .causes import Block, Cause, Constant
+from .facts import cause_size
+from .linear_model import Layout, whitened_rows
+from .robot_changes import RobotChanges
+from .search import can_have_session
+from .timeline import order_samples
+
+# Largest share of unchanged robots that are called changed.
+MAX_FALSE_ALARMS = 0.005
+# Number of sets of residuals that are drawn to find the limit of the evidence.
+N_DRAWS = 2000
+# Smallest share of the evidence with which a change is named.
+MIN_SHARE = 0.75
+# Share of the evidence from which a change that has the same effect is named, too.
+MIN_RIVAL_SHARE = 0.02
+# Widths of the prior of a change, as displacements of the tool [m].
+WIDTHS = 10.0 ** np.arange(-4.0, 0.0, 0.5)
+# Factors to the assumed standard deviations of the measurements if these are not known.
+NOISE_FACTORS = 10.0 ** np.arange(-3.0, 1.25, 0.25)
+# Prior probability of a hypothesis relative to that of one joint; samples share that of one hypothesis.
+ROBOT_PRIOR = 0.3
+# Displacement per unit of a direction that the calibration did not determine [m or rad].
+UNDETERMINED_SIZE = 10.0
+# Fewest samples; three positions determine the pose of the base.
+MIN_SAMPLES = 4
+# Largest number of rows; a check needs few, and their covariance is a full matrix.
+MAX_ROWS = 600
+# A change is revealed if it is this many times its standard deviation.
+REVEALED_RATIO = 5.0
+# Displacement of the tool that a check must reveal [m].
+DEFAULT_SIZE = 1e-3
+# Largest share of the effect of a change that others leave if they have the same effect.
+MAX_UNEXPLAINED = 1e-6
+# Change of a joint that must have this effect, in standard deviations, to count as visible [rad or m].
+LARGEST_CHANGE, MIN_EFFECT = 0.1, 5.0
+MAX_ITERATIONS = 6
+# Step below which a linearization is kept, as a displacement of the tool [m].
+STEP_TOL = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Something that may have changed, with what the measurements say of it.
+
+    Attributes:
+        kind: "joint", "base", "tool", "robot" or "sample".
+        of: Name of the joint, or place of the sample; else empty.
+        share: Share of its evidence in that of all changes.
+        size: Size of the change, signed for a joint, in `unit`; 0 for a robot or a sample.
+        std: Standard deviation of the size.
+        unit: "m" or "rad".
+        revealed: Smallest displacement of the tool by this change that the check reveals [m].
+        imitators: Names of other hypotheses that have every effect of this one.
+    """
+
+    kind: str
+    of: str
+    share: float
+    size: float
+    std: float
+    unit: str
+    revealed: float
+    imitators: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What changed, such as "joint elbow_joint"."""
+        return f"{self.kind} {self.of}".strip()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the hypothesis for a JSON document."""
+        return {key: getattr(self, key) for key in ("kind", "of", "size", "std", "unit", "share")}
+
+
+@dataclass(frozen=True, eq=False)
+class Recheck:
+    """Answer to the question whether a robot is still calibrated.
+
+    Attributes:
+        verdict: "ok", "changed" or "cannot say".
+        reasons: Sentences on it.
+        changes: What changed; several if the measurements cannot tell them apart. Empty unless `changed`.
+        hypotheses: All hypotheses, the most likely one first.
+        log_ratio: Logarithm of the ratio of the likelihoods with and without a change, less its limit.
+        samples: Number of samples.
+        residual_rms: RMS distance of the measured positions from those of the robot [m].
+        expected_rms: RMS distance that noise and uncertainty of the calibration explain [m]; NaN if the noise
+            is not known.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    changes: tuple[Hypothesis, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    log_ratio: float
+    samples: int
+    residual_rms: float
+    expected_rms: float
+
+    @property
+    def what(self) -> str:
+        """What changed, such as "joint elbow_joint" or "joint shoulder_joint or base"."""
+        return " or ".join(each.name for each in self.changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the answer for a JSON document."""
+        first = self.changes[0] if self.changes else None
+        return {
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "what": self.what,
+            "size": first and first.size,
+            "std": first and first.std,
+            "unit": first and first.unit,
+            "changes": [each.to_dict() for each in self.changes],
+            "hypotheses": [each.to_dict() for each in self.hypotheses],
+            "log_ratio": self.log_ratio,
+            "samples": self.samples,
+            "residual_rms_m": self.residual_rms,
+            "expected_rms_m": None if np.isnan(self.expected_rms) else self.expected_rms,
+        }
+
+
+def recheck(
+    chain: Chain,
+    data: Sequence[Measurement],
+    uncertainty: Uncertainty | None = None,
+    *,
+    known: Mapping[str, float] | None = None,
+    noise: Noise | None = None,
+    size: float = DEFAULT_SIZE,
+) -> Recheck:
+    """Check whether a robot is still calibrated.
+
+    Args:
+        chain: Calibrated robot, with its base and tool.
+        data: Positions or poses of the tool, five to ten samples.
+        uncertainty: Uncertainty of the calibration; None for an exact one.
+        known: Values of instrument parameters [m or rad].
+        noise: Standard deviations of instrument and robot together [m, rad]; None for those of the
+            measurements, which are estimated if they state none.
+        size: Displacement of the tool that the check must be able to reveal [m].
+
+    Returns:
+        Verdict, what changed and by how much.
+
+    Raises:
+        InvalidArgumentError: The measurements are not positions or poses, or too many.
+    """
+    if not can_have_session(data):
+        kinds = ", ".join(dict.fromkeys(item.kind for item in data))
+        raise InvalidArgumentError(
+            f"recheck: the measurements are of the kind {kinds}; expected position or pose"
+        )
+    n_rows = sum(item.residual_dim * len(item.rows) for item in data)
+    if n_rows > MAX_ROWS:
+        raise InvalidArgumentError(
+            f"recheck: {n_rows} measured values; expected at most {MAX_ROWS}: five to ten poses suffice, and "
+            "more are worth a calibration"
+        )
+    if noise is not None:
+        data = [_with_noise(item, noise) for item in data]
+    model = _CheckModel(chain, tuple(data), uncertainty, known or {})
+    return _answer(model, *model.judged(), size)
+
+
+def _with_noise(item: Measurement, noise: Noise) -> Measurement:
+    """Return a measurement with other standard deviations."""
+    values = {"sigma": np.full_like(item.sigma, noise.position), "has_stated_sigma": True}
+    if hasattr(item, "rotation_sigma"):
+        values["rotation_sigma"] = np.full_like(item.sigma, noise.rotation)
+    return item.replace(**values)
+
+
+class _CheckModel:
+    """Whitened model of a few measurements of a calibrated robot."""
+
+    def __init__(
+        self,
+        chain: Chain,
+        data: tuple[Measurement, ...],
+        uncertainty: Uncertainty | None,
+        known: Mapping[str, float],
+    ):
+        """Linearize the model at the calibrated robot."""
+        self.chain, self.data = chain, data
+        self.problem = make_problem(ErrorModel(chain, ()), data, np.zeros(0), known)
+        self.layout = Layout.of(self.problem)
+        self.x = np.zeros(len(self.problem.instrument_parameters))
+        width = max(item.residual_dim for item in data)
+        counts = [(len(item.rows), item.residual_dim) for item in data]
+        self.is_row = np.concatenate([np.tile(np.arange(width) < dim, (m, 1)) for m, dim in counts]).ravel()
+        self.numbers = np.repeat(np.arange(len(self.is_row) // width), width)[self.is_row]
+        self.noise_factors = np.ones(1) if all(i.has_stated_sigma for i in data) else NOISE_FACTORS
+        root = self._root(uncertainty)
+        # Coordinates in which the covariance is diagonal for every noise.
+        values, self.axes = np.linalg.eigh(root @ root.T)
+        self.variances = np.maximum(values, 0.0)[None] + self.noise_factors[:, None] ** 2
+
+    @cached_property
+    def rows(self) -> Array:
+        """Whitened rows at the calibrated robot, (n, p)."""
+        return self._linearize(np.zeros(self.layout.n_columns))
+
+    def _linearize(self, changes: Array) -> Array:
+        """Return the whitened rows with the changes (p,) of some columns, (n, p)."""
+        data = [self._changed(item, changes) for item in self.data]
+        rates = np.zeros((len(set(self.numbers.tolist())), self.chain.n_joints))
+        rows = whitened_rows(self.layout, self.x, data, rates)
+        return rows.reshape(-1, rows.shape[-1])[self.is_row]
+
+    def _changed(self, item: Measurement, changes: Array) -> Measurement:
+        """Return samples whose conditions contain changes."""
+        base, tool = (se3.exp6(changes[self._block(kind).columns]) for kind in ("base", "tool"))
+        base = self.chain.base @ base @ se3.inverse(self.chain.base)
+        m = len(item.rows)
+        known = item.recorded or Conditions(item.q)
+        return item.replace(
+            recorded=replace(
+                known,
+                base_motion=np.tile(base, (m, 1, 1)),
+                tool_motion=np.tile(tool, (m, 1, 1)),
+                zeros=np.tile(changes[self.layout.joints], (m, 1)),
+            )
+        )
+
+    def _block(self, kind: str) -> Block:
+        """Return the block of base or tool."""
+        return next(block for block in self.layout.blocks if block.kind == kind)
+
+    def _root(self, uncertainty: Uncertainty | None) -> Array:
+        """Return the root of the whitened covariance that the calibration leaves, (n, ·)."""
+        if uncertainty is None:
+            return np.zeros((self.is_row.sum(), 1))
+        directions = np.concatenate(
+            [uncertainty.sqrt_covariance, UNDETERMINED_SIZE * uncertainty.unbounded_directions], 1
+        )
+        model_std = np.diag(np.repeat(uncertainty.model_std, 3))
+        values, shared, own = self.problem.instruments(self.x), [], []
+        for item in self.data:
+            frames, m = self.chain.forward_kinematics(item.conditions()), len(item.rows)
+            u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
+            observation = item.observation_matrix(frames, u, item.residual(frames, u))
+
+            def whitened(motions: Array, item=item, observation=observation) -> Array:
+                out = np.zeros((len(motions), item.residual_dim, motions.shape[2]))
+                apply_observation_matrix(np.ascontiguousarray(motions), observation, out)
+                return out.transpose(2, 1, 0)
+
+            motions = uncertainty.tool_twists(frames, directions).transpose(2, 1, 0)
+            shared.append(whitened(motions).reshape(-1, len(motions)))
+            # Errors that the model lacks differ from sample to sample.
+            own += list(whitened(np.tile(model_std[..., None], m)))
+        return np.hstack([np.concatenate(shared), block_diag(*own)])
+
+    # ------------------------------------------------------------------------------------------- hypotheses
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Blocks of columns that may change together, without those whose changes do not show."""
+        found = [b for b in self.layout.blocks if b.kind in ("joint", "base", "tool")]
+        effects = np.linalg.norm(self._scaled(self.rows, self.usual_noise), axis=0) * LARGEST_CHANGE
+        seen = [replace(b, sizes=np.where(effects[b.columns] > MIN_EFFECT, b.sizes, 0.0)) for b in found]
+        seen = [b for b in seen if b.sizes.any()]
+        columns, sizes = (np.concatenate([getattr(b, key) for b in seen]) for key in ("columns", "sizes"))
+        return [*seen, Block("robot", "", 0, columns, sizes)]
+
+    @property
+    def hidden_joints(self) -> list[str]:
+        """Joints whose zeros do not move what is measured."""
+        seen = {block.of for block in self.blocks}
+        return [name for name in self.chain.joint_names if name not in seen]
+
+    @property
+    def usual_noise(self) -> int:
+        """Index of the stated noise, or of the middle of the noises that are possible."""
+        return len(self.noise_factors) // 2
+
+    @cached_property
+    def likely_noise(self) -> int:
+        """Index of the most likely noise without a change."""
+        return int(self.null_likelihoods(self.scaled_sets(self.rows[:, -1:]))[:, 0].argmax())
+
+    def _scaled(self, rows: Array, factor: int) -> Array:
+        """Return rows in coordinates of unit variance for one of the noises."""
+        return (self.axes.T @ rows) / np.sqrt(self.variances[factor])[:, None]
+
+    def scaled_sets(self, residuals: Array) -> list[Array]:
+        """Return d residuals (n, d) in coordinates of unit variance for each noise."""
+        turned = self.axes.T @ residuals
+        return [turned / np.sqrt(each)[:, None] for each in self.variances]
+
+    def log_likelihoods(self, columns: Array, sets: Sequence[Array]) -> Array:
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
+        square, nothing = WIDTHS[:, None] ** 2, self.null_likelihoods(sets)
+        out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
+        for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):
+            values, vectors = np.linalg.eigh(a.T @ a)
+            values = np.maximum(values, 0.0)
+            along = (vectors.T @ a.T) @ r
+            gain = square / (1 + square * values)
+            out[i] = nothing[i] + 0.5 * (gain @ along**2 - np.sum(np.log1p(square * values), 1)[:, None])
+        return out
+
+    def null_likelihoods(self, sets: Sequence[Array]) -> Array:
+        """Return the logarithm of the likelihood of d scaled residuals without a change, (σ, d)."""
+        logs = np.sum(np.log(self.variances), 1)
+        return np.array([-0.5 * (np.sum(r**2, 0) + log) for r, log in zip(sets, logs, strict=True)])
+
+    def limit(self, columns: Sequence[Array], log_priors: Array) -> float:
+        """Return the ratio for any change that `MAX_FALSE_ALARMS` of unchanged robots exceed."""
+        draws = np.random.default_rng(0).standard_normal((len(self.numbers), N_DRAWS))
+        sets = [draws * np.sqrt(self.variances[self.likely_noise] / each)[:, None] for each in self.variances]
+        nothing = _log_means(self.null_likelihoods(sets)[:, None])
+        ratios = np.array([_log_means(self.log_likelihoods(each, sets)) - nothing for each in columns])
+        return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
+
+    def estimate(self, block: Block) -> tuple[Array, Array, Array]:
+        """Estimate a change; return its coefficients, and columns and residual linearized there."""
+        changes = np.zeros(self.layout.n_columns)
+        rows, sizes = self.rows, block.sizes
+        for _ in range(MAX_ITERATIONS):
+            scaled = self._scaled(rows, self.usual_noise)
+            a = scaled[:, block.columns] * sizes
+            prior = np.eye(len(sizes)) / WIDTHS[-1] ** 2
+            held = np.divide(changes[block.columns], sizes, out=np.zeros(len(sizes)), where=sizes > 0)
+            step = np.linalg.solve(a.T @ a + prior, a.T @ scaled[:, -1] - prior @ held)
+            changes = self._advanced(changes, block, step * sizes)
+            rows = self._linearize(changes)
+            if np.abs(step).max() < STEP_TOL:
+                break
+        values = changes[block.columns]
+        columns = rows[:, block.columns]
+        return values, columns * sizes, rows[:, -1] + columns @ values
+
+    def _advanced(self, changes: Array, block: Block, step: Array) -> Array:
+        """Return the changes after a step (c,) of a block."""
+        full = np.zeros_like(changes)
+        full[block.columns] = step
+        out = changes + full
+        for kind in ("base", "tool"):
+            own = self._block(kind).columns
+            out[own] = se3.log6(se3.exp6(changes[own]) @ se3.exp6(full[own]))
+        return out
+
+    def judged(self) -> tuple[list[Hypothesis], float, float]:
+        """Return all hypotheses, the most likely one first, the log ratio for any change, and its limit."""
+        blocks, count = self.blocks, self.numbers[-1] + 1
+        estimates = [self.estimate(block) for block in blocks]
+        samples = [np.eye(len(self.numbers))[:, self.numbers == i] / self._sigma[i] for i in range(count)]
+        priors = [ROBOT_PRIOR if block.kind == "robot" else 1.0 for block in blocks] + [1 / count] * count
+        log_priors = np.log(np.array(priors) / np.sum(priors))
+        residual = self.scaled_sets(self.rows[:, -1:])
+        likelihoods = [
+            *(
+                self.log_likelihoods(columns, self.scaled_sets(undone[:, None]))
+                for _, columns, undone in estimates
+            ),
+            *(self.log_likelihoods(columns, residual) for columns in samples),
+        ]
+        nothing = _log_means(self.null_likelihoods(residual)[:, None])
+        ratios = np.array([_log_means(each) - nothing for each in likelihoods])[:, 0]
+        total = float(_log_sums((ratios + log_priors)[:, None])[0])
+        shares = np.exp(ratios + log_priors - total)
+        places = [(item.source, int(row)) for item in self.data for row in item.rows]
+        hypotheses = [
+            self._hypothesis(block, values, each, float(share))
+            for block, (values, *_), each, share in zip(blocks, estimates, likelihoods, shares, strict=False)
+        ]
+        for (file, line), share in zip(places, shares[len(blocks) :], strict=True):
+            place = f"in line {line} of {file}" if file else f"{line}"
+            hypotheses.append(Hypothesis("sample", place, float(share), 0.0, 0.0, "m", 0.0))
+        columns = [*(self.rows[:, block.columns] * block.sizes for block in blocks), *samples]
+        limit = self.limit(columns, log_priors)
+        return sorted(hypotheses, key=lambda each: -each.share), total, limit
+
+    def position_rms(self) -> tuple[float, float]:
+        """Return the RMS distance of the measured positions from the robot's, and what is expected [m]."""
+        width = len(self.is_row) // (self.numbers[-1] + 1)
+        is_position = (np.arange(len(self.is_row)) % width < 3)[self.is_row]
+        sigma = np.concatenate([np.asarray(item.sigma).ravel() for item in self.data])
+        residual = self.rows[is_position, -1] * sigma
+        variances = np.einsum("ij,j,ij->i", self.axes, self.variances[0], self.axes)[is_position] * sigma**2
+        count = self.numbers[-1] + 1
+        expected = np.sqrt(variances.sum() / count) if len(self.noise_factors) == 1 else np.nan
+        return float(np.sqrt(np.sum(residual**2) / count)), float(expected)
+
+    @cached_property
+    def _sigma(self) -> Array:
+        """Standard deviation of the position of each sample, (N,) [m]."""
+        return np.concatenate([item.sigma.mean(1) for item in self.data])
+
+    def _hypothesis(self, block: Block, values: Array, likelihoods: Array, share: float) -> Hypothesis:
+        """Describe a change."""
+        best = int(likelihoods.max((1, 2)).argmax())
+        used = np.flatnonzero(block.sizes)
+        a = self._scaled(self.rows[:, block.columns[used]] * block.sizes[used], best)
+        unit_covariance = np.linalg.pinv(a.T @ a, rcond=1e-12, hermitian=True)
+        covariance = np.zeros((len(block.sizes),) * 2)
+        covariance[np.ix_(used, used)] = unit_covariance * np.outer(block.sizes[used], block.sizes[used])
+        size, std, unit = 0.0, 0.0, "m"
+        if block.kind != "robot":
+            cause = Cause(block, Constant(), values, covariance)
+            size, std, unit = cause_size(cause, RobotChanges(), self.chain, order_samples(self.data, ()))
+            if block.kind == "joint":
+                size = float(values[0])
+        imitators = [f"{b.kind} {b.of}".strip() for b in self.blocks if self._has_effects_of(b, block)]
+        revealed = self._revealed(block, covariance)
+        return Hypothesis(block.kind, block.of, share, size, std, unit, revealed, tuple(imitators))
+
+    def _has_effects_of(self, block: Block, other: Block) -> bool:
+        """Return whether a change has all effects of another one."""
+        if "robot" in (block.kind, other.kind) or block.columns[0] == other.columns[0]:
+            return False
+        a, b = (self._scaled(self.rows[:, each.columns] * each.sizes, 0) for each in (block, other))
+        left = b - a @ np.linalg.lstsq(a, b, rcond=1e-9)[0]
+        return bool(np.sum(left**2) < MAX_UNEXPLAINED * np.sum(b**2))
+
+    def _revealed(self, block: Block, covariance: Array) -> float:
+        """Return the displacement of the tool by a change in its worst direction that is revealed [m]."""
+        frames = self.chain.forward_kinematics(np.concatenate([item.q for item in self.data]))
+        chain, bodies, twists = self.layout.problem.errors.derivative(
+            np.zeros(len(self.layout.problem.errors.parameters))
+        )
+        full = np.zeros((self.layout.n_columns, 3, frames.tool.shape[-1]))
+        full[: len(bodies)] = chain.tool_jacobian(frames, bodies, twists)[:, :3]
+        full[self.layout.joints] = chain.joint_jacobian(frames, None)[:, :3]
+        effects = full[block.columns].reshape(len(block.columns), -1).T / np.sqrt(full.shape[2])
+        r = np.linalg.qr(effects, mode="r")
+        return REVEALED_RATIO * float(np.sqrt(max(np.linalg.eigvalsh(r @ covariance @ r.T).max(), 0.0)))
+
+
+def _log_sums(values: Array) -> Array:
+    """Return the logarithms of the sums of exponentials over the first axis."""
+    largest = values.max(0)
+    return np.log(np.sum(np.exp(values - largest), 0)) + largest
+
+
+def _log_means(values: Array) -> Array:
+    """Return the logarithms of the means of exponentials over the first two axes, (d,)."""
+    flat = values.reshape(-1, values.shape[-1])
+    return _log_sums(flat) - np.log(len(flat))
+
+
+def _answer(
+    model: _CheckModel, hypotheses: list[Hypothesis], total: float, limit: float, size: float
+) -> Recheck:
+    """Decide, and say why."""
+    changes: tuple[Hypothesis, ...] = ()
+    best = hypotheses[0]
+    group = [
+        best,
+        *(h for h in hypotheses if h.name in best.imitators),
+        *(h for h in hypotheses if best.name in h.imitators and h.share > MIN_RIVAL_SHARE),
+    ]
+    n_samples = int(model.numbers[-1]) + 1
+    if n_samples < MIN_SAMPLES:
+        verdict, reasons = (
+            "cannot say",
+            [f"{n_samples} samples are too few; expected at least {MIN_SAMPLES}."],
+        )
+    elif total <= limit:
+        verdict, reasons = _unchanged(hypotheses, size, model.hidden_joints)
+    elif best.kind == "sample":
+        verdict = "cannot say"
+        reasons = [f"The sample {best.of} does not fit to the others; measure it again."]
+    elif sum(each.share for each in group) < MIN_SHARE:
+        verdict = "cannot say"
+        rivals = ", ".join(f"{each.name} ({100 * each.share:.0f} %)" for each in hypotheses[:3])
+        reasons = [
+            f"Something changed, and these samples cannot tell what: {rivals}. Measure more poses, as `dhcal "
+            "plan --recheck` chooses them."
+        ]
+    else:
+        verdict, changes = "changed", tuple(group)
+        reasons = [_sentence(group)]
+    residual, expected = model.position_rms()
+    return Recheck(
+        verdict, tuple(reasons), changes, tuple(hypotheses), total - limit, n_samples, residual, expected
+    )
+
+
+def _unchanged(hypotheses: list[Hypothesis], size: float, hidden_joints: list[str]) -> tuple[str, list[str]]:
+    """Return the verdict if nothing is known to have changed: `ok` if the check reveals what matters."""
+    known = [each for each in hypotheses if each.kind in ("joint", "base", "tool")]
+    hidden = sorted((each for each in known if each.revealed > size), key=lambda each: -each.revealed)
+    if hidden:
+        worst = hidden[0]
+        return "cannot say", [
+            f"A change of {worst.name} would be revealed from {1e3 * worst.revealed:.2g} mm at the tool on; "
+            f"expected {1e3 * size:.2g} mm: measure more poses, as `dhcal plan --recheck` chooses them, or "
+            "more accurately."
+        ]
+    largest = max((each.revealed for each in known), default=0.0)
+    moved = format_quantity(largest, "m", largest / 10)
+    reasons = [f"Nothing changed that moves the measured point by more than {moved}."]
+    if hidden_joints:
+        reasons.append(f"Zeros of {', '.join(hidden_joints)} do not move it; measure a point off their axes.")
+    return "ok", reasons
+
+
+def _sentence(group: list[Hypothesis]) -> str:
+    """Say what changed."""
+    best, *others = group
+    if best.kind == "robot":
+        return "More than one part of the robot changed: calibrate again."
+    size = format_quantity(abs(best.size), best.unit, best.std, small=best.unit == "m")
+    verb = "turned" if best.unit == "rad" else "moved"
+    what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {best.kind} {verb}"
+    rivals = " or ".join(each.name for each in others)
+    return f"{what} by {size}." + (f" The same effect has a change of {rivals}." if rivals else "")

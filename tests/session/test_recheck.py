@@ -1,0 +1,183 @@
+"""Checks of calibrated arms, simulated with Pinocchio and NumPy only, against the change that was made."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
+
+from dhcal_pin import Result, calibrate
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import InvalidArgumentError
+from dhcal_pin.io import measurement_text, write_urdf
+from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
+from dhcal_pin.planning import change_options, plan
+from dhcal_pin.session import Recheck, recheck
+
+STILL = pin.SE3.Identity()
+LENGTH, ANGLE = 5e-4, np.deg2rad(0.05)
+CHANGES = ("nothing", "joint", "base", "tool")
+
+
+def measured(
+    sim: Simulation,
+    q: np.ndarray,
+    kind: type[Measurement],
+    is_stated: bool,
+    *,
+    base=STILL,
+    tool=STILL,
+    zeros=0.0,
+) -> Measurement:
+    """Measure an arm after changes of base, tool and joint zeros."""
+    poses = [sim.base * base * arm * sim.tool * tool for arm in sim.poses(q + zeros)]
+    positions = np.array([pose.translation for pose in poses]) + sim.rng.normal(0, NOISE, (len(q), 3))
+    if kind is Position:
+        return Position(q, positions, NOISE if is_stated else None)
+    turned = [pose.rotation @ pin.exp3(sim.rng.normal(0, ANGLE_NOISE, 3)) for pose in poses]
+    matrices = np.array([pin.SE3(r, p).homogeneous for r, p in zip(turned, positions, strict=True)])
+    return Pose(q, matrices, *((NOISE, ANGLE_NOISE) if is_stated else (None, None)))
+
+
+@cache
+def calibrated(arm: str, seed: int, kind: type[Measurement]) -> tuple[Simulation, Result, np.ndarray]:
+    """Return an arm, its calibration, and ten poses that are chosen for a check."""
+    sim = Simulation(arm, 60, seed)
+    fit = calibrate(sim.chain, measured(sim, sim.q, kind, True), extend="none", session="off")
+    noise = Noise(NOISE, ANGLE_NOISE)
+    options = change_options(fit.chain)
+    q = plan(fit.chain, 10, kind=kind.kind, noise=noise, candidates=300, **options).q
+    return sim, fit, q
+
+
+def changed(sim: Simulation, what: str) -> tuple[dict, str]:
+    """Draw a change; return it and its name."""
+    if what in ("base", "tool"):
+        return {what: pin.SE3(np.eye(3), LENGTH * sim.direction())}, what
+    joint = int(sim.rng.integers(sim.chain.n_joints))
+    zeros = np.zeros(sim.chain.n_joints)
+    if what == "joint":
+        zeros[joint] = ANGLE * sim.rng.choice([-1, 1])
+    return {"zeros": zeros}, sim.chain.joint_names[joint] if what == "joint" else ""
+
+
+def is_right(result: Recheck, name: str) -> bool:
+    """Return whether the answer is the change, alone or with another one that has the same effect."""
+    if not name:
+        return result.verdict == "ok"
+    return result.verdict == "changed" and name in [each.of or each.kind for each in result.changes]
+
+
+def shares(arms, seeds, kind: type[Measurement], is_stated: bool) -> dict[str, float]:
+    """Return the share of right answers by what changed."""
+    right, count = Counter(), 0
+    for arm, seed in product(arms, seeds):
+        sim, fit, q = calibrated(arm, seed, kind)
+        count += 1
+        for what in CHANGES:
+            keywords, name = changed(sim, what)
+            data = measured(sim, q, kind, is_stated, **keywords)
+            right[what] += is_right(recheck(fit.chain, [data], fit.uncertainty), name)
+    return {what: right[what] / count for what in CHANGES}
+
+
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_changes_are_named(kind):
+    found = shares(["ur10"], range(2), kind, True)
+    assert sum(found.values()) >= 3.5, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_stated", [True, False], ids=["stated", "estimated"])
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_changes_are_named_in_many_arms(kind, is_stated):
+    found = shares(["ur10", "ur5", "panda", "xarm7"], range(50, 63), kind, is_stated)
+    assert found["nothing"] >= 0.98, found
+    assert np.mean([found[what] for what in CHANGES[1:]]) >= 0.9, found
+
+
+def test_large_changes_have_the_right_size():
+    sim, fit, q = calibrated("ur10", 7, Position)
+    zeros = np.zeros(6)
+    zeros[2] = np.deg2rad(3.0)
+    result = recheck(fit.chain, [measured(sim, q, Position, True, zeros=zeros)], fit.uncertainty)
+    first = result.changes[0]
+    assert first.of == sim.chain.joint_names[2]
+    assert abs(first.size - zeros[2]) < 4 * first.std + 1e-6
+    assert first.std < 1e-4
+    moved = pin.SE3(np.eye(3), np.array([0.03, -0.04, 0.0]))
+    result = recheck(fit.chain, [measured(sim, q, Position, True, base=moved)], fit.uncertainty)
+    first = result.changes[0]
+    assert first.kind == "base"
+    assert abs(first.size - 0.05) < 4 * first.std + 1e-5
+
+
+def test_a_turn_about_the_first_axis_names_joint_and_base():
+    sim, fit, q = calibrated("ur10", 7, Position)
+    zeros = np.zeros(6)
+    zeros[0] = ANGLE
+    result = recheck(fit.chain, [measured(sim, q, Position, True, zeros=zeros)], fit.uncertainty)
+    assert [each.of or each.kind for each in result.changes] == [sim.chain.joint_names[0], "base"]
+
+
+def test_it_cannot_say():
+    sim, fit, q = calibrated("ur10", 7, Position)
+    few = recheck(fit.chain, [measured(sim, q[:3], Position, True)], fit.uncertainty)
+    assert (few.verdict, few.changes) == ("cannot say", ())
+    data = measured(sim, q, Position, True)
+    data.positions()[4] += [0.003, 0.0, 0.0]
+    wrong = recheck(fit.chain, [data], fit.uncertainty)
+    assert wrong.verdict == "cannot say"
+    assert "measure it again" in wrong.reasons[0]
+    assert (wrong.hypotheses[0].kind, wrong.hypotheses[0].of) == ("sample", "5")
+    good = measured(sim, q, Position, True)
+    noisy = recheck(fit.chain, [good], fit.uncertainty, noise=Noise(2e-3))
+    assert noisy.verdict == "cannot say"
+    assert "would be revealed" in noisy.reasons[0]
+    with pytest.raises(InvalidArgumentError, match="expected position or pose"):
+        recheck(fit.chain, [Inclination.simulate(fit.chain, q, Noise(0, 1e-4), sim.rng)], fit.uncertainty)
+
+
+def test_command(tmp_path: Path, capsys):
+    sim, fit, q = calibrated("ur10", 7, Position)
+    robot, history = tmp_path / "cal.urdf", tmp_path / "h.jsonl"
+    write_urdf(fit, robot)
+    zeros = np.zeros(6)
+    for name, status in (("ok", 0), ("changed", 1)):
+        data = tmp_path / f"{name}.csv"
+        data.write_text(measurement_text(measured(sim, q, Position, True, zeros=zeros), fit.chain, []))
+        args = ["recheck", str(robot), str(data), "--tip", "tool0", "--history", str(history)]
+        assert main([*args, "--plot", str(tmp_path / "h.html"), "--json", "-"]) == status
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["verdict"] == name
+        zeros[3] = 0.002
+    lines = [json.loads(line) for line in history.read_text().splitlines()]
+    assert [line["verdict"] for line in lines] == ["ok", "changed"]
+    assert lines[1]["what"] == "joint wrist_1_joint"
+    assert abs(lines[1]["size"] - 0.002) < 4 * lines[1]["std"]
+    assert "joint wrist_1_joint" in (tmp_path / "h.html").read_text()
+    history.write_text(history.read_text() + "{}\n")
+    before = history.read_text()
+    assert main(args) == 2
+    assert f"{history}:3: time is missing" in capsys.readouterr().err
+    assert history.read_text() == before
+    (tmp_path / "cal.calibration.toml").unlink()
+    assert main(args) == 2
+    assert "no sidecar" in capsys.readouterr().err
+
+
+def test_hidden_joints_are_named():
+    """The measured point is on the last axis of this arm."""
+    chain = nominal_arm("ur10")
+    q = np.random.default_rng(0).uniform(-2, 2, (10, 6))
+    data = Position(q, chain.poses(q)[:, :3, 3], NOISE)
+    result = recheck(chain, [data])
+    assert result.verdict == "ok"
+    assert "Zeros of wrist_3_joint do not move it" in result.reasons[1]
