@@ -25,6 +25,9 @@ VIEWPORT = {"width": 700, "height": 400}
 SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"
 CLICK = "it.click()"
 READY = "window.dhcal && window.dhcal.ready === true"
+# Ten frames per second are enough, and without a graphics card each one takes processor time.
+FEW_FRAMES = """requestAnimationFrame = draw => setTimeout(() => draw(performance.now()), 100);
+cancelAnimationFrame = clearTimeout;"""
 
 # Draws the scene now and looks at its pixels: how many have each layer's colour, and a fingerprint.
 LOOK = """() => {
@@ -96,6 +99,7 @@ class Window:
 def window_of(browser: Any) -> Iterator[Window]:
     """A page that must stay silent and ask no host for anything."""
     page = browser.new_page(viewport=VIEWPORT)
+    page.add_init_script(FEW_FRAMES)
     out = Window(page, [], [])
     page.on("console", lambda message: out.complaints.append(message.text))
     page.on("pageerror", lambda error: out.complaints.append(str(error)))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from rig_files import draw_views
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
@@ -34,8 +35,12 @@ RIGS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("options", [(), ("--world-joint",)])
-@pytest.mark.parametrize("link", ["tip", "world"])
+@pytest.mark.parametrize(
+    ("link", "options"),
+    some_slow(
+        [("tip", ()), ("world", ("--world-joint",)), ("tip", ("--world-joint",)), ("world", ())], {0, 1}
+    ),
+)
 def test_frames_are_where_the_images_were_taken(run, robot_folder, link, options):
     """The link in the URDF and the transform of easy_handeye give the true pose in the measuring frame."""
     dh.write_urdf(replace(dh.read_robot("example:ur10", tip="tool0"), base=BASE, tool=TOOL), "moved.urdf")
