@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 import dhcal_pin
+from dhcal_pin.cli.main import COMMANDS
 from dhcal_pin.measurements import KINDS
 
 PACKAGE = Path(dhcal_pin.__file__).parent
@@ -168,7 +169,8 @@ def test_kinds_of_measurements_state_what_they_can():
 @pytest.mark.parametrize("folder", [PACKAGE, *PACKAGES], ids=lambda folder: folder.name)
 def test_packages_are_small_and_say_what_belongs_there(folder):
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
-    assert len(modules) <= 16
+    # One module per command, as the table of commands lists them.
+    assert len(modules) <= (len(COMMANDS) if folder.name == "commands" else 16)
     assert len(ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or "") > 60
 
 

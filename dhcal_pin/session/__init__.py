@@ -1,7 +1,7 @@
 """What happened during a session: events, drift, lag and scale, found from the order of the samples."""
 
+from .check import Recheck, recheck
 from .facts import History, Session, histories
-from .recheck import Recheck, recheck
 from .scale import find_scale
 from .search import can_have_session, find_session
 
