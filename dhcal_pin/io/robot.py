@@ -282,7 +282,7 @@ def _with_template(
     data, urdf = with_written_origins(nominal, joint_origins(filled)[0], target)
     parsed = Chain.from_urdf(urdf, filled.tip)
     q = _random_positions(len(robot.moving_joints))
-    ideal = replace(robot, base=np.eye(4), tool=np.eye(4), transmission=None)
+    ideal = replace(robot, base=np.eye(4), tool=np.eye(4))
     difference = np.abs(without_mimics(parsed).poses(q) - without_mimics(ideal).poses(q)).max()
     if not difference <= TEMPLATE_TOL:
         raise InvalidArgumentError(
