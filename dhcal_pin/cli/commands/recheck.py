@@ -35,7 +35,7 @@ def _history_content(done: Checked, path: str) -> str:
 
 
 def _plot_content(done: Checked, path: str) -> str:
-    from ...report.check_history import history_page  # lazy import: only for pages
+    from ...report.changes import history_page  # lazy import: only for pages
 
     return history_page(done.robot, done.checks)
 

@@ -15,7 +15,7 @@ from ...formatting import Quantity, Table
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
-from ...report.difference import difference_table
+from ...report.changes import difference_table
 from ...report.provenance import short_names
 from .screen import Block, Screen, list_first
 

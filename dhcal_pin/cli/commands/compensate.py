@@ -8,15 +8,15 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ....exceptions import InvalidArgumentError
-from ...options import ROBOT, add_motion_options, add_urdf_options
+from ...exceptions import InvalidArgumentError
+from ..options import ROBOT, add_motion_options, add_urdf_options
 
 if TYPE_CHECKING:
-    from ...._typing import Array
-    from ....compensation import Compensation
-    from ....io import TargetPoses
-    from ....programs import Program
-    from ....robot import Chain
+    from ..._typing import Array
+    from ...compensation import Compensation
+    from ...io import TargetPoses
+    from ...programs import Program
+    from ...robot import Chain
 
 EXAMPLE = "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv"
 
@@ -63,12 +63,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Correct targets, write them, and show which could not be reached."""
-    from ....compensation import compensate  # lazy import, as the following: they load Pinocchio
-    from ....io import read_targets
-    from ....programs import program_text, require_program_ending
-    from ...outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from ...screens import console
-    from ...screens.result_screens import compensation_screen
+    from ...compensation import compensate  # lazy import, as the following: they load Pinocchio
+    from ...io import read_targets
+    from ...programs import program_text, require_program_ending
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import compensation_screen
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
@@ -106,9 +106,9 @@ def read_robots(args: Namespace) -> tuple[Chain, Chain]:
 
     import numpy as np
 
-    from ....io import read_robot
-    from ....io.robot import has_dh_table
-    from ....io.sidecar import read_tool
+    from ...io import read_robot
+    from ...io.robot import has_dh_table
+    from ...io.sidecar import read_tool
 
     nominal, calibrated = (
         read_robot(
@@ -150,7 +150,7 @@ def _tool_text(args: Namespace, chain: Chain) -> str:
 
 def _frame_hint(args: Namespace, result: Compensation) -> str:
     """Suggest --frame measuring if most targets are not reached, and the sidecar says where the base is."""
-    from ....io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
+    from ...io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
 
     if args.frame != BASE or result.reached.mean() >= 0.5 or not existing_sidecar(args.calibrated):
         return ""
@@ -165,7 +165,7 @@ def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, ca
     are not in the calibrated one. A number is computed if it has at least 15 significant digits and is not a
     multiple of 15 degrees: a calibration writes all digits, and people do not.
     """
-    from ....io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
+    from ...io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
 
     has_sidecar = [existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
     if has_sidecar == [True, False]:
@@ -204,7 +204,7 @@ def _program(result: Compensation, nominal: Chain) -> Program:
     """Create the program that visits all targets that are reached."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ....programs import Program, Stop
+    from ...programs import Program, Stop
 
     stops = [Stop(f"target {i + 1}", result.q[i], result.poses[i]) for i in np.flatnonzero(result.reached)]
     if not stops:
@@ -218,11 +218,11 @@ def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joi
     """Format corrected targets."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from .... import se3
-    from ....io.measurement_files.columns import QUATERNION, ROTVEC
-    from ....io.measurement_files.writing import joint_columns
-    from ....io.tabular import csv_text
-    from ....units import ANGLES, LENGTHS
+    from ... import se3
+    from ...io.measurement_files.columns import QUATERNION, ROTVEC
+    from ...io.measurement_files.writing import joint_columns
+    from ...io.tabular import csv_text
+    from ...units import ANGLES, LENGTHS
 
     columns: dict[str, Sequence[str]] = {
         name: _cells(np.array(values))

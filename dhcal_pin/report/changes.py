@@ -1,8 +1,9 @@
-"""Page of the difference of two calibrations of one robot."""
+"""Pages of changes of a calibrated robot: the difference of two calibrations, and later checks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from functools import partial
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy as np
 from .. import plots, se3
 from ..diagnostics.difference import STATISTICS, Difference
 from ..formatting import Quantity, Table
-from ..plots import SQUARE_PANEL
+from ..io.check_history import Check
+from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..visualization import scene
-from .document import Document, FigureGroup, Panel, Section
+from .document import Document, FigureGroup, LegendEntry, Panel, Section
 from .figures import MAX_SCENE_TRIANGLES, level_legend, packed_scene
 from .html import html_page
 from .provenance import origin_tables
@@ -74,3 +76,59 @@ def _scene(difference: Difference) -> list[FigureGroup]:
     a, b = difference.first, difference.second
     page = scene.scene_html(a, b, title="Difference", triangles=MAX_SCENE_TRIANGLES)
     return [FigureGroup((), scene=packed_scene(page), scene_title="Both robots, in three dimensions")]
+
+
+# --- checks over time ------------------------------------------------------------------------------
+
+
+def history_page(robot: str, checks: Sequence[Check]) -> str:
+    """Render the history of a robot."""
+    last = checks[-1]
+    return html_page(
+        Document(
+            title=f"Checks of {robot}",
+            heading=f"{last.verdict}: {last.what}" if last.what else last.verdict,
+            eyebrow=f"Last of {len(checks)} checks of {robot}, {last.time}",
+            sections=[
+                Section("history", "Checks over time", figures=partial(_history_figures, checks)),
+                Section("checks", "Checks", tables=[_history_table(checks)]),
+            ],
+        )
+    )
+
+
+def _history_figures(checks: Sequence[Check]) -> list[FigureGroup]:
+    """Draw the residuals of the checks over time."""
+    times = np.array([datetime.fromisoformat(check.time).timestamp() for check in checks])
+    residuals = np.array([check.residual_rms_m for check in checks])
+    expected = np.array([np.nan if c.expected_rms_m is None else c.expected_rms_m for c in checks])
+    verdicts = [check.verdict for check in checks]
+    plot = partial(plots.plot_checks, (times - times.max()) / 86400.0, residuals, expected, verdicts)
+    largest = Quantity.error(float(residuals.max()), "m")
+    text = f"RMS distance of the measured positions from those of the robot over time; at most {largest}."
+    panel = Panel("checks", "Distance of measured positions, RMS", text, plot, WIDE_PANEL)
+    legend = [
+        LegendEntry(name, color, "dots") for name, color in plots.CHECK_COLORS.items() if name in verdicts
+    ]
+    return [FigureGroup([panel], legend=[*legend, LegendEntry("expected", "text", "dashes")], layout="wide")]
+
+
+def _history_table(checks: Sequence[Check]) -> Table:
+    """List the checks, the last one first."""
+    rows = []
+    for check in reversed(checks):
+        expected = np.nan if check.expected_rms_m is None else check.expected_rms_m
+        size = (
+            Quantity(check.size, check.unit or "m", check.std or np.nan, is_small=True) if check.size else ""
+        )
+        rows.append(
+            [
+                check.time,
+                check.verdict,
+                check.what,
+                size,
+                Quantity.error(check.residual_rms_m, "m"),
+                Quantity.error(expected, "m"),
+            ]
+        )
+    return Table(["time", "verdict", "what", "size", "RMS", "expected RMS"], rows, n_text_columns=3)

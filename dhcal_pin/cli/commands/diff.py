@@ -5,11 +5,11 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, NamedTuple
 
-from ...options import JSON, ROBOT, add_urdf_options
-from ...output_table import Output
+from ..options import JSON, ROBOT, add_urdf_options
+from ..output_table import Output
 
 if TYPE_CHECKING:
-    from ....diagnostics import Calibrated, Difference
+    from ...diagnostics import Calibrated, Difference
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
 
@@ -23,7 +23,7 @@ class Compared(NamedTuple):
 
 
 def _report_content(done: Compared, path: str) -> str:
-    from ....report.difference import difference_page  # lazy import: only for reports
+    from ...report.changes import difference_page  # lazy import: only for reports
 
     return difference_page(done.names, done.difference, done.inputs)
 
@@ -46,13 +46,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Compare two robots, write the difference and show it."""
-    from ....diagnostics import compare  # lazy import, as the following: they load Pinocchio
-    from ....io import robot_name
-    from ....report.provenance import file_digests
-    from ...output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ...outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from ...screens import console
-    from ...screens.result_screens import difference_screen
+    from ...diagnostics import compare  # lazy import, as the following: they load Pinocchio
+    from ...io import robot_name
+    from ...report.provenance import file_digests
+    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import difference_screen
 
     robots = [args.first, args.second]
     inputs, outputs = [*robots, *existing_sidecars(robots)], chosen_files(vars(args), OUTPUTS)
@@ -70,8 +70,8 @@ def run(args: Namespace) -> int:
 
 def _read(path: str, args: Namespace) -> Calibrated:
     """Read a robot and what its sidecar says of its calibration."""
-    from ....diagnostics import Calibrated  # lazy import, as the following: they load Pinocchio
-    from ....io import existing_sidecar, read_measured_region, read_robot, read_uncertainty
+    from ...diagnostics import Calibrated  # lazy import, as the following: they load Pinocchio
+    from ...io import existing_sidecar, read_measured_region, read_robot, read_uncertainty
 
     chain, sidecar = (
         read_robot(path, args.tip, package_dirs=args.package_dir, root=args.root),

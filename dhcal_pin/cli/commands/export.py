@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from ...options import ROBOT, add_urdf_options
+from ..options import ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal export ur10_calibrated.urdf --tip tool0 -o model.h"
 
@@ -25,12 +25,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Write the source code."""
-    from ....io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ....model_code import model_code, require_code_ending
-    from ...outputs import existing_sidecars, require_writable_outputs, write_outputs
-    from ...screens import console
-    from ...screens.result_screens import files_block
-    from ...screens.screen import Screen
+    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
+    from ...model_code import model_code, require_code_ending
+    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block
+    from ..screens.screen import Screen
 
     require_code_ending(args.output)
     require_writable_outputs([args.output], [args.robot, *existing_sidecars([args.robot])])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 
-from ....exceptions import InvalidArgumentError
-from ...options import ROBOT, add_urdf_options
+from ...exceptions import InvalidArgumentError
+from ..options import ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -66,11 +66,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Convert a robot file to the format that the ending of the output selects, or a recording."""
-    from ....io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
-    from ...outputs import require_writable_outputs, write_outputs
-    from ...screens import console
-    from ...screens.result_screens import files_block, notes_block
-    from ...screens.screen import Screen
+    from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
+    from ..outputs import require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import files_block, notes_block
+    from ..screens.screen import Screen
 
     others = [path for path in (args.robot, args.template) if path]
     require_writable_outputs([args.output], [args.input, *others])
@@ -82,7 +82,7 @@ def run(args: Namespace) -> int:
 
 def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of a robot in another format, and notes on it."""
-    from ....io.robot import convert_robot  # lazy import: loads Pinocchio
+    from ...io.robot import convert_robot  # lazy import: loads Pinocchio
 
     for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
         if value:
@@ -98,8 +98,8 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
 
 def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of the stops of a recording, and notes on them."""
-    from ....io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ....io.measurement_files.bag import convert_bag
+    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
+    from ...io.measurement_files.bag import convert_bag
 
     if not args.output.lower().endswith(".csv"):
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
