@@ -13,7 +13,7 @@ from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def calibrated(sim_6dof: Chain, sim_6dof_actual: Chain) -> Callable[[float], Result]:
     """Return a function from the hold-out fraction to a calibration with 40 simulated poses."""
 
@@ -26,7 +26,7 @@ def calibrated(sim_6dof: Chain, sim_6dof_actual: Chain) -> Callable[[float], Res
     return calibrate_with
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fit(calibrated: Callable[[float], Result]) -> Result:
     return calibrated(0.3)
 

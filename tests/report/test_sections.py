@@ -64,7 +64,7 @@ def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
     data = Pose.simulate(truth, rng.uniform(-np.pi, 1.0, (60, 6)), Noise(1e-5, 1e-5), rng)
     joint = sim_6dof.joint_names[1]
     names = [p.name for p in errors.parameters if p.name.startswith(f"{joint}.")]
-    fit = calibrate(sim_6dof, data, "dh", free=names, extend="none")
+    fit = calibrate(sim_6dof, data, "dh", free=names, extend="none", session="off")
     context = ReportContext(fit, Provenance())
     section = joint_section(fit)
     assert section.title == "Joint correction curves"
