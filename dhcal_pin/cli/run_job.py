@@ -47,6 +47,7 @@ from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections
+from .bundle_content import bundle_content
 from .job import REGION, Job
 from .job_outputs import ROBOT_FORMATS, Calibrated, robot_ending
 from .options import split_commas
@@ -91,10 +92,16 @@ class CalibrationOutcome:
 
 
 def run_job(
-    job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
+    job: Job,
+    progress: Progress | None = None,
+    executor: TaskExecutor = SERIAL,
+    shown: Mapping[str, str] | None = None,
 ) -> CalibrationOutcome:
-    """Calibrate one robot and write its outputs, in this process or another; no messages are shown."""
-    inputs = _checked_inputs(job)
+    """Calibrate one robot and write its outputs, in this process or another; no messages are shown.
+
+    `shown` has the paths of outputs as they are listed, where these differ from those that are written.
+    """
+    inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
@@ -132,7 +139,7 @@ def run_job(
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []
     hint = _add_warnings(job, fit, data, sets, on_images)
-    return _write_job(job, fit, sets, data, inputs, hint)
+    return _write_job(job, fit, sets, data, inputs, hint, shown or {})
 
 
 # --- input -----------------------------------------------------------------------------------------
@@ -158,7 +165,7 @@ def _holdout_file(job: Job) -> str | None:
     return job.holdout
 
 
-def _checked_inputs(job: Job) -> list[str]:
+def checked_inputs(job: Job) -> list[str]:
     """Check the paths of a job; return those of its input files."""
     measured = [*job.data, *filter(None, [_holdout_file(job)])]
     for number, path in enumerate(measured):
@@ -371,7 +378,13 @@ def _is_kept(job: Job, fit: Result) -> bool:
 
 
 def _write_job(
-    job: Job, fit: Result, sets: str, data: _JobData, inputs: Sequence[str], hint: str
+    job: Job,
+    fit: Result,
+    sets: str,
+    data: _JobData,
+    inputs: Sequence[str],
+    hint: str,
+    shown: Mapping[str, str],
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
     is_kept = _is_kept(job, fit)
@@ -384,6 +397,7 @@ def _write_job(
     done = Calibrated(fit, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
+    files = {name: shown.get(path, path) for name, path in files.items()}
     contents |= file_contents(outputs, done)
     outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
@@ -391,6 +405,8 @@ def _write_job(
     )
     rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
     document = _job_document(fit, data, outliers, files, source)
+    if job.bundle:
+        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, document)
     write_outputs(contents, job.json, document)
     return CalibrationOutcome(
         fit=fit,

@@ -159,13 +159,17 @@ class _Scaled:
     blocks: list[Array]  # Indices of the rows of each block
 
     @classmethod
-    def of(cls, effects: Sequence[Array], columns: Array, labels: Array, model: tuple[float, float]) -> _Scaled:
+    def of(
+        cls, effects: Sequence[Array], columns: Array, labels: Array, model: tuple[float, float]
+    ) -> _Scaled:
         """Scale the blocks of rows by the root of their mean squared effects, relative to the tool's errors."""
         squares, own = np.zeros((len(columns), len(columns))), 3 * np.square(model)
         for effect in effects:
             root = (effect.reshape(-1, len(columns)) @ columns).reshape(len(effect), 2, -1)
             weight = 1 / np.sqrt(np.sum(root**2, 2) + own)
-            rows = (effect.reshape(len(effect), 2, 3, -1) * weight[:, :, None, None]).reshape(-1, len(columns))
+            rows = (effect.reshape(len(effect), 2, 3, -1) * weight[:, :, None, None]).reshape(
+                -1, len(columns)
+            )
             squares += rows.T @ rows / len(effect)
         to_scaled, to_rows = np.zeros_like(squares), np.zeros_like(squares)
         blocks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
