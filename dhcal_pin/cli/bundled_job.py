@@ -1,4 +1,4 @@
-"""Jobs with a bundle: their inputs are copied to a temporary folder under the names that the bundle has for them.
+"""Jobs with a bundle: inputs are copied to a temporary folder under the names that the bundle has for them.
 
 The first calibration and its repetition therefore run in equal folders and name equal paths in all
 outputs. Only the paths of outputs are those of the command line.

@@ -404,7 +404,9 @@ def _write_job(
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
     )
     rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
-    document = _job_document(fit, data, outliers, files, source)
+    # Without the bundle, which holds the document, so that a repetition without one gives an equal document.
+    listed = {name: path for name, path in files.items() if name != "bundle"}
+    document = _job_document(fit, data, outliers, listed, source)
     if job.bundle:
         contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, document)
     write_outputs(contents, job.json, document)

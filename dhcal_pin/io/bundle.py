@@ -7,8 +7,8 @@ A bundle is a zip file whose name ends with `.dhcal.zip`:
     inputs/NAME         files that the calibration read
     outputs/NAME        files that it wrote
 
-In the options, paths are the names of members without their folder. The comment of the zip file is the SHA-256 of
-`manifest.json`. All members have the same time stamp, so that equal content gives equal bytes.
+In the options, paths are the names of members without their folder. The comment of the zip file is the
+SHA-256 of `manifest.json`. All members have the same time stamp, so that equal content gives equal bytes.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _read_members(archive: zipfile.ZipFile, path: PathLike) -> dict[str, bytes]:
         raise FileFormatError(f"{path}: two members have the same name; expected different names")
     if len(infos) > MAX_MEMBERS or sum(info.file_size for info in infos) > MAX_BYTES:
         raise FileFormatError(
-            f"{path}: its content is too large; expected at most {MAX_MEMBERS} files and {MAX_BYTES >> 20} MiB"
+            f"{path}: its content is too large; expected at most {MAX_MEMBERS} files, {MAX_BYTES >> 20} MiB"
         )
     members = {}
     for info in infos:

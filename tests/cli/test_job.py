@@ -62,7 +62,8 @@ ARGUMENTS = (
     "--loss tukey "
     "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "
     "--in-place --world-joint --tool-frame tcp --camera-frame eye --camera-files cam --force "
-    "--report r.html --report r.md --certificate c.html --bundle all.dhcal.zip --meta meta.toml --json r.json "
+    "--report r.html --report r.md --certificate c.html --bundle all.dhcal.zip "
+    "--meta meta.toml --json r.json "
     "--curves curves.csv --residuals residuals.csv --scene scene.html --map map.csv"
 )
 
