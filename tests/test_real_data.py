@@ -314,7 +314,9 @@ def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> flo
     chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
     fitted, judged = (read_measurements(SERIES[name], chain, MAPS / "ipa_ur10.toml") for name in "BD")
     fit = calibrate(chain, fitted.take(rows), extend=extend, session="off")
-    return calibrate(fit.chain, judged, "base,tool", session="off").comparisons[-1].after.groups["position"].rms
+    return (
+        calibrate(fit.chain, judged, "base,tool", session="off").comparisons[-1].after.groups["position"].rms
+    )
 
 
 def rows_that_fill_bins(count: int) -> np.ndarray:

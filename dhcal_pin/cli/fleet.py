@@ -38,11 +38,11 @@ from ..io.tabular import csv_text
 from ..io.toml_table import Key, TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
+from .bundled_job import run_any_job
 from .job import Job, option_flags
 from .job_outputs import ROBOT_FORMATS, companion_paths
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
-from .run_job import run_job
 from .screens import console
 from .screens.screen import Block, Screen
 
@@ -259,7 +259,7 @@ def _run_in_process(runner: JobRunner, job: Job) -> FleetJobOutcome:
 
 def _run_one(job: Job) -> Mapping[str, Any]:
     """Run one job; return its JSON document."""
-    return run_job(job).document
+    return run_any_job(job).document
 
 
 # --- command ---------------------------------------------------------------------------------------

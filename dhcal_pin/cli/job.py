@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
+from ..exceptions import InvalidArgumentError
 from . import job_outputs, options
 from .output_table import Output, OutputFile, chosen_files
 
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 REGION = "region"
 # Values of --arm.
 ARMS = ("industrial", "low-cost")
-# File extension of a manifest of several jobs.
+# File extension of a bundle, and of a manifest of several jobs.
+BUNDLE_ENDING = ".dhcal.zip"
 MANIFEST_ENDING = ".fleet.toml"
 
 
@@ -41,6 +43,7 @@ class Job:
         metadata={
             "flags": ("robot",),
             "metavar": "ROBOT",
+            "nargs": "?",
             "type": options.ROBOT["type"],
             "help": f"{options.ROBOT['help']}; or a manifest of several robots, NAME{MANIFEST_ENDING}",
         }
@@ -57,7 +60,6 @@ class Job:
         metadata={
             "flags": ("-o", "--output"),
             "metavar": "OUT",
-            "required": True,
             "help": "; ".join(item.help for item in job_outputs.ROBOT_FORMATS.values())
             + "; with a manifest, a summary of all robots (.csv)",
             "output": None,
@@ -134,7 +136,7 @@ class Job:
         default="auto",
         metadata={
             "metavar": "LOSS",
-            "help": "weights of the samples in the fit (default: %(default)s): {losses}",
+            "help": "weights of the samples in the fit (default: auto): {losses}",
         },
     )
     priors: str | None = field(
@@ -166,7 +168,7 @@ class Job:
         metadata={
             "metavar": "N",
             "type": options.POSITIVE_INTEGER,
-            "help": "maximum number of iterations (default: %(default)s)",
+            "help": "maximum number of iterations (default: 100)",
         },
     )
     seed: int = field(
@@ -174,7 +176,7 @@ class Job:
         metadata={
             "metavar": "N",
             "type": options.NON_NEGATIVE_INTEGER,
-            "help": "random seed of the hold-out selection (default: %(default)s)",
+            "help": "random seed of the hold-out selection (default: 0)",
         },
     )
     in_place: bool = field(
@@ -272,6 +274,14 @@ class Job:
             "output": Output(job_outputs.certificate_content, "a certificate", (".html",), (".htm",)),
         },
     )
+    bundle: str | None = field(
+        default=None,
+        metadata={
+            "metavar": f"NAME{BUNDLE_ENDING}",
+            "help": "write one file with all inputs, options and outputs, which --from repeats",
+            "output": Output(None, "a bundle", (BUNDLE_ENDING,), is_written_if_refused=True),
+        },
+    )
     meta: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -285,11 +295,11 @@ class Job:
     @classmethod
     def from_args(cls, args: Namespace) -> Job:
         """Create the job that a command line describes."""
-        values: dict[str, Any] = {}
-        for option in fields(cls):
-            value = getattr(args, option.name)
-            values[option.name] = tuple(value) if isinstance(value, list) else value
-        return cls(**values)
+        given = given_options(args)
+        if missing := [name for name in ("robot", "output") if not given.get(name)]:
+            flag = {"robot": "ROBOT", "output": "-o OUT.urdf"}[missing[0]]
+            raise InvalidArgumentError(f"{flag} is required; see dhcal calibrate --help")
+        return cls(**{"data": (), **given})
 
     @property
     def outputs(self) -> list[OutputFile[job_outputs.Calibrated]]:
@@ -323,18 +333,25 @@ def option_flags(option: Field[Any]) -> tuple[str, ...]:
     return option.metadata.get("flags", (f"--{option.name.replace('_', '-')}",))
 
 
+def given_options(args: Namespace) -> dict[str, Any]:
+    """Return the options that a command line names, by the names of the fields."""
+    values = {option.name: getattr(args, option.name, None) for option in fields(Job)}
+    return {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in values.items()
+        if value is not None and value != []
+    }
+
+
 def add_job_arguments(parser: ArgumentParser) -> None:
-    """Declare the options of a job."""
+    """Declare the options of a job; those that are not named are absent from the arguments."""
     for option in fields(Job):
         keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "output")}
-        flags = option_flags(option)
         if option.default is False:
             keywords["action"] = "store_true"
         elif option.default == ():
-            keywords |= {"action": "append", "default": []}
-        elif flags[0].startswith("-") and not keywords.get("required"):
-            keywords["default"] = option.default
-        parser.add_argument(*flags, **keywords)
+            keywords["action"] = "append"
+        parser.add_argument(*option_flags(option), **{**keywords, "default": None})
 
 
 def is_manifest(path: str) -> bool:

@@ -50,6 +50,7 @@ from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections
+from .bundle_content import bundle_content
 from .job import REGION, Job
 from .job_outputs import (
     ROBOT_FORMATS,
@@ -105,11 +106,17 @@ class CalibrationOutcome:
 
 
 def run_job(
-    job: Job, progress: Progress | None = None, executor: TaskExecutor = SERIAL
+    job: Job,
+    progress: Progress | None = None,
+    executor: TaskExecutor = SERIAL,
+    shown: Mapping[str, str] | None = None,
 ) -> CalibrationOutcome:
-    """Calibrate one robot and write its outputs, in this process or another; no messages are shown."""
+    """Calibrate one robot and write its outputs, in this process or another; no messages are shown.
+
+    `shown` has the paths of outputs as they are listed, where these differ from those that are written.
+    """
     servos = read_servos(job.servos) if job.servos else None
-    inputs = _checked_inputs(job, servos)
+    inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
     if job.arm == "low-cost" or (servos and job.arm is None and job.parameters is None):
@@ -151,7 +158,7 @@ def run_job(
         suggestion = improvement_hint(fit, chain, measurements, **options)
         data.warnings[job.robot] = [suggestion] if suggestion else []
     hint = _add_warnings(job, fit, data, sets, on_images)
-    return _write_job(job, fit, sets, data, inputs, hint, servos)
+    return _write_job(job, fit, sets, data, inputs, hint, servos, shown or {})
 
 
 # --- input -----------------------------------------------------------------------------------------
@@ -177,8 +184,9 @@ def _holdout_file(job: Job) -> str | None:
     return job.holdout
 
 
-def _checked_inputs(job: Job, servos: ServoFile | None) -> list[str]:
+def checked_inputs(job: Job) -> list[str]:
     """Check the paths of a job; return those of its input files."""
+    servos = read_servos(job.servos) if job.servos else None
     if job.arm and job.parameters:
         raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
     if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
@@ -411,6 +419,7 @@ def _write_job(
     inputs: Sequence[str],
     hint: str,
     servos: ServoFile | None,
+    shown: Mapping[str, str],
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
     is_kept = _is_kept(job, fit)
@@ -426,6 +435,7 @@ def _write_job(
     done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
+    files = {name: shown.get(path, path) for name, path in files.items()}
     contents |= file_contents(outputs, done)
     outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
@@ -435,7 +445,11 @@ def _write_job(
     held_out: dict[str, list[int]] = {}
     for (path, _), rows in zip(data.holdout, fit.holdout_outliers, strict=True):
         held_out.setdefault(path, []).extend(rows.tolist())
-    document = _job_document(fit, data, (outliers, held_out), files, source)
+    # Without the bundle, which holds the document, so that a repetition without one gives an equal document.
+    listed = {name: path for name, path in files.items() if name != "bundle"}
+    document = _job_document(fit, data, (outliers, held_out), listed, source)
+    if job.bundle:
+        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, document)
     write_outputs(contents, job.json, document)
     return CalibrationOutcome(
         fit=fit,

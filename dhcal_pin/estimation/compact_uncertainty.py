@@ -5,21 +5,21 @@ contributes to predictions at joint positions q:
 
     C ≈ L·Lᵀ + diag(G·Gᵀ, C_1, ..., C_n),    C_i = B_i·B_iᵀ + Σ_m v_im·κ_m·κ_mᵀ
 
-- L, the leading directions, has the covariances between joints, and between joints and geometry. It is found by
-  factor analysis with correlated specific errors: the eigenvectors of C without the blocks on the diagonal of
-  what L leaves, repeated. Errors are measured by their effects on the tool at configurations of the joint
-  space, relative to the standard deviations there.
+- L, the leading directions, has the covariances between joints, and between joints and geometry. It is found
+  by factor analysis with correlated specific errors: the eigenvectors of C without the blocks on the
+  diagonal of what L leaves, repeated. Errors are measured by their effects on the tool at configurations of
+  the joint space, relative to the standard deviations there.
 - G is the exact rest of all rows that are no harmonics.
 - B_i has the leading directions of the rest of joint i. What is left is described by independent errors at
   angles θ_m with the variances v_im, where κ_m has the harmonics cos k(θ - θ_m) that peak there. A prediction
   depends on the variance of the error curve at one angle at a time only. Its values at all angles
   determine v_im (Richardson-Lucy iteration).
 
-Harmonics are rounded to multiples of a step far below the standard deviations. The predicted standard deviations are
-compared before the form is used; the number of directions grows until they agree.
+Harmonics are rounded to multiples of a step far below the standard deviations. The predicted standard
+deviations are compared before the form is used; the number of directions grows until they agree.
 
-Where measurements leave base or tool free (`frame_gauge`), the gauge coordinates of each column are further rows
-of the geometry, so that both uncertainties, with and without the free frames, follow from the same columns.
+Where measurements leave base or tool free (`frame_gauge`), the gauge coordinates of each column are further
+rows of the geometry, so that both uncertainties, with and without free frames, follow from the same columns.
 
 Reference: H. H. Harman, Modern Factor Analysis, 3rd ed., 1976, chapter 8.
 
@@ -44,8 +44,8 @@ MAX_COLUMNS = 120
 # Numbers of leading directions that are tried, and that of each joint.
 N_LEADING, N_OF_JOINT = (64, 112, 160), 32
 # Largest relative error of the standard deviations of position and orientation at the configurations that
-# are compared: further directions are added until it is below the first value, and the form is not used above the second
-# one. With the largest number of directions 99 % of the configurations are below 0.6 %.
+# are compared: further directions are added until it is below the first value, and the form is not used
+# above the second one. With the largest number of directions 99 % of the configurations are below 0.6 %.
 TOLERANCE, MAX_ERROR = 8e-3, 3e-2
 # Largest number of columns of an array that is read.
 MAX_COMPACT_COLUMNS = 4096
@@ -53,8 +53,8 @@ MAX_COMPACT_COLUMNS = 4096
 MIN_HARMONICS = 24
 # Step of the harmonics, relative to the 1 % quantile of the standard deviations [per rad].
 RELATIVE_STEP = 1e-3
-# Numbers of configurations for the effects: drawn from the joint space, and with measured values of each joint;
-# number of configurations at which predictions are compared.
+# Numbers of configurations for the effects: drawn from the joint space, and with measured values of each
+# joint; number of configurations at which predictions are compared.
 N_DRAWN, N_MEASURED, N_COMPARED = 600, 400, 1000
 # Rounds of the factor analysis, and of those in which the rest is made positive semidefinite.
 N_ROUNDS, N_BETWEEN_CORRECTIONS = 40, 5
@@ -105,7 +105,7 @@ class CompactUncertainty:
 
 
 def compact_rows(known: Uncertainty) -> dict[str, int]:
-    """Return the number of rows of each array in the compact form, of `geometry` without gauge coordinates."""
+    """Return the number of rows of each array, of `geometry` without gauge coordinates."""
     n_rows = len(known.sqrt_covariance)
     labels = _joint_of_rows(known.chain, known.entries, n_rows)
     n_harmonics, n_joints = int(np.sum(labels > 0)), len(_rows_by_joint(labels))
@@ -162,7 +162,7 @@ class _Scaled:
     def of(
         cls, effects: Sequence[Array], columns: Array, labels: Array, model: tuple[float, float]
     ) -> _Scaled:
-        """Scale the blocks of rows by the root of their mean squared effects, relative to the tool's errors."""
+        """Scale each block of rows by the root of its mean squared effects, relative to the tool's errors."""
         squares, own = np.zeros((len(columns), len(columns))), 3 * np.square(model)
         for effect in effects:
             root = (effect.reshape(-1, len(columns)) @ columns).reshape(len(effect), 2, -1)

@@ -55,6 +55,7 @@ VALUES = {
     "json": '"r.json"',
     "report": '["r.html", "r.md"]',
     "certificate": '"c.html"',
+    "bundle": '"all.dhcal.zip"',
     "meta": '["meta.toml"]',
 }
 ARGUMENTS = (
@@ -65,7 +66,8 @@ ARGUMENTS = (
     "--loss tukey "
     "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "
     "--in-place --world-joint --tool-frame tcp --camera-frame eye --camera-files cam --force "
-    "--report r.html --report r.md --certificate c.html --meta meta.toml --json r.json "
+    "--report r.html --report r.md --certificate c.html --bundle all.dhcal.zip "
+    "--meta meta.toml --json r.json "
     "--curves curves.csv --residuals residuals.csv --scene scene.html --map map.csv"
 )
 
@@ -99,7 +101,7 @@ def test_command_parses_to_the_same_job():
     text = job.command({"arm.urdf": "robots/arm.urdf"})
     outputs = "-o out.urdf --in-place --report r.html --report r.md --json r.json --map map.csv "
     outputs += "--curves curves.csv --residuals residuals.csv --scene scene.html --camera-files cam "
-    outputs += "--certificate c.html --meta meta.toml"
+    outputs += "--certificate c.html --bundle all.dhcal.zip --meta meta.toml"
     assert job_of(f"{text.replace('robots/', '').removeprefix('dhcal ')} {outputs}") == job
     flags = {"-o", "--in-place", "--report", "--json", "--curves", "--residuals", "--scene", "--map"}
     assert not flags & set(text.split())

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from ...exceptions import InvalidArgumentError
-from ..job import Job, add_job_arguments, is_manifest
+from ..job import BUNDLE_ENDING, add_job_arguments, is_manifest
 from ..options import add_execution_options
 
 # Exit status of a refused calibration.
@@ -18,6 +18,13 @@ EXAMPLE = "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal calibrate`."""
     add_job_arguments(parser)
+    parser.add_argument(
+        "--from",
+        dest="source",
+        metavar=f"NAME{BUNDLE_ENDING}",
+        help="repeat the calibration of a bundle; a ROBOT and options that are named replace its own, and "
+        "DATA is added to its measurements",
+    )
     add_execution_options(parser, "processes (default: 1; with a manifest, one per processor)", jobs=None)
     parser.add_argument(
         "--progress",
@@ -30,30 +37,36 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Calibrate one robot or all robots of a manifest, and show the results."""
-    if is_manifest(args.robot):
+    if args.source:
+        return _calibrate_robot(args)
+    robot = args.robot or ""
+    if is_manifest(robot):
         if args.scheduler:
             raise InvalidArgumentError("--scheduler: not available with a manifest; use --jobs")
         from ..fleet import run_manifest  # lazy import: loads Pinocchio
 
         return run_manifest(args)
-    if not args.data:
-        raise InvalidArgumentError(f"{args.robot}: DATA is required; name at least one measurement file")
+    if robot and not args.data:
+        raise InvalidArgumentError(f"{robot}: DATA is required; name at least one measurement file")
     return _calibrate_robot(args)
 
 
 def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
     from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
-    from ..run_job import run_job
+    from ..bundled_job import job_source, run_any_job
     from ..screens import console
     from ..screens.calibration_screen import calibration_screen
 
-    job = Job.from_args(args)
     shown = {
         "status": console.show_progress("reading the files"),
         "lines": nullcontext(console.print_progress),
     }
-    with open_executor(args.jobs or 1, args.scheduler) as executor, shown[args.progress] as progress:
-        outcome = run_job(job, progress, executor)
+    with (
+        job_source(args) as (job, folder),
+        open_executor(args.jobs or 1, args.scheduler) as executor,
+        shown[args.progress] as progress,
+    ):
+        outcome = run_any_job(job, folder, progress, executor)
     console.show(calibration_screen(outcome, job), args.verbosity)
     return REFUSED if outcome.fit.verdict.is_refused and not job.force else 0

@@ -27,6 +27,10 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Show the content of files."""
+    from ...io.bundle import is_bundle  # lazy import: not for help pages
+
+    if any(map(is_bundle, args.data)):
+        return _inspect_bundle(args)
     from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
     from ...io import read_robot
     from ...io.rig_file import read_rig
@@ -69,4 +73,36 @@ def run(args: Namespace) -> int:
     if chain is not None:
         about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
     console.show(inspection_screen(about, inspections), args.verbosity)
+    return 0
+
+
+def _inspect_bundle(args: Namespace) -> int:
+    """Show what a bundle holds."""
+    from ...io.bundle import read_bundle  # lazy import, as the following: not for help pages
+    from ..outputs import require_writable_outputs, write_outputs
+    from ..screens import console
+    from ..screens.result_screens import bundle_screen
+
+    if len(args.data) > 1 or args.robot or args.columns or args.rig:
+        raise InvalidArgumentError(f"{args.data[0]}: a bundle is inspected alone; leave out other files")
+    path = args.data[0]
+    require_writable_outputs([args.json], [path])
+    bundle = read_bundle(path)
+    accuracy = {
+        key: value
+        for key, value in bundle.result.items()
+        if key.endswith(("before", "after")) and isinstance(value, dict) and value
+    }
+    document = {
+        "bundle": path,
+        "robot": {"path": bundle.options.get("robot"), "tip": bundle.tip, "joints": list(bundle.joints)},
+        "data": bundle.options.get("data", []),
+        "options": bundle.options,
+        "versions": bundle.versions,
+        "verdict": bundle.result.get("verdict"),
+        "accuracy": accuracy,
+        "sha256": bundle.digests,
+    }
+    write_outputs({}, args.json, document)
+    console.show(bundle_screen(document, bundle.result), args.verbosity)
     return 0

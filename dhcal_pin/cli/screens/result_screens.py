@@ -115,6 +115,39 @@ def detection_screen(
 # --- inspect ---------------------------------------------------------------------------------------
 
 
+def bundle_screen(document: Mapping[str, Any], result: Mapping[str, Any]) -> Screen:
+    """Describe a bundle: robot, data, options, versions, accuracy and verdict."""
+    robot, verdict = document["robot"], result.get("verdict") or {}
+    options = [
+        f"{name}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
+        for name, value in document["options"].items()
+        if name not in ("robot", "data")
+    ]
+    accuracy = [
+        f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in values.items() if _is_number(value))
+        for name, values in document["accuracy"].items()
+    ]
+    return Screen(
+        [
+            Block([f"{robot['path']}: tip {robot['tip']}, {len(robot['joints'])} joints"]),
+            Block([f"data: {name}" for name in document["data"]], noun="file", rank=3),
+            Block(options, noun="option", rank=2),
+            Block(
+                [f"{name} {version}" for name, version in document["versions"].items()],
+                rank=1,
+                noun="version",
+            ),
+            Block(accuracy, noun="figure", rank=4),
+            Block([f"{result.get('command', '')}"]),
+            Block([f"verdict: {verdict.get('status', 'unknown')}"], "bold", is_verdict=True),
+        ]
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
     """Describe what measurement files contain."""
     first = Block([robot] if robot else [])

@@ -1,0 +1,110 @@
+"""Bundles: a calibration is repeated with equal bytes, and changed or unsafe bundles are refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+
+import pytest
+from robots import URDF
+
+from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import FileFormatError
+from dhcal_pin.io.bundle import read_bundle
+
+OPTIONS = ("--extend", "none", "--session", "off")
+OUTPUTS = ("out.urdf", "out.calibration.toml", "residuals.csv")
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """Calibrate a simulated arm in a folder, with paths outside of it; return the folder."""
+    folder = tmp_path_factory.mktemp("first")
+    data = folder.parent / "laser.csv"
+    arm = str(URDF / "sim_6dof.dh.toml")
+    assert main(["simulate", arm, "-m", "20", "--noise", "0.1mm", "-o", str(data)]) == 0
+    outputs = [
+        "-o",
+        "out.urdf",
+        "--json",
+        "r.json",
+        "--residuals",
+        "residuals.csv",
+        "--bundle",
+        "arm.dhcal.zip",
+    ]
+    old = os.getcwd()
+    os.chdir(folder)
+    try:
+        assert main(["calibrate", arm, f"../{data.name}", *OPTIONS, *outputs]) == 0
+    finally:
+        os.chdir(old)
+    return folder
+
+
+def test_a_bundle_repeats_the_calibration_with_equal_bytes(first, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("LC_ALL", "C")
+    bundle = str(first / "arm.dhcal.zip")
+    assert main(["calibrate", "--from", bundle, "-o", "out.urdf", "--bundle", "arm.dhcal.zip"]) == 0
+    for name in (*OUTPUTS, "r.json", "arm.dhcal.zip"):
+        assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+    assert set(json.loads((tmp_path / "r.json").read_text())["inputs"]) == {"sim_6dof.dh.toml", "laser.csv"}
+
+
+def test_inspect_says_what_a_bundle_holds(first, capsys):
+    assert main(["inspect", str(first / "arm.dhcal.zip"), "--json", "-"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["data"] == ["laser.csv"]
+    assert document["options"]["extend"] == "none"
+    assert document["verdict"]["status"] in ("ok", "caution")
+    assert document["accuracy"]["after"]["position_rms_m"] > 0
+
+
+def changed(source, target, name, data):
+    """Copy a zip file with another content of a member, or with a further one."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for info in old.infolist():
+            new.writestr(info, data if info.filename == name else old.read(info))
+        if name not in old.namelist():
+            new.writestr(name, data)
+        new.comment = old.comment
+    return target
+
+
+@pytest.mark.parametrize(
+    ("member", "message"),
+    [
+        ("inputs/laser.csv", "was changed"),
+        ("manifest.json", "no manifest"),
+        ("inputs/more.csv", "was changed"),
+        ("../out.txt", "unsafe name"),
+        ("/tmp/out.txt", "unsafe name"),
+        ("inputs/../../out.txt", "unsafe name"),
+    ],
+)
+def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, message):
+    path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, b"x")
+    assert main(["calibrate", "--from", str(path), "-o", str(tmp_path / "out.urdf")]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert [each.name for each in tmp_path.iterdir()] == ["bad.dhcal.zip"]
+
+
+def test_a_large_content_and_other_files_are_refused(first, tmp_path, monkeypatch):
+    monkeypatch.setattr("dhcal_pin.io.bundle.MAX_BYTES", 1000)
+    with pytest.raises(FileFormatError, match="too large"):
+        read_bundle(first / "arm.dhcal.zip")
+    (tmp_path / "text.dhcal.zip").write_text("no zip file")
+    with pytest.raises(FileFormatError, match="not a bundle"):
+        read_bundle(tmp_path / "text.dhcal.zip")
+
+
+def test_another_robot_must_have_the_joints_of_the_bundle(first, tmp_path, capsys):
+    output = str(tmp_path / "out.urdf")
+    other = str(URDF / "ur10.dh.toml")
+    assert main(["calibrate", "--from", str(first / "arm.dhcal.zip"), other, "-o", output]) == 2
+    assert "its joints are" in capsys.readouterr().err
