@@ -79,7 +79,9 @@ def _continued(args: Namespace, bundle: Bundle, folder: str) -> Job:
     known = {option.name for option in fields(Job)}
     if unknown := sorted(set(bundle.options) - known):
         raise FileFormatError(f"{args.source}: unknown option {unknown[0]!r}; use the version that wrote it")
-    options = {key: tuple(v) if isinstance(v, list) else v for key, v in bundle.options.items()}
+    options: dict[str, Any] = {
+        key: tuple(v) if isinstance(v, list) else v for key, v in bundle.options.items()
+    }
     job = _renamed(Job(**options), {name: os.path.join(folder, name) for name in bundle.inputs})
     target = os.path.dirname(given.get("output", ""))
     job = with_output_paths(job, lambda path: os.path.join(target, os.path.basename(path)))

@@ -180,15 +180,12 @@ def _read_members(archive: zipfile.ZipFile, path: PathLike) -> dict[str, bytes]:
 def _read_manifest(data: bytes, path: PathLike) -> dict[str, Any]:
     """Read the manifest of a bundle."""
     try:
-        manifest = json.loads(data)
+        content = json.loads(data)
     except ValueError:
-        manifest = None
-    is_valid = (
-        isinstance(manifest, dict)
-        and manifest.get("format") == FORMAT
-        and all(isinstance(manifest.get(key), kind) for key, kind in _TYPES.items())
-    )
-    if not is_valid:
+        content = None
+    manifest: dict[str, Any] = content if isinstance(content, dict) else {}
+    has_types = all(isinstance(manifest.get(key), kind) for key, kind in _TYPES.items())
+    if manifest.get("format") != FORMAT or not has_types:
         raise FileFormatError(
             f"{path}: no manifest of a bundle; expected a bundle of `dhcal calibrate --bundle`"
         )

@@ -490,8 +490,8 @@ def _read_compact(table: TomlTable, values: Mapping[str, Any], known: Uncertaint
 
 def _decompress(data: bytes, max_bytes: int, where: str) -> bytes:
     """Decompress an array of at most a number of bytes."""
+    decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MAX_SIDECAR_BYTES << 2)
     try:
-        decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MAX_SIDECAR_BYTES << 2)
         content = decompressor.decompress(data, max_bytes + 1)
     except lzma.LZMAError:
         content = None

@@ -25,9 +25,9 @@ def difference_table(difference: Difference) -> Table:
     rows = []
     for where, each in (("measured region", difference.region), ("joint limits", difference.everywhere)):
         for what, unit in (("position", "m"), ("orientation", "rad")):
-            values = each and getattr(each, what)
-            if values is None:
+            if each is None:
                 continue
+            values = getattr(each, what)
             cells = [Quantity.error(float(function(values)), unit) for function in STATISTICS.values()]
             expected = each.expected if what == "position" and each.expected is not None else np.nan
             rows.append([f"{what}, {where}", *cells, Quantity.error(expected, "m")])

@@ -297,7 +297,7 @@ class _CheckModel:
             shared.append(whitened(motions).reshape(-1, len(motions)))
             # Errors that the model lacks differ from sample to sample.
             own += list(whitened(np.tile(model_std[..., None], m)))
-        return np.hstack([np.concatenate(shared), block_diag(*own)])
+        return np.concatenate([np.concatenate(shared), np.asarray(block_diag(*own))], 1)
 
     # ------------------------------------------------------------------------------------------- hypotheses
     @cached_property

@@ -55,7 +55,7 @@ def test_a_calibrated_mjcf_predicts_the_measurements_in_mujoco(run, mjcf_folder)
 def test_what_an_mjcf_cannot_hold_is_refused_before_the_calibration(
     run, assert_refused, mjcf_folder, change, words, options
 ):
-    write(mjcf_folder, "ur5e.xml", UR5E.replace(*change, 1))
+    write(mjcf_folder, "ur5e.xml", UR5E.replace(change[0], change[1], 1))
     assert_refused(words, "calibrate", "ur5e.xml", "ur5e.csv", "-o", "out.xml", *TIP, *options)
 
 

@@ -108,7 +108,7 @@ def test_file_alone_and_sidecar_hold_two_models(arm, tmp_path):
     transmission.linear[np.diag_indices(chain.n_joints)] = 1e-3
     fit = replace(chain, origins=complete, urdf_origins=alone).with_transmission(transmission)
     for path, content in urdf_files(fit, tmp_path / "out.xml").items():
-        write(tmp_path, path, content)
+        write(tmp_path, str(path), content)
     q = draw(chain)
     written = read_robot(tmp_path / "out.xml", chain.tip)
     by_mujoco = mujoco_poses((tmp_path / "out.xml").read_bytes(), chain.tip, chain.joint_names, q)
