@@ -25,7 +25,7 @@ def difference_table(difference: Difference) -> Table:
     rows = []
     for where, each in (("measured region", difference.region), ("joint limits", difference.everywhere)):
         for what, unit in (("position", "m"), ("orientation", "rad")):
-            if each is None:
+            if each is None or getattr(each, what) is None:
                 continue
             values = getattr(each, what)
             cells = [Quantity.error(float(function(values)), unit) for function in STATISTICS.values()]
