@@ -45,9 +45,9 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
 
     [uncertainty.compact]              # in place of these three: `estimation.compact_uncertainty`
     step = 2e-7                        # unit of `leading` and `of_joint` [rad]
-    leading = "..."                    # rows of 16-bit integers, compressed (xz), in base64
+    leading = "..."                    # rows of 16-bit integers, compressed, in base85
     of_joint = "..."
-    geometry = "..."                   # rows of 32-bit floats, compressed, in base64
+    geometry = "..."                   # rows of 32-bit floats, compressed, in base85
     angle_std = "..."
     gauge = "..."
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
@@ -65,7 +65,7 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     spread = [0.6]                     # standard deviations of the measured values [rad or m]
     radius = 0.9                       # of the region, and how far its accuracy was judged, in spreads
     reach = 1.5
-    configurations = "..."             # rows of little-endian doubles in base64, one per joint
+    centres = "..."                    # configurations: rows of 32-bit floats in base64, one per joint
 
 Absent tables mean identity frames, ideal joints and unknown uncertainty. Numbers are written with all digits
 and read back bit-identical. Errors in the content of a file are `FileFormatError`, unknown joints
@@ -189,7 +189,9 @@ _MEASURED_KEYS = {
     **{key: toml.list_of(toml.number()) for key in ("lower", "upper", "spread")},
     "radius": toml.number(0),
     "reach": toml.number(0),
-    "configurations": _BASE64,
+    # Rows of 32-bit floats; former files have doubles.
+    "centres": replace(_BASE64, is_optional=True),
+    "configurations": replace(_BASE64, is_optional=True),
 }
 _FRAME_KEYS = {
     "tip": toml.text(is_optional=True),
@@ -214,13 +216,13 @@ SIDECAR_KEYS = {
 _FORMER_HARMONIC_KEYS = ("sin_rad", "cos_rad", "sin2_rad", "cos2_rad")
 # Entry of `harmonics` as tomli_w writes it.
 _HARMONIC_LINES = re.compile(r"^ {4}\[\n +(\d+),\n +(\S+),\n +(\S+),\n {4}\]", re.MULTILINE)
-# Lines of base64 text, and the number of such a text as tomli_w writes it.
-_BASE64_LINES, _TEXT_NUMBER = re.compile(r"[A-Za-z0-9+/=\n]*\n"), re.compile(r'"""\n(\d+)\n"""')
+# Lines of base64 or base85 text, and the number of such a text as tomli_w writes it.
+_ENCODED_LINES, _TEXT_NUMBER = re.compile(r"[!-&(-~\n]*\n"), re.compile(r'"""\n(\d+)\n"""')
 # Decimals of the numbers [m or rad] that the hash of the joints depends on.
 _DIGEST_DECIMALS = 12
 # What stands between the first and the last name of successive terms.
 _RANGE = " ... "
-# Length of the lines of base64 text [characters].
+# Length of the lines of encoded text [characters].
 _LINE_LENGTH = 76
 
 _HEADER = """\
@@ -480,24 +482,29 @@ def _read_compact(table: TomlTable, values: Mapping[str, Any], known: Uncertaint
         where = f"{table.where}: {key}"
         # The coordinates of free frames are further rows.
         n_rows += arrays["gauge"].shape[1] if key == "geometry" else 0
-        data = _decompress(_decode(values[key], where), 4 * n_rows * MAX_COMPACT_COLUMNS, where)
-        arrays[key] = _as_rows(data, n_rows, _COMPACT_TYPES[key], where)
+        arrays[key] = _read_compressed(values[key], n_rows, _COMPACT_TYPES[key], where)
     found = CompactUncertainty(values["step"], **arrays)
     if problem := found.problem:
         raise table.error(*problem)
     return found.expand(known)
 
 
-def _decompress(data: bytes, max_bytes: int, where: str) -> bytes:
-    """Decompress an array of at most a number of bytes."""
+def _read_compressed(text: str, n_rows: int, number: str, where: str) -> Array:
+    """Return an array with n rows from the text of `_compressed_text`."""
+    size = np.dtype(number).itemsize
+    max_bytes = size * n_rows * MAX_COMPACT_COLUMNS
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MAX_SIDECAR_BYTES << 2)
     try:
-        content = decompressor.decompress(data, max_bytes + 1)
-    except lzma.LZMAError:
-        content = None
-    if content is None or len(content) > max_bytes or not decompressor.eof:
+        content = decompressor.decompress(base64.b85decode("".join(text.split())), max_bytes + 1)
+    except (lzma.LZMAError, ValueError):
+        content = b""
+    if not decompressor.eof or len(content) > max_bytes or len(content) % size:
         raise FileFormatError(f"{where} is not a compressed array; calibrate again to replace it")
-    return content
+    data = np.frombuffer(content, np.uint8).reshape(size, -1).T.tobytes()
+    if np.dtype(number).kind == "i":
+        folded = np.frombuffer(data, number.replace("i", "u")).astype(np.int64)
+        data = ((folded >> 1) ^ -(folded & 1)).astype(number).tobytes()
+    return _as_rows(data, n_rows, number, where)
 
 
 def _folded(terms: Sequence[str], order: Sequence[str]) -> list[str]:
@@ -533,9 +540,11 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
     values = table.values(_MEASURED_KEYS | dict.fromkeys(sides, toml.vector(chain.n_joints)))
     if values["joints"] != list(chain.joint_names):
         raise table.error("joints", f"expected the joints of this robot: {', '.join(chain.joint_names)}")
-    rows = _decode_rows(values["configurations"], chain.n_joints, f"{table.where}: configurations")
+    key, number = ("configurations", "<f8") if values["centres"] is None else ("centres", "<f4")
+    where = f"{table.where}: {key}"
+    rows = _as_rows(_decode(values[key], where), chain.n_joints, number, where)
     if not rows.size:
-        raise table.error("configurations", "expected at least one configuration")
+        raise table.error(key, "expected at least one configuration")
     lower, upper, spread = (np.array(values[key]) for key in sides)
     return MeasuredRegion(
         chain.is_prismatic, lower, upper, spread, rows.T.copy(), values["radius"], values["reach"]
@@ -623,7 +632,7 @@ def _toml_text(content: dict[str, Any]) -> str:
     def with_numbers(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: with_numbers(each) for key, each in value.items()}
-        if isinstance(value, str) and _BASE64_LINES.fullmatch(value):
+        if isinstance(value, str) and _ENCODED_LINES.fullmatch(value):
             inserted.append(value)
             return f"{len(inserted) - 1}\n"
         return value
@@ -692,7 +701,7 @@ def _uncertainty_content(uncertainty: Uncertainty | None, region: MeasuredRegion
             **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
         }
     else:
-        texts = {key: _encode_compressed(getattr(found, key), kind) for key, kind in _COMPACT_TYPES.items()}
+        texts = {key: _compressed_text(getattr(found, key), kind) for key, kind in _COMPACT_TYPES.items()}
         columns = {"compact": {"step": found.step, **texts}}
     return {
         "joints": list(uncertainty.chain.moving_joints),
@@ -715,7 +724,7 @@ def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, 
         "spread": region.spread.tolist(),
         "radius": region.radius,
         "reach": region.reach,
-        "configurations": _encode_rows(region.configurations.T),
+        "centres": _encode(np.ascontiguousarray(region.configurations.T, "<f4").tobytes()),
     }
 
 
@@ -724,11 +733,25 @@ def _encode_rows(rows: Array) -> str:
     return _encode(np.ascontiguousarray(rows, "<f8").tobytes())
 
 
-def _encode_compressed(rows: Array, number: str) -> str:
-    """Compress an array and encode it as lines of base64 text."""
-    return _encode(lzma.compress(np.ascontiguousarray(rows, number).tobytes(), check=lzma.CHECK_CRC32))
+def _compressed_text(rows: Array, number: str) -> str:
+    """Compress an array and encode it as lines of base85 text.
+
+    Small integers of both signs become small ones without a sign: 0, -1, 1, -2 to 0, 1, 2, 3. The first bytes
+    of all numbers stand together, then the second ones, which makes equal bytes neighbours.
+    """
+    values = np.ascontiguousarray(rows, number)
+    if values.dtype.kind == "i":
+        wide = values.astype(np.int64)
+        values = ((wide << 1) ^ (wide >> 63)).astype(number.replace("i", "u"))
+    planes = values.reshape(-1, 1).view(np.uint8).T.tobytes()
+    return _lines(base64.b85encode(lzma.compress(planes, check=lzma.CHECK_CRC32)).decode())
 
 
 def _encode(data: bytes) -> str:
-    text = base64.b64encode(data).decode()
+    """Encode bytes as lines of base64 text."""
+    return _lines(base64.b64encode(data).decode())
+
+
+def _lines(text: str) -> str:
+    """Divide a text into lines."""
     return "\n".join([*(text[i : i + _LINE_LENGTH] for i in range(0, len(text), _LINE_LENGTH)), ""])

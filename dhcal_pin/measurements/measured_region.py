@@ -50,11 +50,12 @@ class MeasuredRegion:
     @classmethod
     def from_configurations(cls, q: Array, is_prismatic: Array) -> MeasuredRegion:
         """Describe the region of measured configurations."""
-        region = cls(is_prismatic, q.min(0), q.max(0), q.std(0), q, 0.0, 0.0)
         drawn = _is_drawn(len(q))
+        # Files have configurations as 32-bit floats.
+        centres = q[drawn].astype(np.float32).astype(float)
+        region = cls(is_prismatic, q.min(0), q.max(0), q.std(0), centres, 0.0, 0.0)
         if drawn.all():
             return region
-        region = replace(region, configurations=q[drawn])
         distances = region.distances(_thinned(q[~drawn]))
         radius = float(np.quantile(distances, RADIUS_QUANTILE, method="higher"))
         return replace(region, radius=radius, reach=radius)
