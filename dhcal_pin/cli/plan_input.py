@@ -45,7 +45,7 @@ def input_paths(args: Namespace) -> list[str]:
 
 def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any], Array]:
     """Return the keyword arguments of `plan`, and the rows (m,) of given candidates in their file, from 0."""
-    space = _workspace_constraints(args)
+    space = workspace_constraints(args)
     candidates, rows = _read_candidates(args, chain)
     rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
     data = [read_measurement_file(path, chain, args.columns, rig=rig).data for path in args.data or []]
@@ -158,7 +158,7 @@ def _obstacles(args: Namespace) -> list[Obstacle]:
     return obstacles
 
 
-def _workspace_constraints(args: Namespace) -> WorkspaceConstraints:
+def workspace_constraints(args: Namespace) -> WorkspaceConstraints:
     """Create the constraints of the robot from --box, --visible-from, --cone, --floor and --obstacle."""
     box = _parse_box(args.box, "--box") if args.box else None
     instrument = None
@@ -236,9 +236,14 @@ def _floor(text: str | None, root: str | None) -> float | None:
     text = text or ("none" if root else "0mm")
     if text == "none":
         return None
+    return parse_length(text, "--floor", "a height with a unit, such as -800mm, or none")
+
+
+def parse_length(text: str, option: str, expected: str) -> float:
+    """Parse a length with its unit [m]."""
     match = re.fullmatch(rf"\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
     if not match or match[2] not in LENGTHS:
-        raise InvalidArgumentError(f"--floor {text}: expected a height with a unit, such as -800mm, or none")
+        raise InvalidArgumentError(f"{option} {text}: expected {expected}")
     return float(match[1]) / LENGTHS[match[2]]
 
 

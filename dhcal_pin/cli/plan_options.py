@@ -34,6 +34,25 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="joint values to write, ordered as a short tour",
     )
     options.add_urdf_options(parser)
+    parser.add_argument(
+        "--iso9283",
+        action="store_true",
+        help="plan a test according to ISO 9283 in place of a calibration: the points P1 to P5 of a cube in "
+        "the workspace, in this order in each cycle; the column iso_point names point and cycle, such as "
+        "P1:12, for `dhcal validate --iso9283`",
+    )
+    parser.add_argument(
+        "--cube",
+        metavar="SIDE",
+        help="with --iso9283: side of the cube, such as 400mm (default: the largest of 1000, 630, 400 and "
+        "250 mm that fits into the workspace)",
+    )
+    parser.add_argument(
+        "--cycles",
+        type=options.POSITIVE_INTEGER,
+        metavar="N",
+        help="with --iso9283: number of cycles (default: 30)",
+    )
     _add_measurement_options(parser)
     _add_calibration_options(parser)
     _add_search_options(parser)

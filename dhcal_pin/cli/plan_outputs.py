@@ -22,7 +22,7 @@ from ..robot.chain import Chain
 from .output_table import Output, chosen_files, paths_by_name
 
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
-_DEGREE_DECIMALS = 4
+DEGREE_DECIMALS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Planned:
             f"{pixels}{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
         ]
         units = self.args.joint_units
-        decimals = _DEGREE_DECIMALS if units == "deg" else None
+        decimals = DEGREE_DECIMALS if units == "deg" else None
         return configurations_text(plan.q, self.chain, [*comments, *self.moves], units, decimals)
 
     @cached_property

@@ -11,6 +11,7 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evaluation import Accuracy, compute_errors, error_norms
 from ..calibration.summary import STATISTIC_LABELS, statistic
+from ..diagnostics.iso9283 import PoseCharacteristics
 from ..formatting import Table
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
@@ -40,6 +41,8 @@ class Validation:
     warnings: Sequence[str] = ()  #: What a reader must know before relying on the figures.
     notes: Sequence[str] = ()  #: What of the input is not used.
     inputs: Mapping[str, str] = field(default_factory=dict)  #: SHA-256 of each input file by path.
+    #: Characteristics of poses according to ISO 9283, if they were asked for.
+    characteristics: PoseCharacteristics | None = None
 
 
 def validation_page(validation: Validation) -> str:
@@ -102,6 +105,11 @@ def _sections(validation: Validation, samples: Samples) -> list[Section]:
             "Accuracy",
             tables=[_accuracy_table(validation.accuracies)],
             figures=partial(_histograms, samples),
+        ),
+        *(
+            [Section("iso9283", "Poses according to ISO 9283", tables=validation.characteristics.tables())]
+            if validation.characteristics
+            else []
         ),
         Section("residuals", "Residual errors", figures=partial(figures.sample_figures, samples)),
         Section("scene", "Robot and measurements", figures=partial(_scene_figures, validation)),

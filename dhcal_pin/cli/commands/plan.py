@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from ...exceptions import InvalidArgumentError
 from ..plan_options import add_arguments as add_arguments
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
@@ -11,6 +12,13 @@ EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses
 
 def run(args: Namespace) -> int:
     """Choose poses, write them and show the predicted accuracy."""
+    if args.iso9283:
+        from ..iso_plan import run_iso_plan  # lazy import: slow to load
+
+        return run_iso_plan(args)
+    for option in ("cube", "cycles"):
+        if getattr(args, option):
+            raise InvalidArgumentError(f"--{option}: needs --iso9283")
     from ...io import read_robot  # lazy import, as the following: they are slow to load
     from ...planning import plan, with_repeats
     from ...programs import require_program_ending

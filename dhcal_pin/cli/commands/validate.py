@@ -55,6 +55,13 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="write the predicted position uncertainty and the measured errors over the workspace (.csv or "
         ".html)",
     )
+    parser.add_argument(
+        "--iso9283",
+        action="store_true",
+        help="compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
+        "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` "
+        "writes it (default: rows with equal joint values are one point)",
+    )
     parser.add_argument("--report", metavar="R.html", help="write a report (.html)")
     parser.add_argument("--json", **JSON)
 
@@ -120,7 +127,7 @@ OUTPUTS: dict[str, Output[Validated]] = {
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...diagnostics import find_extrapolation  # lazy import, as the following: they load Pinocchio
+    from ...diagnostics import find_extrapolation, pose_characteristics  # lazy import, as the following
     from ...io import existing_sidecar, robot_name
     from ...report.provenance import file_digests
     from ...report.validation import Validation
@@ -136,6 +143,10 @@ def run(args: Namespace) -> int:
     given = _read_input(args, sidecar)
     judged = _judge(args, given)
     data, accuracies = given.data, judged.accuracies
+    characteristics = None
+    if args.iso9283:
+        points = [file.iso_points for file in given.files]
+        characteristics = pose_characteristics(judged.chain, data, points, judged.known)
     warnings = _input_warnings(args, given, judged)
     notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
     extrapolation = given.region and find_extrapolation(given.region, judged.chain, data, judged.known)
@@ -155,18 +166,21 @@ def run(args: Namespace) -> int:
         [f"{path}: {text}" for path, texts in warnings.items() for text in texts],
         notes,
         file_digests(inputs),
+        characteristics,
     )
     files = paths_by_name(outputs)
     document = _document(report, judged) | {
         "estimated_entries": given.estimated,
         "warnings": [*notes, *report.warnings],
         "measured_region": extrapolation and extrapolation.to_dict(),
+        "iso9283": characteristics and characteristics.to_dict(),
         "files": files,
     }
     write_outputs(file_contents(outputs, Validated(report, given.predictor)), args.json, document)
     title = f"{args.robot}: accuracy on {document['samples']} samples"
     shown = {name: path for name, path in files.items() if name != "json"}
-    screen = validation_screen(title, accuracies, report.remarks, notes, warnings, shown)
+    tables = characteristics.tables() if characteristics else []
+    screen = validation_screen(title, accuracies, report.remarks, notes, warnings, shown, tables)
     console.show(screen, args.verbosity)
     return 0
 

@@ -66,8 +66,9 @@ def validation_screen(
     notes: Sequence[str],
     warnings: Mapping[str, Sequence[str]],
     files: Mapping[str, str],
+    tables: Sequence[Table] = (),
 ) -> Screen:
-    """Describe the accuracy of a model on measurements."""
+    """Describe the accuracy of a model on measurements, and further tables."""
     rows = []
     for group in in_order({group for each in accuracies.values() for group in each.groups}):
         columns = [each.groups[group] for each in accuracies.values() if group in each.groups]
@@ -77,6 +78,7 @@ def validation_screen(
             )
     blocks = [
         Block(Table(["error", *accuracies], rows), title=title, is_verdict=True),
+        *(Block(table, title=table.caption, is_verdict=True, has_space=True) for table in tables),
         Block(remarks, noun="remark", rank=1, has_space=True),
         notes_block(notes),
         warnings_block(warnings),

@@ -43,10 +43,13 @@ TOOL_POSE = ("x", "y", "z", *ROTVEC)
 # Prefix of a joint's name in the columns of the second configuration of a row.
 SECOND_PREFIX = "to:"
 
+# Point and cycle of a test according to ISO 9283, such as P1:12.
+ISO_POINT = "iso_point"
+
 # Columns for people only, some of which a kind uses for its messages; others are ignored without a note.
 _REMARKS = frozenset(
     name for kind in KINDS.values() for name, content in kind.columns.items() if content == "remark"
-) | {"pose_id", "time"}
+) | {"pose_id", "time", ISO_POINT}
 AUXILIARY_COLUMNS = frozenset(("set", *_REMARKS, *COMMANDED, *AFTER))
 VALUE_COLUMNS = (
     frozenset((*(name for kind in KINDS.values() for name in kind.columns), *QUATERNION)) - _REMARKS

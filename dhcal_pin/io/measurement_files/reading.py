@@ -15,6 +15,7 @@ Shapes: m rows of data, n joints.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -35,6 +36,7 @@ from ..tables import Column, DataTable, format_lines, read_table
 from .columns import (
     AFTER,
     COMMANDED,
+    ISO_POINT,
     QUATERNION,
     ROTVEC,
     SECOND_PREFIX,
@@ -81,6 +83,9 @@ class MeasurementFile:
     bad_rows: Mapping[int, str] = field(default_factory=dict)  #: Reason why a row was skipped, by line.
     #: Joints of the robot that move in the file, but not the tip of the chain.
     other_moving_joints: tuple[str, ...] = ()
+    #: Point and cycle of each sample in a test according to ISO 9283, such as ("P1", 12), with cycle 0 if
+    #: it is not stated; None without the column.
+    iso_points: tuple[tuple[str, int], ...] | None = None
 
 
 def read_measurements(
@@ -189,7 +194,24 @@ def parse_measurements(
         ),
         bad_rows=table.bad_rows,
         other_moving_joints=_find_other_moving_joints(table, chain),
+        iso_points=_parse_iso_points(table),
     )
+
+
+def _parse_iso_points(table: DataTable) -> tuple[tuple[str, int], ...] | None:
+    """Parse the points and cycles of a test according to ISO 9283; None without the column."""
+    if ISO_POINT not in table.columns:
+        return None
+    found = []
+    for row, text in enumerate(table.text(table.columns[ISO_POINT])):
+        match = re.fullmatch(r"([^:]+?)(?:\s*:\s*(\d{1,9}))?", text)
+        if not match:
+            raise FileFormatError(
+                f"{table.cell_location(row, ISO_POINT)}: {text!r}; expected a point, or a point and a cycle, "
+                "such as P1:12"
+            )
+        found.append((match[1], int(match[2] or 0)))
+    return tuple(found)
 
 
 def _find_other_moving_joints(table: DataTable, chain: Chain) -> tuple[str, ...]:

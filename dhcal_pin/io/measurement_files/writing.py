@@ -14,7 +14,7 @@ from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
 from ...units import ANGLES, LENGTHS, UNITS
 from ..tabular import csv_text
-from .columns import SECOND_PREFIX, check_joint_names, condition_columns, joint_units
+from .columns import ISO_POINT, SECOND_PREFIX, check_joint_names, condition_columns, joint_units
 
 # Unit of prismatic joints beside the unit of revolute joints.
 _LENGTH_UNITS = {"rad": "m", "deg": "mm"}
@@ -60,11 +60,17 @@ def _condition_columns(data: Measurement, chain: Chain) -> dict[str, list[Any]]:
 
 
 def configurations_text(
-    q: Array, chain: Chain, comments: Sequence[str], angle_unit: str = "rad", decimals: int | None = None
+    q: Array,
+    chain: Chain,
+    comments: Sequence[str],
+    angle_unit: str = "rad",
+    decimals: int | None = None,
+    iso_points: Sequence[str] = (),
 ) -> str:
-    """Return the CSV text of joint positions."""
+    """Return the CSV text of joint positions, with the points of a test according to ISO 9283 if given."""
     check_joint_names(chain)
-    return csv_text(joint_columns(q, chain, angle_unit=angle_unit, decimals=decimals), comments)
+    columns = joint_columns(q, chain, angle_unit=angle_unit, decimals=decimals)
+    return csv_text({ISO_POINT: iso_points} | columns if iso_points else columns, comments)
 
 
 def joint_columns(
