@@ -29,6 +29,7 @@ from ..io.origins_file import origin_table
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..robot.chain import BASE_FRAME
 from . import figures, images, samples
+from .budget import UncertaintyBudget
 from .context import ReportContext
 from .document import BarTable, IntervalBar, Section
 from .provenance import origin_tables
@@ -504,7 +505,7 @@ def _state_section(context: ReportContext) -> Section:
 
 
 def _certificate_section(context: ReportContext) -> Section:
-    """Return the accuracy and the largest corrections."""
+    """Return the accuracy, the uncertainty budget and the largest corrections."""
     text = (
         "“Before” is the nominal robot with base and tool fitted to the same measurements, if they are "
         "unknown."
@@ -518,7 +519,13 @@ def _certificate_section(context: ReportContext) -> Section:
     n_hidden = len(changed) - len(rows)
     caption = "Largest corrections" + (f" ({n_hidden} more in the report)" if n_hidden > 0 else "")
     corrections = Table(["parameter", "frame", "change", "standard deviation"], rows, 2, caption)
-    tables = [summary.accuracy_table(context.comparisons), *([corrections] if rows else [])]
+    stated = context.comparisons[0]
+    budget = UncertaintyBudget.from_fit(fit, stated)
+    tables = [
+        summary.accuracy_table(context.comparisons),
+        *([budget.table(stated.title)] if budget else []),
+        *([corrections] if rows else []),
+    ]
     return Section("accuracy", "Accuracy before and after", [text], tables=tables)
 
 
