@@ -121,18 +121,18 @@ class PoseCharacteristics:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the JSON document [m and rad]."""
+        found = [point.characteristics() | point.drift() for point in self.points]
         points = [
             {
                 "point": point.name,
                 "cycles": len(point.cycles),
                 "commanded_m": point.commanded.tolist(),
-                **point.characteristics(),
-                **point.drift(),
+                **values,
             }
-            for point in self.points
+            for point, values in zip(self.points, found, strict=True)
         ]
-        names = [name for name in points[0] if name not in ("point", "cycles", "commanded_m")]
-        largest = {name: max(abs(point[name]) for point in points if name in point) for name in names}
+        names = dict.fromkeys(name for each in found for name in each)
+        largest = {name: max(abs(each[name]) for each in found if name in each) for name in names}
         longest = self.longest_distance()
         return {
             "standard": "ISO 9283:1998",
@@ -145,13 +145,10 @@ class PoseCharacteristics:
     def tables(self) -> list[Table]:
         """Return one table of the points and one of the longest distance."""
         document = self.to_dict()
-        rows = [("", document["overall"]), *((each["point"], each) for each in document["points"])]
-        columns = [(name, unit) for name, unit in _SHOWN.items() if all(name in each for _, each in rows)]
+        rows = [*document["points"], {"point": "largest"} | document["overall"]]
+        columns = [(name, unit) for name, unit in _SHOWN.items() if all(name in row for row in rows)]
         header = [f"{name.rpartition('_')[0]}, {'mm' if unit == 'm' else 'mrad'}" for name, unit in columns]
-        cells = [
-            [label or "largest", *(_cell(each[name], unit) for name, unit in columns)]
-            for label, each in (*rows[1:], rows[0])
-        ]
+        cells = [[row["point"], *(_cell(row[name], unit) for name, unit in columns)] for row in rows]
         clauses = ", ".join(f"{name} {clause}" for name, clause in CLAUSES.items())
         tables = [Table(["point", *header], cells, caption=f"ISO 9283:1998: {clauses}")]
         if longest := self.longest_distance():
@@ -216,6 +213,8 @@ def pose_characteristics(
         cycles = np.array([samples[i][1] for i in index])
         if len(np.unique(cycles)) < len(cycles):
             cycles = np.arange(1, len(index) + 1)
+        in_order = np.argsort(cycles)
+        index, cycles = index[in_order], cycles[in_order]
         turned = None if rotations is None else rotations[index]
         found.append(PointCycles(name, cycles, commanded[index].mean(0), attained[index], turned))
     return PoseCharacteristics(found)
