@@ -15,8 +15,8 @@ from ..exceptions import InvalidArgumentError
 from ..formatting import Table
 from ..io.measurement_files import configurations_text
 from ..io.robot import read_robot
+from ..iso9283.cube import CYCLES, SIDES, IsoCube, find_iso_cube
 from ..measurements.base import Noise
-from ..planning.iso_cube import CYCLES, SIDES, IsoCube, find_iso_cube
 from ..programs import Program, Stop, program_text, require_program_ending
 from ..report.provenance import file_digests, versions
 from ..robot.chain import Chain
@@ -30,17 +30,8 @@ from .screens.result_screens import files_block, notes_block
 from .screens.screen import Block, Screen
 
 # Options of other plans.
-_EXCLUDED = {
-    "-n": "count",
-    "--from": "candidates_from",
-    **{
-        f"--{name}": name
-        for name in (
-            *("recheck", "repeat", "kind", "sigma", "rig", "criterion", "task", "parameters", "priors", "data"),
-            *("candidates", "html", "report"),
-        )
-    },
-}
+_NAMES = "recheck repeat kind sigma rig criterion task parameters priors data candidates html report"
+_EXCLUDED = {"-n": "count", "--from": "candidates_from"} | {f"--{name}": name for name in _NAMES.split()}
 
 
 @dataclass(frozen=True, eq=False)

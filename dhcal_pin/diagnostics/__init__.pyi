@@ -22,8 +22,6 @@ from .inspection import inspect_file as inspect_file
 from .installation import InstallationCheck as InstallationCheck
 from .installation import check_calibration as check_calibration
 from .installation import check_installation as check_installation
-from .iso9283 import PoseCharacteristics as PoseCharacteristics
-from .iso9283 import pose_characteristics as pose_characteristics
 from .reachability import UnreachableRow as UnreachableRow
 from .reachability import find_unreachable_rows as find_unreachable_rows
 from .residuals import JointProfile as JointProfile

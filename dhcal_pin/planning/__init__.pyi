@@ -6,8 +6,6 @@ from .curve_prediction import CurvePrediction as CurvePrediction
 from .information import Information as Information
 from .information import PlannedCalibration as PlannedCalibration
 from .information import plannable_kinds as plannable_kinds
-from .iso_cube import IsoCube as IsoCube
-from .iso_cube import find_iso_cube as find_iso_cube
 from .named_criteria import CRITERIA as CRITERIA
 from .planner import Plan as Plan
 from .planner import plan as plan

@@ -19,6 +19,7 @@ from ..calibration import summary
 from ..calibration.cross_validation import Generalization
 from ..calibration.estimates import Estimate
 from ..calibration.model_selection import trial_table
+from ..calibration.presentation.budget import UncertaintyBudget
 from ..calibration.presentation.curves import JointCurve, find_lattices, fitted_coverage
 from ..calibration.presentation.workspace import RELATIVE_TEXT
 from ..diagnostics.residuals import median_sigmas
@@ -29,7 +30,6 @@ from ..io.origins_file import origin_table
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..robot.chain import BASE_FRAME
 from . import figures, images, samples
-from .budget import UncertaintyBudget
 from .context import ReportContext
 from .document import BarTable, IntervalBar, Section
 from .provenance import origin_tables

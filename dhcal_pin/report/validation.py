@@ -11,8 +11,8 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evaluation import Accuracy, compute_errors, error_norms
 from ..calibration.summary import STATISTIC_LABELS, statistic
-from ..diagnostics.iso9283 import PoseCharacteristics
 from ..formatting import Table
+from ..iso9283.characteristics import PoseCharacteristics
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..robot.chain import Chain

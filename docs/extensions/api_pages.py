@@ -20,7 +20,7 @@ import dhcal_pin
 
 PACKAGES = (
     "robot measurements estimation identifiability io calibration plausibility planning diagnostics "
-    "visualization report studies paper"
+    "visualization iso9283 report studies paper"
 ).split()
 _FOLDER = Path("reference/api")
 # Order of the packages on the page of `dhcal_pin` itself.

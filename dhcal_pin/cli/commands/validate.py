@@ -127,8 +127,9 @@ OUTPUTS: dict[str, Output[Validated]] = {
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...diagnostics import find_extrapolation, pose_characteristics  # lazy import, as the following
+    from ...diagnostics import find_extrapolation  # lazy import, as the following: they load Pinocchio
     from ...io import existing_sidecar, robot_name
+    from ...iso9283 import pose_characteristics
     from ...report.provenance import file_digests
     from ...report.validation import Validation
     from ..output_table import chosen_files, file_contents, paths_by_name, require_endings

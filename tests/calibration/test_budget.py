@@ -7,7 +7,7 @@ import pytest
 from robots import paper
 
 import dhcal_pin as dh
-from dhcal_pin.report.budget import UncertaintyBudget
+from dhcal_pin.calibration.presentation.budget import UncertaintyBudget
 
 # Standard deviations per axis of the instrument, the arm at equal joint values and the configuration [m].
 INSTRUMENT, ARM, MODEL = 5e-5, 1e-4, 2e-4

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.evaluation import Comparison, compute_errors
-from ..calibration.result import Result
-from ..formatting import Quantity, Table
-from ..measurements.base import label_stops
-from ..measurements.pose import Pose
-from ..measurements.position import Position
+from ...formatting import Quantity, Table
+from ...measurements.base import label_stops
+from ...measurements.pose import Pose
+from ...measurements.position import Position
+from ..evaluation import Comparison, compute_errors
+from ..fitted import FittedModel
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class UncertaintyBudget:
     combined: float  #: Root of the sum of squares.
 
     @classmethod
-    def from_fit(cls, fit: Result, comparison: Comparison) -> UncertaintyBudget | None:
+    def from_fit(cls, fit: FittedModel, comparison: Comparison) -> UncertaintyBudget | None:
         """Compute the budget of positions or poses; None for other measurements and unknown uncertainty."""
         data = [item for item in fit.inliers if isinstance(item, (Position, Pose)) and len(item.rows)]
         errors = comparison.after.groups.get("position")
@@ -87,7 +87,7 @@ def _root(square: float) -> float:
     return float(np.sqrt(max(square, 0.0)))
 
 
-def _repeat_variance(fit: Result, data: list[Position | Pose]) -> float | None:
+def _repeat_variance(fit: FittedModel, data: list[Position | Pose]) -> float | None:
     """Return the pooled variance of repeated samples, sum of the axes [m²]; None without any."""
     total, freedom = 0.0, 0
     for item, errors in zip(data, compute_errors(fit.chain, data, fit.instruments), strict=True):

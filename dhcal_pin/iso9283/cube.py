@@ -22,6 +22,7 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Noise
+from ..planning.tour import is_move_free
 from ..robot.chain import Chain
 from ..robot.inverse_kinematics import (
     REACHED_TOL,
@@ -32,7 +33,6 @@ from ..robot.inverse_kinematics import (
     tool_pose_and_jacobian,
 )
 from ..robot.sampling import ConfigurationSampler, WorkspaceConstraints, limits_with_margin
-from .tour import is_move_free
 
 # Preferred sides of the cube, the largest first [m].
 SIDES = (1.0, 0.63, 0.4, 0.25)

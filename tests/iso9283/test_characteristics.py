@@ -7,9 +7,9 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from dhcal_pin.diagnostics import pose_characteristics
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import read_robot
+from dhcal_pin.iso9283 import pose_characteristics
 from dhcal_pin.measurements import Distance, Pose, Position
 from dhcal_pin.se3 import exp3, transform
 
