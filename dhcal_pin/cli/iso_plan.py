@@ -15,7 +15,7 @@ from ..exceptions import InvalidArgumentError
 from ..formatting import Table
 from ..io.measurement_files import configurations_text
 from ..io.robot import read_robot
-from ..iso9283.cube import CYCLES, SIDES, IsoCube, find_iso_cube
+from ..iso9283.cube import CYCLES, N_CENTRES, SIDES, IsoCube, find_iso_cube
 from ..measurements.base import Noise
 from ..programs import Program, Stop, program_text, require_program_ending
 from ..report.provenance import file_digests, versions
@@ -30,7 +30,7 @@ from .screens.result_screens import files_block, notes_block
 from .screens.screen import Block, Screen
 
 # Options of other plans.
-_NAMES = "recheck repeat kind sigma rig criterion task parameters priors data candidates html report"
+_NAMES = "recheck repeat kind sigma rig criterion task parameters priors data html report"
 _EXCLUDED = {"-n": "count", "--from": "candidates_from"} | {f"--{name}": name for name in _NAMES.split()}
 
 
@@ -106,7 +106,7 @@ def run_iso_plan(args: Namespace) -> int:
     space, margin = workspace_constraints(args), Noise(*parse_noise(args.margin, "--margin"))
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
     with console.show_progress("looking for a cube"):
-        cube = find_iso_cube(chain, sides, space, margin, args.seed)
+        cube = find_iso_cube(chain, sides, space, margin, args.candidates or N_CENTRES, args.seed)
     done = IsoPlanned(cube, chain, args.cycles or CYCLES, args, file_digests(inputs))
     contents = file_contents(files, done)
     write_outputs(contents, args.json, _document(done))

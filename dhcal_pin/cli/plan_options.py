@@ -153,7 +153,8 @@ def _add_search_options(parser: ArgumentParser) -> None:
         "--candidates",
         type=options.POSITIVE_INTEGER,
         metavar="N",
-        help=f"number of random candidates (default: {N_CANDIDATES}; {N_IMAGE_CANDIDATES} with --rig)",
+        help=f"number of random candidates (default: {N_CANDIDATES}; {N_IMAGE_CANDIDATES} with --rig, "
+        "1500 with --iso9283)",
     )
     parser.add_argument(
         "--from", dest="candidates_from", metavar="FILE", help="choose from the joint values in a file"

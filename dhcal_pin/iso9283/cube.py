@@ -42,8 +42,8 @@ CYCLES = 30
 POINTS = 0.8 * np.array([[0, 0, 0], [-1, -1, -1], [-1, 1, -1], [1, 1, 1], [1, -1, 1]])
 # Corners, middles of edges and faces, and centre, in the same units.
 GRID = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
-# Random configurations, whose tool poses are tried as centre and orientation.
-_N_CENTRES = 1500
+# Random configurations whose tool poses are tried as centre and orientation, by default.
+N_CENTRES = 1500
 # Steps of the inverse kinematics from the centre to a point of the cube.
 _IK_STEPS = 60
 # Points of the axis of the first joint that are checked.
@@ -67,6 +67,7 @@ def find_iso_cube(
     sides: Iterable[float] = SIDES,
     space: WorkspaceConstraints | None = None,
     margin: Noise | None = None,
+    candidates: int = N_CENTRES,
     seed: int = 0,
 ) -> IsoCube:
     """Find a cube of the first side that fits into the workspace, and the joint positions at its points.
@@ -76,7 +77,8 @@ def find_iso_cube(
         sides: Sides to try [m].
         space: Constraints of the tool and of the robot.
         margin: Margins to the joint limits: `rotation` [rad], `position` [m].
-        seed: Seed of the random centres.
+        candidates: Number of random configurations whose tool poses are tried as centre and orientation.
+        seed: Seed of these configurations.
 
     Returns:
         Cube with its points.
@@ -87,7 +89,7 @@ def find_iso_cube(
     space, margin, rng = space or WorkspaceConstraints(), margin or Noise(), np.random.default_rng(seed)
     sampler = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
     low, high = limits_with_margin(chain, margin.rotation, margin.position)
-    limited, starts, sides = replace(chain, lower=low, upper=high), sampler.draw(_N_CENTRES, rng), list(sides)
+    limited, starts, sides = replace(chain, lower=low, upper=high), sampler.draw(candidates, rng), list(sides)
     for is_turning, side in product((False, True), sides):
         for q in _reachable(limited, starts, side, sampler, is_turning):
             # Every point is approached from the one before, P1 from P5.
