@@ -17,7 +17,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--output",
         metavar="FILE",
         required=True,
-        help="file to write: NAME.h, a C99 header without dependencies, whose functions begin with its name, or "
+        help="file to write: NAME.h, a C99 header whose functions begin with the name of the file, or "
         "NAME.py, a Python module that needs NumPy only",
     )
     add_urdf_options(parser)
