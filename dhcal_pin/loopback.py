@@ -32,11 +32,19 @@ def new_token() -> str:
     return secrets.token_urlsafe(_TOKEN_BYTES)
 
 
+@tornado.web.stream_request_body
+class _UnknownAddress(tornado.web.RequestHandler):
+    """Refuses a request by its header, before its body arrives."""
+
+    def prepare(self) -> None:
+        raise tornado.web.HTTPError(404)
+
+
 def local_application(
     token: str, handlers: Sequence[tuple[Any, ...]], **settings: Any
 ) -> tornado.web.Application:
     """Create an application that answers requests for the loopback address below a token only."""
-    app = tornado.web.Application(**settings)
+    app = tornado.web.Application(**settings, default_handler_class=_UnknownAddress)
     root = f"/{re.escape(token)}/"
     app.add_handlers(_HOSTS, [(root + pattern, *rest) for pattern, *rest in handlers])
     return app

@@ -28,6 +28,7 @@ class App:
     process: subprocess.Popen[str]
     url: str
     folder: Path
+    first_line: str
 
     def contents(self) -> list[Path]:
         """Everything in the temporary folder but the empty folder of the server."""
@@ -52,7 +53,7 @@ def start_app(folder: Path, *options: str) -> App:
     line = process.stderr.readline()
     url = re.search(r"http://\S+/", line)
     assert url, line
-    return App(process, url[0], folder)
+    return App(process, url[0], folder, line)
 
 
 def form(files: dict[str, bytes], request: Any) -> tuple[bytes, dict[str, str]]:

@@ -2,6 +2,7 @@
 "use strict";
 
 const LIMIT = Number(document.documentElement.dataset.limit);
+const MAX_FILES = Number(document.documentElement.dataset.files);
 const ROLES = { robot: "Robot", data: "Measurements", columns: "Column map", beside: "Sidecar or other" };
 const ROBOT = /\.(urdf|dh\.toml|dh\.csv|ya?ml)$/i;
 // Pause before the files are checked again after a change [ms].
@@ -61,6 +62,10 @@ function setRole(name, role) {
 function addFiles(added) {
   const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
   const size = [...added].reduce((sum, file) => sum + file.size, total);
+  if (files.size + added.length > MAX_FILES) {
+    showError("file-error", `More than ${MAX_FILES} files; join the rows of several measurement files in one.`);
+    return;
+  }
   if (size > LIMIT) {
     showError("file-error", `The files have ${megabytes(size)}; at most ${megabytes(LIMIT)} are accepted (dhcal app --max-size).`);
     return;

@@ -8,12 +8,16 @@ anything, so several browsers can work at once.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
+import os
+import shutil
 import signal
-from collections.abc import AsyncGenerator, Callable
-from contextlib import aclosing, suppress
+import time
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import aclosing, contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import tornado.httpserver
@@ -25,7 +29,7 @@ from ..exceptions import DhcalError, InvalidArgumentError
 from ..loopback import LOOPBACK, is_same_origin, local_application, new_token
 from ..messages import message_line
 from . import command
-from .upload import Upload
+from .upload import MAX_FILES, Upload
 
 # Default limit of all files of a request [bytes].
 DEFAULT_LIMIT = 100 * 10**6
@@ -35,6 +39,11 @@ MAX_RUNS = 4
 MAX_PORT = 65535
 # Largest part of a form that contains no file content [bytes].
 _FORM_BYTES = 10**6
+
+# Start of the names of the servers' folders in the folder for temporary files.
+_FOLDER_PREFIX = "dhcal-app-"
+# Age of a folder from which its server has locked it [s].
+_LOCKED_AGE_S = 10.0
 
 _PAGE_FOLDER = Path(__file__).parent
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
@@ -70,8 +79,8 @@ async def serve(show_address: Callable[[str], object], *, port: int = 0, limit: 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, stopped.set)
     token = new_token()
-    with TemporaryDirectory(prefix="dhcal-app-") as folder:
-        service = _Service(Path(folder), limit)
+    with _server_folder() as folder:
+        service = _Service(folder, limit)
         server = tornado.httpserver.HTTPServer(
             local_application(token, _routes(service)), max_body_size=limit + _FORM_BYTES
         )
@@ -85,6 +94,33 @@ async def serve(show_address: Callable[[str], object], *, port: int = 0, limit: 
         server.stop()
         await service.stop()
         await server.close_all_connections()
+
+
+@contextmanager
+def _server_folder() -> Iterator[Path]:
+    """Create the locked folder of this server, and remove those of servers that were killed.
+
+    The system releases the lock of a process that is killed.
+    """
+    for other in Path(gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
+        with suppress(OSError):
+            state = other.lstat()
+            if state.st_uid == os.getuid() and time.time() - state.st_mtime > _LOCKED_AGE_S:
+                with _locked(other):
+                    shutil.rmtree(other, ignore_errors=True)
+    with TemporaryDirectory(prefix=_FOLDER_PREFIX) as name, _locked(Path(name)):
+        yield Path(name)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder; `OSError` if another server has locked it, or if it is no folder."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 class _Service:
@@ -140,7 +176,9 @@ class _PageHandler(_Handler):
 
     def get(self) -> None:
         self.set_header("Content-Type", f"{_TYPES[self._path.suffix]}; charset=utf-8")
-        self.write(self._path.read_text(encoding="utf-8").replace("@LIMIT_BYTES@", str(self._limit)))
+        text = self._path.read_text(encoding="utf-8")
+        text = text.replace("@LIMIT_BYTES@", str(self._limit)).replace("@MAX_FILES@", str(MAX_FILES))
+        self.write(text)
 
 
 @tornado.web.stream_request_body

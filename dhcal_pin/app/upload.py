@@ -19,8 +19,11 @@ from ..messages import quote
 
 # Longest file name that all file systems accept [bytes].
 _MAX_NAME_BYTES = 255
+# Largest number of files, and longest command line that is made of a request [bytes].
+MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
 _TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns")
+_TOO_MANY_FILES = f"more than {MAX_FILES} files; join the rows of several measurement files in one"
 # Options without a value.
 _SWITCHES = ("skip-bad-rows", "force")
 # Options with a list of texts.
@@ -45,9 +48,13 @@ class Upload:
             tornado.httputil.parse_body_arguments(content_type, body, arguments, parts)
             request = json.loads(arguments["request"][0])
         except (ValueError, KeyError, RecursionError, tornado.httputil.HTTPInputError) as error:
+            if "too many parts" in str(error):
+                raise InvalidArgumentError(_TOO_MANY_FILES) from error
             raise InvalidArgumentError("the form is malformed; load the page again") from error
         if not isinstance(request, dict):
             raise InvalidArgumentError("the form is malformed; load the page again")
+        if len(parts.get("file", [])) > MAX_FILES:
+            raise InvalidArgumentError(_TOO_MANY_FILES)
         files: dict[str, bytes] = {}
         for part in parts.get("file", []):
             name = str(part["filename"])
@@ -62,6 +69,8 @@ class Upload:
         names = [*([robot] if robot else []), *data]
         if unknown := [name for name in names if name not in files]:
             raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
+        if sum(len(word.encode()) + 1 for word in (*names, *options)) > _MAX_COMMAND_BYTES:
+            raise InvalidArgumentError("names and options are too long; expected at most 100 kB together")
         return cls(files, robot, tuple(data), options)
 
     def save(self, folder: Path) -> None:

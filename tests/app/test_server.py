@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import psutil
 import pytest
 from app_requests import example_form, form, post, start_app
 
-from dhcal_pin.app.upload import Upload
+from dhcal_pin.app.upload import MAX_FILES, Upload
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
 
@@ -197,6 +199,64 @@ def test_large_files_are_refused_before_they_are_read(tmp_path):
         assert post(app, "calibrate", body, **headers)[0] == 200
     finally:
         assert app.stop() == 0
+
+
+def test_a_wrong_token_is_refused_by_the_header(app):
+    """The answer comes before the body, none of which is kept."""
+    server, parts = psutil.Process(app.process.pid), urlsplit(app.url)
+    before = server.memory_info().rss
+    head = f"POST /wrong/calibrate HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
+    for _ in range(3):
+        with socket.create_connection((parts.hostname, parts.port), timeout=30) as connection:
+            connection.sendall(f"{head}Content-Length: 95000000\r\n\r\n".encode())
+            assert b" 404 " in connection.recv(1000)
+            with suppress(ConnectionError):
+                for _ in range(30):
+                    connection.sendall(b" " * 1_000_000)
+            assert server.memory_info().rss - before < 10_000_000
+
+
+@pytest.mark.parametrize("n_files", [MAX_FILES + 1, 300])
+def test_too_many_files_are_one_line(app, n_files):
+    names = [f"{i}.csv" for i in range(n_files)]
+    body, headers = form(dict.fromkeys(names, b""), {"data": names})
+    status, (message,) = post(app, "inspect", body, **headers)
+    assert status == 200
+    assert message["error"].startswith(f"more than {MAX_FILES} files; ")
+
+
+@pytest.mark.parametrize(
+    "request_changes",
+    [{"columns": "x" * 150_000}, {"mend": ["x" * 50_000] * 40}, {"data": ["a.csv"] * 50_000}],
+)
+def test_options_that_no_command_line_can_hold_are_one_line(app, request_changes):
+    body, headers = form({"a.csv": b""}, {"data": ["a.csv"]} | request_changes)
+    message = {"error": "names and options are too long; expected at most 100 kB together"}
+    assert post(app, "inspect", body, **headers) == (200, [message])
+
+
+def test_the_next_start_removes_the_folder_of_a_killed_server(tmp_path):
+    killed, other = start_app(tmp_path / "app"), start_app(tmp_path / "app")
+    folders = set(killed.folder.iterdir())
+    assert len(folders) == 2
+    assert killed.stop(signal.SIGKILL) == -signal.SIGKILL
+    assert set(killed.folder.iterdir()) == folders
+    (killed.folder / "dhcal-app-file").touch()
+    (killed.folder / "dhcal-app-link").symlink_to(tmp_path)
+    for path in killed.folder.iterdir():
+        os.utime(path, (0, 0), follow_symlinks=False)
+    assert start_app(tmp_path / "app").stop() == 0
+    assert len(folders & set(killed.folder.iterdir())) == 1
+    assert other.stop() == 0
+    assert {path.name for path in killed.folder.iterdir()} == {"dhcal-app-file", "dhcal-app-link"}
+    assert tmp_path.exists()
+
+
+def test_the_address_has_a_line_of_its_own(tmp_path):
+    app = start_app(tmp_path / "app")
+    app.process.send_signal(signal.SIGTERM)
+    assert app.first_line == f"{app.url}\n"
+    assert app.process.communicate(timeout=20)[1] == "end with Ctrl-C\n"
 
 
 def test_a_port_in_use_is_one_line(app):

@@ -39,7 +39,7 @@ def run(args: Namespace) -> int:
     from ..screens import console
 
     def show_address(url: str) -> None:
-        console.print_lines(f"page at {url}; end with Ctrl-C")
+        console.print_lines(url, "end with Ctrl-C")
         if not args.no_browser:
             console.open_url(url)
 

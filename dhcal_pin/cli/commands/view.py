@@ -142,7 +142,7 @@ def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Name
 
     q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
     with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:
-        console.print_lines(f"live at {server.url}; end with Ctrl-C")
+        console.print_lines(server.url, "end with Ctrl-C")
         console.open_url(server.url)
         try:
             while True:
