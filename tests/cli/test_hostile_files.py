@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import pytest
 from command_line import CALIBRATE, positions_csv
@@ -238,3 +239,37 @@ def test_names_that_a_spreadsheet_or_a_browser_would_execute(run, robot_folder):
     report = Path("r.md").read_text()
     assert r"\<script\>" in report or "&lt;script" in report
     assert "<script" not in report.replace(r"\<script", "")
+
+
+def test_names_of_joints_that_a_browser_would_execute(run, robot_folder):
+    """A joint may be called `<b>`; no page takes its name for markup, and every file is read again."""
+    names = ["<b>", "<script>alert(1)</script>", "</script><img src=x onerror=alert(1)>"]
+    joints = [f"[[joint]]\nname = '{name}'\ntheta = 0\nd = 0.3\na = 0.2\nalpha = 1.0\n" for name in names]
+    units = '[units]\nlength = "m"\nangle = "rad"\n'
+    Path("b.dh.toml").write_text(f'convention = "standard"\n{units}' + "".join(joints))
+    assert run("simulate", "b.dh.toml", "-m", "20", "--errors", "1mm,1mrad", "-o", "b.csv")[0] == 0
+    outputs = [
+        "-o",
+        "b.urdf",
+        "--report",
+        "b.html",
+        "--scene",
+        "s.html",
+        "--residuals",
+        "r.csv",
+        "--json",
+        "b.json",
+    ]
+    assert run("calibrate", "b.dh.toml", "b.csv", "--parameters", "dh", *outputs)[0] == 0
+    assert run("inspect", "b.csv", "--robot", "b.urdf")[0] == 0
+    for page in ("b.html", "s.html"):
+        text = Path(page).read_text(encoding="utf-8")
+        assert "&lt;b&gt;" in text or r"\u003cb" in text.lower()
+        assert not any(word in text for word in ("<script>alert", "<b>", "<img src=x"))
+
+
+@pytest.mark.parametrize("name", ["a,b", "a;b", "a[b]", "#a", 'a"b', "a'b", "=1", "a\tb", " a"])
+def test_names_of_joints_that_no_column_can_have(assert_refused, name):
+    text = Path("arm.urdf").read_text().replace('"joint_1"', quoteattr(name))
+    Path("arm.urdf").write_text(text)
+    assert_refused(["joint name", "rename the joint"], "calibrate", "arm.urdf", "data.csv", "-o", "o.urdf")
