@@ -179,7 +179,7 @@ def compute_errors(
     data = [item.matched_to(known) for item in data]
     data = [
         item.mounted(chain)
-        if all(parameter.name in known for parameter in item.instrument_parameters)
+        if all(p.name in known and not p.is_local for p in item.instrument_parameters)
         else item.initialized(chain)
         for item in data
     ]

@@ -61,7 +61,7 @@ from .cameras import (
     split_sets,
     with_stated_distortion,
 )
-from .cameras.procedure import ImageFitting, calibrate_images, require_no_selection
+from .cameras.procedure import ImageFitting, calibrate_images, require_no_selection, with_common_start
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
@@ -185,6 +185,7 @@ def calibrate(
         signs = decide_signs(chain, data)
     chain = signs.apply(chain) if signs else chain
     data, exchanges = exchange_axes(chain, data)
+    data = with_common_start(chain, data)
     holdout = reorder(holdout, exchanges)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())

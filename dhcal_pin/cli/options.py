@@ -221,7 +221,8 @@ def _parameter_sets() -> str:
     from ..estimation.parameters import PARAMETER_SETS
 
     images = "; ".join(f"{name} ({text})" for name, text in RIG_SETS.items())
-    default = f"{DEFAULT_SETS}, or {HAND_EYE_SETS} if poses of the tip stand in place of joint values"
+    default = f"{DEFAULT_SETS} (and base,tool beside other instruments), or {HAND_EYE_SETS}"
+    default += " if poses of the tip stand in place of joint values"
     return f"{_described(PARAMETER_SETS)}; with --rig, where the default is {default}: {images}"
 
 

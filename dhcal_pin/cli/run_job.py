@@ -22,7 +22,7 @@ import numpy as np
 
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
-from ..calibration.cameras import default_sets, has_images, has_joint_values
+from ..calibration.cameras import MIXED_SETS, default_sets, has_images, has_joint_values
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.presentation.curves import find_lattices
@@ -123,7 +123,7 @@ def run_job(
         chain = replace(chain, parameters=HAND_BUILT)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
-    sets = chain.parameters if job.parameters is None else job.parameters
+    sets = job.parameters if job.parameters is not None else MIXED_SETS if job.rig else chain.parameters
     data = _read_data(chain, job, servos, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
     if job.parameters is None:
         sets = default_sets(chain, list(data.fit.values()))

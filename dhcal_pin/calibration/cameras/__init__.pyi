@@ -17,6 +17,7 @@ from .lens_priors import with_stated_distortion as with_stated_distortion
 from .seen_ranges import seen_ranges_warning as seen_ranges_warning
 from .sets import DEFAULT_SETS as DEFAULT_SETS
 from .sets import HAND_EYE_SETS as HAND_EYE_SETS
+from .sets import MIXED_SETS as MIXED_SETS
 from .sets import RIG_SETS as RIG_SETS
 from .sets import default_sets as default_sets
 from .sets import has_images as has_images

@@ -36,7 +36,7 @@ from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.images.camera_parameters import POINTS_SET
-from ..partition import Fold, configuration_groups, different_configurations, k_fold
+from ..partition import Fold, configuration_groups, k_fold
 from ..reweighting import Fit
 from .corner_noise import fit_with_corner_noise
 from .jitter import Jitter, estimate_jitter, with_jitter
@@ -329,8 +329,9 @@ def _change(before: Stage, after: Stage) -> str:
 def cluster_folds(data: Sequence[Measurement]) -> tuple[Fold, ...]:
     """Divide the configurations of measurements into clusters of joint space."""
     label = configuration_groups(data)
-    q, _ = different_configurations(data)
-    if len(q) < 2 * N_CLUSTERS or len(q) != label.max() + 1:
+    # Samples of two configurations, such as relative poses, are in the cluster of the first one.
+    q = np.concatenate([item.q for item in data])[np.unique(label, return_index=True)[1]]
+    if len(q) < 2 * N_CLUSTERS:
         return ()
     std = q.std(0)
     points = (q - q.mean(0))[:, std > 0] / std[std > 0]

@@ -97,10 +97,10 @@ def _log_likelihood(images: Sequence[tuple[Array, Array]], jitter: Jitter) -> fl
     std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
     out = 0.0
     for residual, derivative in images:
-        scaled = derivative * std
-        precision = np.eye(6) + scaled.T @ scaled
-        right = scaled.T @ residual
-        out += 0.5 * float(right @ np.linalg.solve(precision, right)) - 0.5 * np.linalg.slogdet(precision)[1]
+        # I + A·Aᵀ in the singular vectors of A, which may be large and singular for images of another arm.
+        u, s, _ = np.linalg.svd(derivative * std, full_matrices=False)
+        explained = (u.T @ residual) ** 2 * s**2 / (1 + s**2)
+        out += 0.5 * float(np.sum(explained - np.log1p(s**2)))
     return out
 
 

@@ -14,10 +14,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ..._typing import Progress
 from ...estimation.priors import PriorGroups
-from ...exceptions import InvalidArgumentError
+from ...exceptions import InvalidArgumentError, NotObservableError
 from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
 from ..model_selection import Extension
 from ..result import Result, make_result
@@ -28,7 +31,7 @@ from .diagnosis import LARGE_ERROR, HandEyeFit
 from .gate import apply_gate, judge_stages, judge_target_points
 from .lens_priors import lens_prior_groups, with_lens_priors
 from .seen_ranges import seen_ranges_warning
-from .sets import DEFAULT_SETS
+from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
 
@@ -39,6 +42,23 @@ def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[
             f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
             f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
         )
+
+
+def with_common_start(chain: Chain, data: tuple[Measurement, ...]) -> tuple[Measurement, ...]:
+    """Return images of several files with first values from all of them, if one file alone has too few."""
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    names = {tuple(p.name for p in item.instrument_parameters) for item in images}
+    if len(images) < 2 or len(names) > 1:
+        return data
+    try:
+        for item in images:
+            item.initialized(chain)
+    except NotObservableError:
+        columns = {n: np.concatenate([getattr(item, n) for item in images]) for n in images[0].sample_fields}
+        joined = images[0].replace(**columns, recorded=None).initialized(chain)
+        start = {p.name: p.nominal for p in joined.instrument_parameters}
+        return tuple(item.with_values(start) if isinstance(item, CameraCorners) else item for item in data)
+    return data
 
 
 @dataclass(frozen=True)
@@ -53,7 +73,15 @@ class ImageFitting:
     def reweight(self, fit: Fit) -> Fit:
         """Estimate noise, weights and widths of priors, those of lenses included."""
         groups = self.groups.joined(lens_prior_groups(fit.problem))
-        return reweight(fit, self.stages, groups, self.max_iterations, self.progress)
+        fit = reweight(fit, self.stages, groups, self.max_iterations, self.progress)
+        images = [(item, w) for item, w in zip(fit.data, fit.weights, strict=True) if has_images([item])]
+        if not any((weights > 0.5).any() for _, weights in images):
+            raise InvalidArgumentError(
+                f"{images[0][0].source or 'images'}: no image agrees with the other measurements; expected "
+                "joint values and a rig of the same arm, and base and tool among the parameters if another "
+                "instrument measures in a frame of its own"
+            )
+        return fit
 
 
 def calibrate_images(

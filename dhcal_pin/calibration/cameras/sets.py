@@ -25,6 +25,8 @@ _ARM_SETS = "placement,offset"
 DEFAULT_SETS = f"{_ARM_SETS},camera,board,intrinsics"
 # Sets that are estimated by default from images of which only the pose of the tip is known.
 HAND_EYE_SETS = "camera,board,intrinsics"
+# The same beside other instruments, which measure in a frame of their own and at a target of their own.
+MIXED_SETS = f"{DEFAULT_SETS},base,tool"
 # Largest number of corners of all boards that are estimated to judge whether boards are as stated.
 MAX_POINTS = 150
 
@@ -46,7 +48,8 @@ def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
         return chain.parameters
     if not has_joint_values(data):
         return HAND_EYE_SETS
-    return DEFAULT_SETS.replace(_ARM_SETS, LOW_COST) if LOW_COST in chain.parameters else DEFAULT_SETS
+    sets = DEFAULT_SETS if all(item.rig is not None for item in data) else MIXED_SETS
+    return sets.replace(_ARM_SETS, LOW_COST) if LOW_COST in chain.parameters else sets
 
 
 def has_joint_values(data: Sequence[Measurement]) -> bool:

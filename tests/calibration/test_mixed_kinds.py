@@ -1,0 +1,120 @@
+"""Calibrations with two measurement kinds at once, for all pairs of `KINDS`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from slow_cases import some_slow
+
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration.cameras import procedure
+from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.exceptions import InvalidArgumentError, NotObservableError
+from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
+from dhcal_pin.measurements.camera import simulated_rig
+from dhcal_pin.se3 import exp6
+
+# Known distances between points need contacts with these points: see `test_kinds`.
+PAIRS = list(combinations([name for name in KINDS if name != "point_distance"], 2))
+FAST = [PAIRS.index(pair) for pair in (("position", "camera"), ("wires", "plane"), ("position", "plane"))]
+
+
+def placed(chain):
+    """Return the robot in a measuring frame of its own, with a target beside its flange."""
+    return chain.with_base_and_tool(
+        exp6(np.array([2.0, 1, 0.3, 0.3, 0.2, 1])), exp6(np.array([0.05, 0.02, 0.1, 0.3, 0.1, 0.2]))
+    )
+
+
+def small_errors(chain, rng):
+    """Return a robot with errors of about 1 mm and 3 mrad."""
+    errors = select_parameters(chain, "dh")
+    std = np.array([1e-3 if p.unit == "m" else 3e-3 for p in errors.parameters])
+    return errors.at(std * rng.standard_normal(len(std)))
+
+
+@pytest.mark.parametrize(("first", "second"), some_slow(PAIRS, FAST))
+def test_two_kinds_predict_what_they_did_not_see(first, second, sim_6dof):
+    """Held-out samples of both kinds are predicted up to the noise, whatever the other kind is."""
+    rng = np.random.default_rng(PAIRS.index((first, second)))
+    truth = placed(small_errors(sim_6dof, rng))
+    noise = Noise(1e-4, 1e-4)
+    draw = lambda: rng.uniform(-2.5, 2.5, (40, 6))  # noqa: E731
+    data = [KINDS[kind].simulate(truth, draw(), noise, rng) for kind in (first, second)]
+    fitted, left_out = [], []
+    for item in data:
+        is_fitted = item.sample_groups % 4 < 3
+        fitted.append(item.take(is_fitted))
+        left_out.append(item.take(~is_fitted))
+    parameters = None if "camera" in (first, second) else "dh,base,tool"
+    result = calibrate(sim_6dof, fitted, parameters, extend="none")
+    assert result.converged
+    for item, weights in zip(left_out, result.weights, strict=True):
+        assert np.mean(weights > 0.5) > 0.9, item.kind
+        found = result.validate(item)
+        for key in ("position_rms_m", "orientation_rms_rad", "residual_rms"):
+            assert found.get(key, 0.0) < (0.5 if found.get("unit") == "px" else 1e-3), (item.kind, key)
+
+
+def test_images_that_turn_about_one_axis_only_use_the_poses_of_another_file(sim_6dof):
+    """The first joint alone does not determine camera and board; images of all joints beside it do."""
+    rng = np.random.default_rng(5)
+    truth = small_errors(sim_6dof, rng)
+    q = rng.uniform(-2.5, 2.5, (90, 6))
+    q[:30, 1:] = q[0, 1:]
+    images = KINDS["camera"].simulate(truth, q, Noise(1e-4), rng)
+    poses = tuple(replace(board, pose=None) for board in images.rig.boards)
+    images = images.with_rig(replace(images.rig, boards=poses))
+    number = np.repeat(np.arange(90), 6)
+    one_axis, other, left_out = (images.take(number // 30 == i) for i in range(3))
+    with pytest.raises(NotObservableError, match="one axis only"):
+        calibrate(sim_6dof, one_axis)
+    result = calibrate(sim_6dof, [one_axis, other])
+    assert result.verdict.status == "ok"
+    assert result.validate(left_out)["residual_rms"] < 0.3
+
+
+def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
+    rng = np.random.default_rng(6)
+    q = rng.uniform(-2.5, 2.5, (30, 6))
+    q[:, 1:] = q[0, 1:]
+    images = KINDS["camera"].simulate(sim_6dof, q, Noise(1e-4), rng)
+    cameras = mount_rig(simulated_rig(sim_6dof, q), sim_6dof).cameras
+    boards = tuple(replace(board, pose=None) for board in images.rig.boards)
+    rig = replace(images.rig, cameras=cameras, boards=boards)
+    names = [cameras[i].name for i in images.camera]
+    images = CameraCorners(images.q, images.values, images.corner, rig, names, None, images.sigma)
+    result = calibrate(sim_6dof, images, "camera,board")
+    assert result.converged
+    assert result.comparisons[-1].after["residual_rms"] < 0.3
+
+
+def test_images_without_weight_are_refused(sim_6dof, monkeypatch):
+    """No result is made from the other measurements alone if the robust loss rejects all images."""
+    rng = np.random.default_rng(7)
+    positions, images = (
+        KINDS[kind].simulate(sim_6dof, rng.uniform(-2.5, 2.5, (20, 6)), Noise(1e-4), rng)
+        for kind in ("position", "camera")
+    )
+    rejected = (np.ones(len(positions.rows)), np.zeros(len(images.rows)))
+    monkeypatch.setattr(procedure, "reweight", lambda fit, *_: replace(fit, weights=rejected))
+    with pytest.raises(InvalidArgumentError, match=r"images: no image agrees .* base and tool"):
+        calibrate(sim_6dof, [positions, images], session="off")
+
+
+def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():
+    rng = np.random.default_rng(8)
+    residual, derivative = rng.normal(size=12), rng.normal(size=(12, 6))
+    jitter = Jitter(1.0, 0.7, 0.3)
+    scaled = derivative * ([0.7] * 3 + [0.3] * 3)
+    with_it, without = (
+        multivariate_normal(cov=np.eye(12) + extra).logpdf(residual) for extra in (scaled @ scaled.T, 0)
+    )
+    assert _log_likelihood([(residual, derivative)], jitter) == pytest.approx(with_it - without, rel=1e-12)
+    huge = 1e12 * derivative[:, [0, 0, 1, 1, 2, 2]]
+    assert np.isfinite(_log_likelihood([(residual, huge)], jitter))
