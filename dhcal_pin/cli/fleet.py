@@ -39,7 +39,7 @@ from ..io.toml_table import Key, TomlTable
 from ..messages import message_line
 from ..parallel import end_with_parent
 from .bundled_job import run_any_job
-from .job import Job, option_flags
+from .job import DOUBTFUL, Job, option_flags
 from .job_outputs import ROBOT_FORMATS, companion_paths
 from .options import STDOUT, IntegerType
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
@@ -305,7 +305,9 @@ def run_manifest(args: Namespace) -> int:
         return 130
     n_written = sum(map(_is_written, outcomes))
     console.show(_fleet_screen(entries, outcomes, args), args.verbosity)
-    return 0 if n_written == total else 1
+    if n_written < total:
+        return 1
+    return DOUBTFUL if args.strict and any(outcome.status != OK for outcome in outcomes) else 0
 
 
 # Styles of robots by status, the most severe first.

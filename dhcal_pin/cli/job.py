@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 REGION = "region"
 # Values of --arm.
 ARMS = ("industrial", "low-cost")
+# Exit status with --strict of robots that are written with another verdict than "ok".
+DOUBTFUL = 4
 # File extension of a bundle, and of a manifest of several jobs.
 BUNDLE_ENDING = ".dhcal.zip"
 MANIFEST_ENDING = ".fleet.toml"

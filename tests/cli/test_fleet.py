@@ -51,6 +51,11 @@ def write_manifest(folder, text):
 RUN = ("calibrate", "cells/all.fleet.toml", "-o", "summary.csv")
 
 
+def test_strict_tells_a_robot_with_caution(cells):
+    write_manifest(cells, job("arm.dh.toml", "b.urdf", 'parameters = "offset"'))
+    assert main.main([*RUN, "--jobs", "1", "--strict"]) == 4
+
+
 def test_failed_job_does_not_stop_the_others(cells, capsys):
     missing = job("no.dh.toml", "c.urdf", 'name = "the third"')
     write_manifest(

@@ -304,8 +304,9 @@ def test_many_outliers_advise_caution(run, robot_folder):
     columns["x[mm]"][::7] += 20 * np.random.default_rng(0).normal(size=len(columns["x[mm]"][::7]))
     write_columns(columns)
     command = ("calibrate", UR10, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--loss", "tukey")
-    status, out, _ = run(*command, "--json", "-")
-    assert status == 0
+    status, out, _ = run(*command, "--json", "-", "--strict")
+    assert status == 4
+    assert Path("out.urdf").exists()
     verdict = parse_json(out)["verdict"]
     assert verdict["status"] == "caution"
     assert "are outliers" in verdict["reasons"][0]

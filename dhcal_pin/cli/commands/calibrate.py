@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from ...exceptions import InvalidArgumentError
-from ..job import BUNDLE_ENDING, add_job_arguments, is_manifest
+from ..job import BUNDLE_ENDING, DOUBTFUL, add_job_arguments, is_manifest
 from ..options import add_execution_options
 
 # Exit status of a refused calibration.
@@ -32,6 +32,11 @@ def add_arguments(parser: ArgumentParser) -> None:
         default="status",
         help="status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` on "
         "stderr for each step, for programs that run this command",
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit status 4 for the verdict caution; the files are written",
     )
 
 
@@ -69,4 +74,7 @@ def _calibrate_robot(args: Namespace) -> int:
     ):
         outcome = run_any_job(job, folder, progress, executor)
     console.show(calibration_screen(outcome, job), args.verbosity)
-    return REFUSED if outcome.fit.verdict.is_refused and not job.force else 0
+    verdict = outcome.fit.verdict
+    if verdict.is_refused and not job.force:
+        return REFUSED
+    return DOUBTFUL if args.strict and verdict.status != "ok" else 0

@@ -1,7 +1,8 @@
 """Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
 
-The first sheet with content is read. Its rows are numbered as in Excel. Rows whose only cell starts with `#`
-are comments, as in a text file. Of a formula the value is read that Excel saved with it.
+The first sheet with a row of several numbers is read, else the first one with content. Its rows are numbered
+as in Excel. Rows whose only cell starts with `#` are comments, as in a text file. Of a formula the value is
+read that Excel saved with it.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
     filled = {title: rows for title, rows in sheets.items() if rows}
     if not filled:
         raise FileFormatError(f"{source}: is empty; the first row must be a header such as joint_1[deg]")
-    title, rows = next(iter(filled.items()))
+    title = next((each for each, rows in filled.items() if any(map(_has_numbers, rows))), next(iter(filled)))
+    rows = filled[title]
     others = [other for other in filled if other != title]
     notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
     return _build_table(source, rows, layout, f"Excel sheet {title!r}", notes)
@@ -78,6 +80,11 @@ def _numbered_rows(rows: Iterable[Sequence[Any]]) -> list[tuple[int, list[Any]]]
         (number, ["" if value is None else value for value in row]) for number, row in enumerate(rows, 1)
     )
     return [(number, cells) for number, cells in values if any(cell != "" for cell in cells)]
+
+
+def _has_numbers(row: tuple[int, Sequence[Any]]) -> bool:
+    """Return whether a row has as many numbers as the smallest table of measurements: three."""
+    return sum(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in row[1]) >= 3
 
 
 def _cell_text(value: Any, decimal: str) -> str:

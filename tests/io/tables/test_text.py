@@ -45,6 +45,21 @@ def test_a_comment_is_one_line():
     assert csv_text({"a": [1]}, ["b\nc,\r\u2028d"]) == "# b\\nc,\\r\\u2028d\na\n1\n"
 
 
+def test_the_sheet_with_numbers_is_read(tmp_path):
+    workbook = pytest.importorskip("openpyxl").Workbook()
+    workbook.active.title = "Info"
+    workbook.active.append(["Date", "2026-01-02"])
+    workbook.active.append(["Operator", "A. B."])
+    for title, numbers in (("Data", [1, 2.5, 3]), ("Other", [4, 5, 6])):
+        sheet = workbook.create_sheet(title)
+        sheet.append(["a", "b", "c"])
+        sheet.append(numbers)
+    workbook.save(tmp_path / "a.xlsx")
+    table = read_table(tmp_path / "a.xlsx")
+    assert table.headers == ("a", "b", "c")
+    assert table.notes == ("read sheet 'Data', not 'Info', 'Other'",)
+
+
 @pytest.mark.parametrize("name", ["=1", "+a", "@b", "-c"])
 def test_no_joint_name_heads_a_column_as_a_formula(name):
     with pytest.raises(DhcalError, match=r"arm\.urdf: joint name .*rename the joint"):
