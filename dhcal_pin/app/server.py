@@ -42,8 +42,8 @@ _FORM_BYTES = 10**6
 
 # Start of the names of the servers' folders in the folder for temporary files.
 _FOLDER_PREFIX = "dhcal-app-"
-# Age of a folder from which its server has locked it [s].
-_LOCKED_AGE_S = 10.0
+# Age of a folder from which its server has locked it [s]; it does so at once.
+_LOCKED_AGE_S = 0.5
 
 _PAGE_FOLDER = Path(__file__).parent
 _TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
