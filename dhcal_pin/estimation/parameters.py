@@ -283,7 +283,7 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
     "offset": ParameterSet(offset, "zero position of each joint"),
     LOW_COST: ParameterSet(
         low_cost,
-        "axes and zero positions of a low-cost servo arm: zeros 15 deg, lengths 3 mm, directions 2 deg",
+        "axes and zeros of a low-cost arm: zeros 15 deg, lengths 3 mm, directions 2 deg",
     ),
     **{
         name: ParameterSet(functools.partial(joint_errors, family=family), family.description)

@@ -23,6 +23,7 @@ from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path, sidecar_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
+from dhcal_pin.robot import Transmission
 from dhcal_pin.robot.chain import Chain
 
 AWAY = se3.exp6(np.array([2.0, -1.0, 0.5, 0.3, -0.2, 2.0]))
@@ -37,11 +38,17 @@ def covariance_by_differences(fit: Result, q: np.ndarray) -> np.ndarray:
     """Propagate the parameter covariance to the tool by central differences, shape (m, 6, 6)."""
     robot, h = len(fit.errors.parameters), 1e-5
     x, at = fit.x[:robot], fit.chain.poses(q)
+    errors = fit.errors
+    if fit.chain.transmission is not None:
+        # The torques of gravity are those of the written URDF.
+        transmission = errors.chain.transmission or Transmission.zero(fit.chain.loads)
+        transmission = replace(transmission, loads=fit.chain.transmission.loads)
+        errors = replace(errors, chain=errors.chain.with_transmission(transmission))
     columns = []
     for i in range(robot):
         step = np.zeros(robot)
         step[i] = h
-        up, down = (fit.errors.at(x + sign * step).poses(q) for sign in (1, -1))
+        up, down = (errors.at(x + sign * step).poses(q) for sign in (1, -1))
         rotation = (up - down)[:, :3, :3] @ np.swapaxes(at[:, :3, :3], 1, 2)
         angular = np.stack([rotation[:, 2, 1], rotation[:, 0, 2], rotation[:, 1, 0]], -1)
         columns.append(np.concatenate([(up - down)[:, :3, 3], angular], 1) / (2 * h))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import accuracy, calibrate
+from dhcal_pin.calibration import accuracy, calibrate, cross_validate, k_fold
 from dhcal_pin.cli.commands import demo
 from dhcal_pin.diagnostics import find_unreachable_rows
 from dhcal_pin.io import measurement_text, read_measurement_file
@@ -40,10 +40,14 @@ def test_experiment_figures(experiment):
 )
 def test_the_cross_validation_of_a_result_agrees(experiment, options, fitted, left_out):
     """Folds far from linear are fitted again; one of them takes a single step of the paper's loop."""
-    first, second = calibrate(experiment.chain, experiment.data, "dh", **options).comparisons
+    fit = calibrate(experiment.chain, experiment.data, "dh", **options)
+    first, second = fit.comparisons
     assert (first.title, second.title) == ("cross-validated", "fitted")
-    assert 1e3 * second.after["position_rms_m"] == pytest.approx(fitted, abs=5e-4)
-    assert 1e3 * first.after["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
+    assert 1e3 * fit.validate(experiment.data)["position_rms_m"] == pytest.approx(fitted, abs=5e-4)
+    folds = k_fold(fit.data, len(experiment.data.rows))
+    assert 1e3 * cross_validate(fit, folds).accuracy["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
+    # Figures of a result are without outliers.
+    assert (second.after["position_rms_m"] < 1e-3 * fitted - 1e-4) == bool(second.n_outliers)
 
 
 def test_unreachable_rows_are_found_with_their_reasons(experiment):

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from ...exceptions import InvalidArgumentError
-from ..job import BUNDLE_ENDING, DOUBTFUL, add_job_arguments, is_manifest
+from ..job import BUNDLE_ENDING, DOUBTFUL, Job, add_job_arguments, is_manifest
 from ..options import add_execution_options
 
 # Exit status of a refused calibration.
@@ -53,6 +53,7 @@ def run(args: Namespace) -> int:
         return run_manifest(args)
     if robot and not args.data:
         raise InvalidArgumentError(f"{robot}: DATA is required; name at least one measurement file")
+    Job.from_args(args)  # names an option that is missing, before heavy modules are loaded
     return _calibrate_robot(args)
 
 

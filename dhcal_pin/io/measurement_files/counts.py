@@ -20,7 +20,7 @@ TICKS = "ticks"
 
 def with_joint_values(table: DataTable, chain: Chain, servos: ServoFile | None) -> DataTable:
     """Return a table with the values of joints [rad] in place of counts, under the names of the joints."""
-    if table.has_numbers_as_header:
+    if table.has_numbers_as_header or not any(TICKS in header for header in table.headers):
         return table
     counts = [column for column in table.columns.values() if column.unit == TICKS]
     if not counts:
