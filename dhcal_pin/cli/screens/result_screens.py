@@ -117,6 +117,15 @@ def detection_screen(
 # --- inspect ---------------------------------------------------------------------------------------
 
 
+# Samples of the accuracies of a document, by the beginning of their keys.
+_ACCURACIES = {
+    "": "fitted",
+    "holdout_": "hold-out",
+    "cross_validated_": "cross-validated",
+    "holdout_region_": "left-out regions",
+}
+
+
 def bundle_screen(document: Mapping[str, Any], result: Mapping[str, Any]) -> Screen:
     """Describe a bundle: robot, data, options, versions, accuracy and verdict."""
     robot, verdict = document["robot"], result.get("verdict") or {}
@@ -124,10 +133,6 @@ def bundle_screen(document: Mapping[str, Any], result: Mapping[str, Any]) -> Scr
         f"{name}: {', '.join(map(str, value)) if isinstance(value, list) else value}"
         for name, value in document["options"].items()
         if name not in ("robot", "data")
-    ]
-    accuracy = [
-        f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in values.items() if _is_number(value))
-        for name, values in document["accuracy"].items()
     ]
     return Screen(
         [
@@ -139,15 +144,24 @@ def bundle_screen(document: Mapping[str, Any], result: Mapping[str, Any]) -> Scr
                 rank=1,
                 noun="version",
             ),
-            Block(accuracy, noun="figure", rank=4),
+            Block(_bundled_accuracy(document["accuracy"]), noun="figure", rank=4, has_space=True),
             Block([f"{result.get('command', '')}"]),
             Block([f"verdict: {verdict.get('status', 'unknown')}"], "bold", is_verdict=True),
         ]
     )
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _bundled_accuracy(accuracy: Mapping[str, Any]) -> Table:
+    """Make a table of the RMS errors that the document of a calibration states."""
+    rows = []
+    for prefix, label in _ACCURACIES.items():
+        before, after = (accuracy.get(f"{prefix}{side}", {}) for side in ("before", "after"))
+        for key, value in after.items():
+            name, is_rms, unit = key.partition("_rms")
+            if is_rms and key in before:
+                sides = (Quantity.error(each, unit[1:] or after["unit"]) for each in (before[key], value))
+                rows.append([f"{name}, {label}", *sides])
+    return Table(["RMS error", "before", "after"], rows)
 
 
 def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
