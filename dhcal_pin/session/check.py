@@ -52,9 +52,9 @@ from .search import can_have_session
 from .timeline import order_samples
 
 # Largest share of unchanged robots that are called changed.
-MAX_FALSE_ALARMS = 0.002
+MAX_FALSE_ALARMS = 0.001
 # Number of sets of residuals that are drawn to find the limit of the evidence.
-N_DRAWS = 4000
+N_DRAWS = 8000
 # Smallest share of the evidence with which a change is named.
 MIN_SHARE = 0.75
 # Share of the evidence from which a change that has the same effect is named, too.
