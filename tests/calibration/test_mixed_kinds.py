@@ -68,6 +68,7 @@ def test_images_that_turn_about_one_axis_only_use_the_poses_of_another_file(sim_
     q = rng.uniform(-2.5, 2.5, (90, 6))
     q[:30, 1:] = q[0, 1:]
     images = KINDS["camera"].simulate(truth, q, Noise(1e-4), rng)
+    assert images.rig is not None
     poses = tuple(replace(board, pose=None) for board in images.rig.boards)
     images = images.with_rig(replace(images.rig, boards=poses))
     number = np.repeat(np.arange(90), 6)
@@ -84,6 +85,7 @@ def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
     q = rng.uniform(-2.5, 2.5, (30, 6))
     q[:, 1:] = q[0, 1:]
     images = KINDS["camera"].simulate(sim_6dof, q, Noise(1e-4), rng)
+    assert images.rig is not None
     cameras = mount_rig(simulated_rig(sim_6dof, q), sim_6dof).cameras
     boards = tuple(replace(board, pose=None) for board in images.rig.boards)
     rig = replace(images.rig, cameras=cameras, boards=boards)
@@ -113,7 +115,7 @@ def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():
     jitter = Jitter(1.0, 0.7, 0.3)
     scaled = derivative * ([0.7] * 3 + [0.3] * 3)
     with_it, without = (
-        multivariate_normal(cov=np.eye(12) + extra).logpdf(residual) for extra in (scaled @ scaled.T, 0)
+        multivariate_normal.logpdf(residual, cov=np.eye(12) + extra) for extra in (scaled @ scaled.T, 0)
     )
     assert _log_likelihood([(residual, derivative)], jitter) == pytest.approx(with_it - without, rel=1e-12)
     huge = 1e12 * derivative[:, [0, 0, 1, 1, 2, 2]]
