@@ -256,8 +256,9 @@ def leave_regions_out(
         held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
         before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
         after += compute_errors(part.chain, held_out, part.instruments)
-        alone += compute_errors(part.urdf_alone, held_out, part.instruments)
-    return _comparison(fit, "region hold-out", before, after, alone if fit.bare else [])
+        if fit.bare:
+            alone += compute_errors(part.urdf_alone, held_out, part.instruments)
+    return _comparison(fit, "region hold-out", before, after, alone)
 
 
 def _comparison(

@@ -203,11 +203,10 @@ class Evidence(FittedModel):
     def _compare_holdout(self) -> Comparison:
         """Compare the accuracy before and after on the hold-out samples."""
         masks, (nominal, instruments) = self.is_holdout_counted, self._nominal
-        chains = (nominal, instruments), (self.chain, self.instruments), (self.urdf_alone, self.instruments)
+        chains = [(nominal, instruments), (self.chain, self.instruments)]
+        chains += [(self.urdf_alone, self.instruments)] if self.bare else []
         errors = [compute_errors(chain, self.holdout, known) for chain, known in chains]
-        before, after, alone = (Accuracy.from_errors(take_errors(each, masks)) for each in errors)
+        before, after, *alone = (Accuracy.from_errors(take_errors(each, masks)) for each in errors)
         n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
         everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
-        return Comparison(
-            "hold-out", n_counted, before, after, n_outliers, everything, alone if self.bare else None
-        )
+        return Comparison("hold-out", n_counted, before, after, n_outliers, everything, *alone)

@@ -56,7 +56,7 @@ MAX_CHANCE = 0.025
 MAX_OUTLIER_SHARE = 0.1
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3
-# Probability that chance makes so many outliers follow each other.
+# Consecutive outliers are named if independent outliers would form such a series with a lower probability.
 MAX_RUN_CHANCE = 1e-3
 # With fewer independent rows for each direction that they determine, a fit can adapt to 40 % of outliers.
 MIN_ROWS_PER_DIRECTION = 2.7

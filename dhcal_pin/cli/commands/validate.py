@@ -91,9 +91,7 @@ class Judged(NamedTuple):
     fit: Result | None  # Fit of base and tool, on request
     before: Accuracy
     accuracies: dict[str, Accuracy]  # Accuracy by the name of the model; the last one is that of `chain`
-    alone: (
-        Accuracy  # Accuracy of the URDF without the sidecar, with base and tool fitted if it has joint errors
-    )
+    alone: Accuracy  # Accuracy of the URDF alone, with base and tool fitted if the sidecar has joint errors
     reference: tuple[Chain, Mapping[str, float]] | None = None  # Nominal robot and its instrument parameters
     remarks: Sequence[str] = ()
 
