@@ -161,7 +161,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Changes:
-    """What happens in a session: a step at a share of it, a linear or an exponential drift."""
+    """What happens in a session: a step at a share of it, or a linear, exponential or periodic drift."""
 
     of: str = ""
     length: float = 0.0
@@ -175,11 +175,14 @@ class Changes:
     has_second_robot: bool = False
     at: float | None = 0.5
     time_constant: float | None = None
+    periods: float = 0.0
 
     def shape(self, share: np.ndarray) -> np.ndarray:
         """Return the change over the session, from 0 to about 1."""
         if self.at is not None:
             return (np.arange(len(share)) >= round(self.at * len(share))).astype(float)
+        if self.periods:
+            return 0.5 - 0.5 * np.cos(2 * np.pi * self.periods * share)
         if self.time_constant is None:
             return share
         return 1 - np.exp(-share / self.time_constant)

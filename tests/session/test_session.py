@@ -125,11 +125,19 @@ EVENTS = {
     },
     **{f"drift of joint {joint}": Changes(joint=(joint, 0.1 * DEGREE), at=None) for joint in (1, 2)},
     "growth": Changes(growth=1e-3, at=None),
+    **{f"drift of {of} there and back": Changes(of, 1e-3, at=None, periods=1.5) for of in ("base", "tool")},
 }
 # Events of the fast suite: one of each type.
 FAST = [
     list(EVENTS).index(name)
-    for name in ("base 5 mm at 0.9", "tool 0.3 mm at 0.5", "joint 2 at 0.1", "drift of base, 0.2", "growth")
+    for name in (
+        "base 5 mm at 0.9",
+        "tool 0.3 mm at 0.5",
+        "joint 2 at 0.1",
+        "drift of base, 0.2",
+        "growth",
+        "drift of tool there and back",
+    )
 ]
 
 
