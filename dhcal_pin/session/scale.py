@@ -15,7 +15,7 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..robot.chain import BASE_FRAME
 from .facts import Scale
-from .linear_model import Layout, whitened_rows
+from .linear_model import Layout, measures_positions, whitened_rows
 
 # Smallest RMS correction in prior standard deviations and relative change of lengths that are reported.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
@@ -37,7 +37,11 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     (lengths,) = np.nonzero(is_length)
     priors = errors.priors[lengths]
     corrections = x[lengths] / priors
-    if not lengths.size or np.sqrt(np.mean(corrections**2)) < MIN_CORRECTION:
+    if (
+        not measures_positions(problem)
+        or not lengths.size
+        or np.sqrt(np.mean(corrections**2)) < MIN_CORRECTION
+    ):
         return None
     # Columns of unknowns without a prior, such as those of an undetermined tool, have an inverse with this.
     weights = np.where(problem.weights > 0, problem.weights, 1e-6)

@@ -489,9 +489,10 @@ class _Search:
             if not isinstance(cause.shape, Step):
                 continue
             change = fit.rows[..., cause.block.columns] @ cause.values
-            number = self._best_place(fit, change, cause.shape.number)
-            if number != cause.shape.number:
+            old, number = cause.shape.number, self._best_place(fit, change, cause.shape.number)
+            if number != old:
                 self.causes[i] = replace(cause, shape=Step(number))
+                self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, number)
                 has_moved = True
         return has_moved
 
@@ -695,11 +696,8 @@ def _bounded_cost(residual: Array) -> Array:
 
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
-    """Return whether all samples are positions or poses of the tool, which show where base and tool are."""
-    return all(
-        item.configurations_per_row == 1 and item.has_joint_values and len(item.positions()) == len(item.rows)
-        for item in data
-    )
+    """Return whether all samples show where base and tool are."""
+    return all(item.shows_changes and item.has_joint_values for item in data)
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:

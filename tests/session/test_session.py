@@ -183,6 +183,20 @@ def test_events_are_named_and_handled(name, request):
     assert np.median(ratios) <= (2.0 if is_fast else 1.3)
 
 
+@pytest.mark.parametrize("measure", [Simulation.measure_wires, Simulation.measure_targets])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("", 0.0), ("tool 5 mm at 0.5", 5e-3), ("joint 2 at 0.9", 0.3 * DEGREE), ("drift of base, None", 1e-3)],
+)
+def test_changes_are_found_in_wires_and_several_targets(measure, name, size):
+    simulation = Simulation("ur10", 100, 5)
+    fit = calibrate(simulation.chain, measure(simulation, EVENTS.get(name)), extend="none")
+    assert [found.size for found in session_of(fit).found] == pytest.approx([size] if size else [], rel=0.1)
+    of = [getattr(found, "of", "") or getattr(found, "kind", "") for found in session_of(fit).found]
+    assert of == {"": [], "j": ["elbow_joint"], "t": ["tool"], "d": ["base"]}[name[:1]]
+    assert simulation.true_error(fit.chain) < 5e-5
+
+
 @pytest.mark.parametrize("count", some_slow([8, 400], {0}))
 def test_nothing_is_found_where_nothing_happened(count):
     """Clean sets, and sets of random samples with outliers only."""
