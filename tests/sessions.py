@@ -134,7 +134,8 @@ class Simulation:
     def measure_wires(self, changes: Changes | None = None) -> Wires:
         """Return the lengths of four wires from known anchors."""
         pose = self.measure(Pose, changes)
-        anchors = self.base.translation + [[1.5, 0, -1], [-1.2, 1.3, -1], [-1, -1.4, -1], [0.2, 0.3, 2.2]]
+        around = np.array([[1.5, 0, -1], [-1.2, 1.3, -1], [-1, -1.4, -1], [0.2, 0.3, 2.2]])
+        anchors = self.base.translation + around
         lengths = np.linalg.norm(pose.positions()[:, None] - anchors, axis=2)
         return Wires(self.q, lengths, anchors=anchors)
 
@@ -144,7 +145,7 @@ class Simulation:
         offsets = np.array([[0.05, 0, 0], [0, 0.06, 0], [-0.04, -0.03, 0.02]])
         points = pose.positions()[:, None] + np.einsum("mij,tj->mti", pose.rotations(), offsets)
         points += self.rng.normal(0, NOISE, points.shape)
-        labels = np.tile(["a", "b", "c"], self.count)
+        labels = ["a", "b", "c"] * self.count
         return MultiTargetPosition(np.repeat(self.q, 3, 0), points.reshape(-1, 3), labels)
 
     def _grown(self, growth: float) -> pin.Model:
