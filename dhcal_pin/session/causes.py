@@ -24,6 +24,8 @@ import numpy as np
 
 from .._typing import Array
 
+# Size of a change that is held at zero.
+HELD_SIZE = 1e-12
 # Number of functions of a free drift.
 N_FUNCTIONS = 8
 
@@ -49,6 +51,12 @@ class Block:
     columns: Array
     sizes: Array
     is_constant: bool = False
+
+    @property
+    def levers(self) -> Array:
+        """Motion of the tool per unit of each column, (c,); 0 for columns that are held at zero."""
+        is_free = self.sizes > HELD_SIZE
+        return np.where(is_free, 1 / np.where(is_free, self.sizes, 1.0), 0.0)
 
 
 @dataclass(frozen=True)

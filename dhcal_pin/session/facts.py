@@ -14,7 +14,7 @@ from ..formatting import format_fixed, format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .causes import Block, Cause, Drift, FreeDrift, Step
-from .linear_model import HELD_SIZE, growing_links
+from .linear_model import growing_links
 from .robot_changes import RobotChanges, apply_changes
 from .timeline import Timeline
 
@@ -281,10 +281,10 @@ def histories(session: Session) -> Iterator[History]:
         for cause in causes:
             size, std, unit = cause_size(cause, session.changes, session.chain, session.timeline)
             f = cause.shape.values(numbers, times)
-            motion = np.linalg.norm(f @ cause.amplitudes / cause.block.sizes, axis=1)
+            motion = np.linalg.norm(f @ cause.amplitudes * cause.block.levers, axis=1)
             # The variance along the direction of the largest change.
             peak = int(np.argmax(motion))
-            along = f[peak] @ cause.amplitudes / cause.block.sizes**2
+            along = f[peak] @ cause.amplitudes * cause.block.levers**2
             at = (f[:, :, None] * along).reshape(len(f), -1)
             spread = np.einsum("ni,ij,nj->n", at, cause.covariance, at)
             values += size * motion / max(float(motion[peak]), 1e-300)
@@ -325,9 +325,8 @@ def _motion_size(
 ) -> tuple[float, float, str]:
     """Return the size of a motion: of its translation, unless it mostly turns."""
     distance, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(angles))
-    size = float(block.sizes[3:].max())
     # Turns that the measurements do not show are held at zero.
-    reach = 1 / size if size > HELD_SIZE else 0.0
+    reach = float(block.levers[3:].max())
     if angle * reach > MIN_ANGLE_RATIO * distance:
         along = np.concatenate([np.zeros(3), angles / angle])
         return angle, float(np.sqrt(along @ covariance @ along)), "rad"
@@ -345,7 +344,7 @@ def cause_size(
         return _step_size(cause, shape, changes, chain)
     numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
     f = shape.values(numbers, times)
-    peak = f[np.argmax(np.linalg.norm(f @ cause.amplitudes / block.sizes, axis=1))]
+    peak = f[np.argmax(np.linalg.norm(f @ cause.amplitudes * block.levers, axis=1))]
     values = peak @ cause.amplitudes
     by_values = np.kron(peak[None], np.eye(len(values)))
     covariance = by_values @ cause.covariance @ by_values.T

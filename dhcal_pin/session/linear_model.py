@@ -20,12 +20,10 @@ from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.error_families import MIN_LINK_LENGTH
-from .causes import Block
+from .causes import HELD_SIZE, Block
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
 PRIOR_FACTOR = 10.0
-# Size of a change that is held at zero.
-HELD_SIZE = 1e-12
 # Largest entry of a column, relative to those of others, below which it is rounding.
 MIN_OBSERVED = 1e-9
 # Largest share of a constant error that the unknowns of the calibration may leave.
