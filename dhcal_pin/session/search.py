@@ -23,7 +23,7 @@ Shapes: N samples in the order of measurement, K cells of consecutive samples, k
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -277,10 +277,15 @@ class _Search:
     def best_cause(self, fit: LinearFit) -> Cause | None:
         """Return the cause of greatest evidence that is not in a fit."""
         cells, cross = self._products(fit)
+        # Blocks with the same number of columns and the same functions of time are tested at once.
+        alike: dict[tuple[int, tuple[Shape, ...]], list[Block]] = {}
+        for block in self.layout.blocks:
+            for shapes in self._shapes(block):
+                alike.setdefault((len(block.columns), tuple(shapes)), []).append(block)
         found = [
-            self._score(fit, block, shapes, cells, cross)
-            for block in self.layout.blocks
-            for shapes in self._shapes(block)
+            cause
+            for (_, shapes), blocks in alike.items()
+            for cause in self._scores(fit, blocks, shapes, cells, cross)
         ]
         best = max(found, key=lambda cause: cause.log_evidence, default=None)
         return best and replace(best, effect=self._effect(fit, best))
@@ -335,44 +340,47 @@ class _Search:
         kinds = (steps, drifts, free)
         return [shapes for shapes in kinds if shapes and (block, type(shapes[0])) not in self.rejected]
 
-    def _score(
-        self, fit: LinearFit, block: Block, shapes: Sequence[Shape], cells: Array, cross: Array
-    ) -> Cause:
-        """Return the cause of greatest evidence among functions of time of one block."""
-        own = block.columns
+    def _scores(
+        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], cells: Array, cross: Array
+    ) -> Iterator[Cause]:
+        """Yield the cause of greatest evidence among functions of time of each of several blocks."""
+        own = np.array([block.columns for block in blocks])
         firsts = self.edges[:-1]
+        # Products of each cell, (K, B, c, ·).
+        parts = [cells[:, own[:, :, None], own[:, None]], cells[:, own, -1], cross[:, own]]
         if isinstance(shapes[0], Step):
             steps = [shape.number for shape in shapes if isinstance(shape, Step)]
             ends = np.searchsorted(self.numbers[firsts], steps)
+            inner, right, beside = (np.cumsum(part, 0)[ends - 1] for part in parts)
             # f is -1 before the step.
-            inner = np.cumsum(cells[:, own][:, :, own], 0)[ends - 1]
-            right = -np.cumsum(cells[:, own, -1], 0)[ends - 1]
-            beside = -np.cumsum(cross[:, own], 0)[ends - 1]
+            right, beside = -right, -beside
         else:
             f = np.array([shape.values(self.numbers[firsts], self.times[firsts]) for shape in shapes])
-            n_shapes, _, n_functions = f.shape
-            count = n_functions * len(own)
+            n_functions = f.shape[2]
+            count = n_functions * own.shape[1]
             squares = f[:, :, :, None] * f[:, :, None]
-            inner = np.tensordot(squares, cells[:, own][:, :, own], (1, 0))
-            inner = inner.swapaxes(2, 3).reshape(n_shapes, count, count)
-            right = np.tensordot(f, cells[:, own, -1], (1, 0)).reshape(n_shapes, count)
-            beside = np.tensordot(f, cross[:, own], (1, 0)).reshape(n_shapes, count, -1)
-        sizes = np.tile(block.sizes, right.shape[1] // len(own))
+            inner = np.moveaxis(np.tensordot(squares, parts[0], (1, 0)), 3, 1).swapaxes(3, 4)
+            inner = inner.reshape(len(f), len(own), count, count)
+            right, beside = (np.tensordot(f, part, (1, 0)).swapaxes(1, 2) for part in parts[1:])
+            right = right.reshape(len(f), len(own), count)
+            beside = beside.reshape(len(f), len(own), count, -1)
+        sizes = np.tile([block.sizes for block in blocks], right.shape[2] // own.shape[1])
         explained = beside @ fit.test_covariance
-        matrix = inner - explained @ beside.swapaxes(1, 2)
-        matrix += MIN_UNEXPLAINED * inner * np.eye(len(sizes))
+        matrix = inner - explained @ beside.swapaxes(2, 3)
+        matrix += MIN_UNEXPLAINED * inner * np.eye(sizes.shape[1])
         right = right - explained @ fit.score
-        matrix = matrix * sizes * sizes[:, None]
-        vector = right * sizes
-        values, vectors = np.linalg.eigh(matrix)
+        values, vectors = np.linalg.eigh(matrix * sizes[:, None] * sizes[:, :, None])
         values = np.maximum(values, 0.0)
-        along = np.einsum("sij,si->sj", vectors, vector)
-        square = WIDTHS[:, None, None] ** 2
+        along = np.einsum("sbij,sbi->sbj", vectors, right * sizes)
+        square = WIDTHS[:, None, None, None] ** 2
         gain = 0.5 * np.sum(along**2 * square / (1 + square * values) - np.log1p(square * values), -1)
-        width, index = np.unravel_index(np.argmax(gain), gain.shape)
-        log_evidence = float(gain[width, index]) - np.log(len(shapes)) - np.log(len(self.layout.blocks))
-        estimate = vectors[index] @ (along[index] / (values[index] + WIDTHS[width] ** -2)) * sizes
-        return Cause(block, shapes[int(index)], estimate, np.zeros((len(sizes),) * 2), log_evidence)
+        for i, block in enumerate(blocks):
+            width, index = np.unravel_index(np.argmax(gain[:, :, i]), gain.shape[:2])
+            log_evidence = float(gain[width, index, i])
+            log_evidence -= float(np.log(len(shapes)) + np.log(len(self.layout.blocks)))
+            scaled = along[index, i] / (values[index, i] + WIDTHS[width] ** -2)
+            estimate = vectors[index, i] @ scaled * sizes[i]
+            yield Cause(block, shapes[int(index)], estimate, np.zeros((len(estimate),) * 2), log_evidence)
 
     # ------------------------------------------------------------------------------------------- search
     def run(self) -> None:
