@@ -21,7 +21,7 @@ Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,10 +32,11 @@ from ..estimation import qr, robust
 from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
+from ..estimation.information import Information, Samples
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
-from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
+from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, Prediction, Uncertainty
 from ..identifiability import observability
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.mounting import MountedRig
@@ -364,6 +365,8 @@ class FittedModel:
             self.problem.temperature,
             self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
+        if len(self.x) > MAX_COLUMNS:
+            uncertainty = replace(uncertainty, information=self._information(scale, root))
         if self.rank == len(self.x) or not robot:
             return uncertainty
         # Even a small last step rotates the null space, so take the Jacobian at x.
@@ -374,6 +377,26 @@ class FittedModel:
         )
         q, _ = different_configurations(self.inliers)
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    def _information(self, scale: float, root: Array) -> Information | None:
+        """Return what the covariance scale²·root·rootᵀ of the parameters follows from."""
+        samples = Samples.of(self.problem, self.x)
+        if samples is None:
+            return None
+        robot = len(self.errors.parameters)
+        rows = Uncertainty.from_errors(
+            self.errors, self.x[:robot], self.chain, np.eye(robot), np.empty((robot, 0))
+        )
+        n_coefficients = len(rows.entries)
+        n_bodies, n_geometric = len(rows.sqrt_covariance) - n_coefficients, robot - n_coefficients
+        factor = 1 / (scale**2 * self.problem.temperature)
+        return Information(
+            samples,
+            rows.sqrt_covariance[:n_bodies, :n_geometric],
+            np.sqrt(factor) * self.problem.weights[:robot],
+            factor / max(self._sigma_scale, MIN_SCALE) ** 2,
+            root=scale * root[:robot],
+        )
 
     @property
     def has_free_frames(self) -> bool:
