@@ -36,14 +36,14 @@ from ..estimation.information import Information, Samples
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
-from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, Prediction, Uncertainty
+from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
 from ..identifiability import observability
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
 from .evaluation import compute_errors, find_inliers, fit_nominal
-from .model_selection import Extension
+from .model_selection import Extension, family_gains
 from .partition import different_configurations
 
 # Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
@@ -57,6 +57,9 @@ MIN_FREEDOM_RATIO = 1e-6
 # Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
 # deviations of an instrument may be too large.
 MIN_MODEL_SHARE = 0.5
+# Largest number of unknowns with which further families of joint errors are tested: correction curves, which
+# take long, explain what the families would.
+MAX_TESTED = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,6 +368,7 @@ class FittedModel:
             self.problem.temperature,
             self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
+        uncertainty = replace(uncertainty, fit=self._model_fit)
         if len(self.x) > MAX_COLUMNS:
             uncertainty = replace(uncertainty, information=self._information(scale, root))
         if self.rank == len(self.x) or not robot:
@@ -377,6 +381,19 @@ class FittedModel:
         )
         q, _ = different_configurations(self.inliers)
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    @property
+    def _model_fit(self) -> ModelFit:
+        """How well the model explains the measurements.
+
+        Correlated residuals are errors of the model, which the uncertainty contains.
+        """
+        is_stated = self.problem.temperature == 1 and all(item.has_stated_sigma for item in self.data)
+        chi_square = self.unit_weight_std**2 * self.degrees_of_freedom
+        has_chi_square = is_stated and np.isfinite(chi_square)
+        is_tested = self.degrees_of_freedom > 0 and len(self.x) <= MAX_TESTED
+        gains = family_gains(self.problem, self.x, self.weights) if is_tested else {}
+        return ModelFit(chi_square if has_chi_square else None, self.degrees_of_freedom, gains)
 
     def _information(self, scale: float, root: Array) -> Information | None:
         """Return what the covariance scale²·root·rootᵀ of the parameters follows from."""

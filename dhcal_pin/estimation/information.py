@@ -52,7 +52,7 @@ class Samples:
         if conditions is None:
             return None
         information = np.concatenate([information for _, information in parts])
-        counts = information.any((1, 2))
+        counts = np.any(information != 0, (1, 2))
         conditions = replace(conditions[counts], **dict.fromkeys(UNUSED_CONDITIONS))
         return cls._rounded(conditions, information[counts]) if counts.any() else None
 

@@ -29,6 +29,7 @@ Shapes: m samples, k moving joints, e uncertain transmission coefficients, r col
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -106,6 +107,36 @@ class Predictor(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class FamilyGain:
+    """What a family of joint errors that a model lacks would explain of the residuals."""
+
+    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`.
+    added: int  #: Number of its parameters.
+    remaining: int  #: Number of rows less the number of all parameters.
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the residuals with the family to those without it."""
+        return float(np.sqrt((self.remaining + self.added) / (self.remaining + self.gain)))
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """How well a model explains the measurements that it was fitted to.
+
+    Attributes:
+        chi_square: Sum of the squared residuals in stated standard deviations of the instrument; None if they
+            are not stated.
+        freedom: Degrees of freedom of the residuals.
+        gains: Families of joint errors that the model lacks, by name, and what they would explain.
+    """
+
+    chi_square: float | None
+    freedom: float
+    gains: Mapping[str, FamilyGain] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """Calibrated chain and the covariance of its errors.
@@ -129,6 +160,8 @@ class Uncertainty:
     frame_part: Array = field(default_factory=lambda: np.empty((0, 0)))
     #: Information that the covariance follows from; None if it is not known.
     information: Information | None = None
+    #: How well the calibrated model explains its measurements; None if it is not known.
+    fit: ModelFit | None = None
 
     @property
     def has_free_frames(self) -> bool:

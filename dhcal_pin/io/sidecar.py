@@ -46,6 +46,9 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
     model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
     model_std_rad = 1e-4               # the same of the orientation
+    chi_square = 512.3                 # of the residuals with the stated noise; absent if it is not stated
+    degrees_of_freedom = 498.0         # of the residuals
+    left_out = [["harmonics", 31.2, 24, 474]]   # families that the model lacks: `estimation.FamilyGain`
 
     [uncertainty.information]          # in place of the three arrays: `estimation.information`
     factor = 0.09                      # on the information of the samples
@@ -84,7 +87,7 @@ import lzma
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -93,7 +96,7 @@ import tomli_w
 from .._typing import Array, PathLike
 from ..estimation.information import Information, Samples
 from ..estimation.parameters import PARAMETER_SETS, fold_harmonics
-from ..estimation.uncertainty import Uncertainty, compact, expand
+from ..estimation.uncertainty import FamilyGain, ModelFit, Uncertainty, compact, expand
 from ..exceptions import FileFormatError, UnknownNameError
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
@@ -137,6 +140,18 @@ _HARMONIC = Key(
         and all(toml.is_number(entry) and abs(entry) <= _MAX_COEFFICIENT for entry in value)
         and isinstance(value[0], int)
         and 1 <= value[0] <= MAX_CURVE_ORDER
+    ),
+)
+_FAMILY_GAIN = Key(
+    '[family, gain, added, remaining], such as ["harmonics", 31.2, 24, 474]',
+    {"type": "array", "minItems": 4, "maxItems": 4},
+    lambda value: (
+        isinstance(value, list)
+        and len(value) == 4
+        and isinstance(value[0], str)
+        and value[0] in FAMILIES
+        and all(toml.is_number(each) and each >= 0 for each in value[1:])
+        and all(isinstance(each, int) and each > 0 for each in value[2:])
     ),
 )
 _NAMES = Key("a list of names", {"type": "array", "items": {"type": "string"}})
@@ -199,6 +214,9 @@ _UNCERTAINTY_KEYS = {
     "temperature": toml.number(1, default=1.0),
     "model_std_m": toml.number(0, default=0.0),
     "model_std_rad": toml.number(0, default=0.0),
+    "chi_square": toml.number(0, is_optional=True),
+    "degrees_of_freedom": toml.number(0, is_optional=True),
+    "left_out": toml.list_of(_FAMILY_GAIN, default=()),
 }
 _MEASURED_KEYS = {
     "joints": _NAMES,
@@ -477,7 +495,10 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
     model_std = (values["model_std_m"], values["model_std_rad"])
     nothing = np.empty((n_rows, 0))
-    known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std)
+    gains = {name: FamilyGain(*numbers) for name, *numbers in values["left_out"]}
+    freedom = values["degrees_of_freedom"]
+    fit = None if freedom is None else ModelFit(values["chi_square"], freedom, gains)
+    known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std, fit=fit)
     if values["information"] is not None:
         return _read_information(table.table("information"), values["information"], known)
     if missing := [key for key in ("sqrt_covariance", "unbounded_directions") if values[key] is None]:
@@ -498,9 +519,12 @@ def _read_information(table: TomlTable, values: Mapping[str, Any], known: Uncert
     n_rows, texts = len(known.sqrt_covariance), values["conditions"]
     n_bodies, where = n_rows - len(known.entries), f"{table.where}: conditions"
     n_of = _condition_sizes(known.chain)
-    if "q" not in texts or (unknown := [name for name in texts if name not in n_of]):
-        wrong = "q is missing" if "q" not in texts else f"unknown condition {quote(unknown[0])}"
-        raise FileFormatError(f"{where}: {wrong}; calibrate again to replace it")
+    if "q" not in texts:
+        raise FileFormatError(f"{where}: q is missing; calibrate again to replace it")
+    if unknown := [name for name in texts if name not in n_of]:
+        raise FileFormatError(
+            f"{where}: unknown condition {quote(unknown[0])}; choose from {', '.join(n_of)}"
+        )
     conditions = {
         name: _read_compressed(text, n_of[name], _CONDITION_TYPE, f"{where}: {name}")
         for name, text in texts.items()
@@ -753,7 +777,20 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
         "temperature": uncertainty.temperature,
         "model_std_m": uncertainty.model_std[0],
         "model_std_rad": uncertainty.model_std[1],
+        **_fit_content(uncertainty.fit),
         **columns,
+    }
+
+
+def _fit_content(fit: ModelFit | None) -> dict[str, Any]:
+    """Return the keys of [uncertainty] that say how well the model explains its measurements."""
+    if fit is None:
+        return {}
+    left_out = [[name, *astuple(each)] for name, each in fit.gains.items()]
+    return {
+        **({} if fit.chi_square is None else {"chi_square": fit.chi_square}),
+        "degrees_of_freedom": float(fit.freedom),
+        **({"left_out": left_out} if left_out else {}),
     }
 
 
