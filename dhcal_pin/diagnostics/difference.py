@@ -20,11 +20,11 @@ that the robot is one, that the model describes it, and that the noise is the st
 with χ²_A of the residuals of one calibration in stated standard deviations of the instrument, and their ν_A
 degrees of freedom. If the noise was estimated from the residuals, χ²_A is ν_A, and only χ² scatters.
 
-Residuals that vary with the joint values are evidence of their own. Calibrations state by how much each family
-of joint errors that the model lacks would decrease the cost. An F test judges the gains of both together.
+Residuals that vary with the joint values are evidence of their own. Calibrations state by how much each
+family of joint errors that the model lacks would decrease the cost. An F test judges the gains of both.
 
-If the difference is too large, joints are named in turn: that whose zero, or whose placement and joint errors,
-reduces χ² most beyond what each coefficient must reduce.
+If the difference is too large, joints are named in turn: that whose zero, or whose placement and joint
+errors, reduces χ² most beyond what each coefficient must reduce.
 
 Reference: W. Baarda, S-transformations and criterion matrices, Netherlands Geodetic Commission, 1973.
 

@@ -54,7 +54,7 @@ from .timeline import order_samples
 # Largest share of unchanged robots that are called changed.
 MAX_FALSE_ALARMS = 0.001
 # Number of sets of residuals that are drawn to find the limit of the evidence.
-N_DRAWS = 8000
+N_DRAWS = 3000
 # Smallest share of the evidence with which a change is named.
 MIN_SHARE = 0.75
 # Share of the evidence from which a change that has the same effect is named, too.
@@ -335,9 +335,12 @@ class _CheckModel:
         turned = self.axes.T @ residuals
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
-    def log_likelihoods(self, columns: Array, sets: Sequence[Array]) -> Array:
-        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
-        square, nothing = WIDTHS[:, None] ** 2, self.null_likelihoods(sets)
+    def log_likelihoods(self, columns: Array, sets: Sequence[Array], nothing: Array) -> Array:
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d).
+
+        `nothing` has those without a change, (σ, d).
+        """
+        square = WIDTHS[:, None] ** 2
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):
             values, vectors = np.linalg.eigh(a.T @ a)
@@ -356,8 +359,9 @@ class _CheckModel:
         """Return the ratio for any change that `MAX_FALSE_ALARMS` of unchanged robots exceed."""
         draws = np.random.default_rng(0).standard_normal((len(self.numbers), N_DRAWS))
         sets = [draws * np.sqrt(self.variances[self.likely_noise] / each)[:, None] for each in self.variances]
-        nothing = _log_means(self.null_likelihoods(sets)[:, None])
-        ratios = np.array([_log_means(self.log_likelihoods(each, sets)) - nothing for each in columns])
+        nothing = self.null_likelihoods(sets)
+        ratios = np.array([_log_means(self.log_likelihoods(each, sets, nothing)) for each in columns])
+        ratios -= _log_means(nothing[:, None])
         return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
 
     def estimate(self, block: Block) -> tuple[Array, Array, Array]:
@@ -395,15 +399,13 @@ class _CheckModel:
         samples = [np.eye(len(self.numbers))[:, self.numbers == i] / self._sigma[i] for i in range(count)]
         priors = [ROBOT_PRIOR if block.kind == "robot" else 1.0 for block in blocks] + [1 / count] * count
         log_priors = np.log(np.array(priors) / np.sum(priors))
-        residual = self.scaled_sets(self.rows[:, -1:])
-        likelihoods = [
-            *(
-                self.log_likelihoods(columns, self.scaled_sets(undone[:, None]))
-                for _, columns, undone in estimates
-            ),
-            *(self.log_likelihoods(columns, residual) for columns in samples),
-        ]
-        nothing = _log_means(self.null_likelihoods(residual)[:, None])
+        pairs = [*((columns, undone[:, None]) for _, columns, undone in estimates)]
+        pairs += [(columns, self.rows[:, -1:]) for columns in samples]
+        likelihoods = []
+        for columns, residual in pairs:
+            sets = self.scaled_sets(residual)
+            likelihoods.append(self.log_likelihoods(columns, sets, self.null_likelihoods(sets)))
+        nothing = _log_means(self.null_likelihoods(self.scaled_sets(self.rows[:, -1:]))[:, None])
         ratios = np.array([_log_means(each) - nothing for each in likelihoods])[:, 0]
         total = float(_log_sums((ratios + log_priors)[:, None])[0])
         shares = np.exp(ratios + log_priors - total)
