@@ -46,19 +46,12 @@ class Case:
         """Calibrate both halves without joint errors and compare them."""
         sim = Simulation(self.arm, self.count, seed)
         if self.curves:
-            factors, poses = sim.rng.normal(0, self.curves, (4, sim.chain.n_joints)), sim.poses
-            sim.poses = lambda q, model=None: poses(q + eccentricities(q, factors), model)
+            sim.add_eccentricities(self.curves)
         data = sim.measure(self.kind)
         if self.is_stated:
             data = with_noise(data)
         order = np.argsort(sim.q[:, 1]) if self.is_by_region else np.arange(self.count)
         return compare(*(calibration(sim, data.take(np.sort(part))) for part in np.array_split(order, 2)))
-
-
-def eccentricities(q: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return the errors of joints at positions q."""
-    waves = np.array([np.sin(q), np.cos(q), np.sin(2 * q) / 2, np.cos(2 * q) / 2])
-    return np.sum(waves * factors[:, None], 0)
 
 
 def with_noise(data: Measurement) -> Measurement:
