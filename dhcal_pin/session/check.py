@@ -421,14 +421,18 @@ class _CheckModel:
         limit = self.limit(columns, log_priors)
         return sorted(hypotheses, key=lambda each: -each.share), total, limit
 
-    def position_rms(self) -> tuple[float, float]:
-        """Return the RMS distance of the measured positions from the robot's, and what is expected [m]."""
+    @cached_property
+    def _positions(self) -> tuple[Array, Array]:
+        """Numbers of the rows of positions, and their standard deviations [m], (3N,) each."""
         width = len(self.is_row) // (self.numbers[-1] + 1)
         is_position = (np.arange(len(self.is_row)) % width < 3)[self.is_row]
-        sigma = np.concatenate([np.asarray(item.sigma).ravel() for item in self.data])
-        residual = self.rows[is_position, -1] * sigma
-        variances = np.einsum("ij,j,ij->i", self.axes, self.variances[0], self.axes)[is_position] * sigma**2
-        count = self.numbers[-1] + 1
+        return np.flatnonzero(is_position), np.concatenate([item.sigma.ravel() for item in self.data])
+
+    def position_rms(self) -> tuple[float, float]:
+        """Return the RMS distance of the measured positions from the robot's, and what is expected [m]."""
+        (rows, sigma), count = self._positions, self.numbers[-1] + 1
+        residual, axes = self.rows[rows, -1] * sigma, self.axes[rows]
+        variances = np.einsum("ij,j,ij->i", axes, self.variances[0], axes) * sigma**2
         expected = np.sqrt(variances.sum() / count) if len(self.noise_factors) == 1 else np.nan
         return float(np.sqrt(np.sum(residual**2) / count)), float(expected)
 
@@ -465,14 +469,8 @@ class _CheckModel:
 
     def _revealed(self, block: Block, covariance: Array) -> float:
         """Return the displacement of the tool by a change in its worst direction that is revealed [m]."""
-        frames = self.chain.forward_kinematics(np.concatenate([item.q for item in self.data]))
-        chain, bodies, twists = self.layout.problem.errors.derivative(
-            np.zeros(len(self.layout.problem.errors.parameters))
-        )
-        full = np.zeros((self.layout.n_columns, 3, frames.tool.shape[-1]))
-        full[: len(bodies)] = chain.tool_jacobian(frames, bodies, twists)[:, :3]
-        full[self.layout.joints] = chain.joint_jacobian(frames, None)[:, :3]
-        effects = full[block.columns].reshape(len(block.columns), -1).T / np.sqrt(full.shape[2])
+        rows, sigma = self._positions
+        effects = self.rows[rows][:, block.columns] * sigma[:, None] / np.sqrt(self.numbers[-1] + 1)
         r = np.linalg.qr(effects, mode="r")
         return REVEALED_RATIO * float(np.sqrt(max(np.linalg.eigvalsh(r @ covariance @ r.T).max(), 0.0)))
 
