@@ -87,6 +87,19 @@ class Simulation:
             out.append(data.oMf[frame].copy())
         return out
 
+    def add_eccentricities(self, size: float) -> None:
+        """Add errors with random sines and cosines of q to each joint [rad], and half as large ones of 2q."""
+        factors = (
+            self.rng.normal(0, size, (4, 1, self.chain.n_joints)) / np.array([1, 1, 2, 2])[:, None, None]
+        )
+        poses = self.poses
+
+        def with_errors(q: np.ndarray, model: pin.Model | None = None) -> list[pin.SE3]:
+            waves = np.array([np.sin(q), np.cos(q), np.sin(2 * q), np.cos(2 * q)])
+            return poses(q + np.sum(factors * waves, 0), model)
+
+        self.poses = with_errors
+
     def direction(self) -> np.ndarray:
         """Draw a unit vector."""
         vector = self.rng.normal(size=3)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from .._typing import Array
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
+from ..measurements.base import Measurement
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
@@ -187,6 +189,45 @@ class Evidence(FittedModel):
         return PairedErrors.from_errors(before, after, configuration_groups(self.holdout)).without_outliers()
 
     @cached_property
+    def holdout_chi_square(self) -> tuple[float, float] | None:
+        """Reduced chi-square of the hold-out samples, and the probability of one at least as large by chance.
+
+        The covariance of their residuals r is that of the noise, which the fitted samples show, and of the
+        uncertain parameters, I + A·Aᵀ in standard deviations of the noise. None without hold-out samples, or
+        if the uncertainty of the model contains its errors (correlated residuals).
+        """
+        known = {parameter.name for parameter in self.problem.instrument_parameters} | set(self.problem.known)
+        groups = _mean_squares(self, self.counted)
+        holdout = [
+            item
+            for item in self.counted_holdout
+            if {parameter.name for parameter in item.instrument_parameters} <= known
+            and {(item.kind, name) for name in item.residual_groups} <= set(groups)
+        ]
+        freedom = self.degrees_of_freedom
+        if not holdout or not freedom or self.problem.temperature > 1 or self.shrinkage_factor < 1:
+            return None
+        per_freedom = sum(count for _, _, count in self._row_counts) / freedom
+        root, unbounded = self._scaled_sqrt_covariance
+        problem, blocks = self.problem.with_data(holdout), []
+        linearization = problem.linearize(self.x)
+        for chunk in problem.chunks:
+            rows = linearization.rows(chunk)
+            for name, group in chunk.data.residual_groups.items():
+                noise = np.sqrt(per_freedom * groups[chunk.data.kind, name])
+                blocks.append(rows[:, group.rows].reshape(len(rows), -1).T / noise)
+        rows = np.concatenate(blocks)
+        if unbounded.size or not (np.isfinite(root).all() and np.isfinite(rows).all()):
+            return None
+        a, r = rows[:, :-1] @ root, rows[:, -1]
+        along = a.T @ r
+        chi_square = float(r @ r - along @ np.linalg.solve(np.eye(len(along)) + a.T @ a, along))
+        from scipy.special import fdtrc  # lazy import: slow
+
+        reduced = chi_square / len(r)
+        return reduced, float(fdtrc(len(r), freedom, reduced))
+
+    @cached_property
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
         return estimate_generalization(self, self.random_folds, self._measured_region, self.region_comparison)
@@ -210,3 +251,15 @@ class Evidence(FittedModel):
         n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
         everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
         return Comparison("hold-out", n_counted, before, after, n_outliers, everything, *alone)
+
+
+def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, str], float]:
+    """Return the mean squared residual of each kind of measurement and residual group."""
+    parts: dict[tuple[str, str], list[Array]] = {}
+    for item in data:
+        values = fit.problem.instrument_values_of(item, fit.x)
+        residual = item.residual(fit.chain.forward_kinematics(item.conditions()), values)
+        for name, group in item.residual_groups.items():
+            parts.setdefault((item.kind, name), []).append(residual[group.rows].ravel())
+    squares = {key: float(np.mean(np.concatenate(each) ** 2)) for key, each in parts.items()}
+    return {key: value for key, value in squares.items() if value > 0}

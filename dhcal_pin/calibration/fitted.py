@@ -21,7 +21,7 @@ Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,17 +32,18 @@ from ..estimation import qr, robust
 from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
+from ..estimation.information import Information, Samples
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
-from ..estimation.uncertainty import UNBOUNDED_TOL, Prediction, Uncertainty
+from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
 from ..identifiability import observability
 from ..measurements.base import InstrumentParameter, Measurement
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
 from .evaluation import compute_errors, find_inliers, fit_nominal
-from .model_selection import Extension
+from .model_selection import Extension, family_gains
 from .partition import different_configurations
 
 # Stated standard deviations are rejected if the reduced cost exceeds 1 by this many standard deviations.
@@ -56,6 +57,9 @@ MIN_FREEDOM_RATIO = 1e-6
 # Smallest share of the variance of correlated residuals that counts as an error of the model. Stated standard
 # deviations of an instrument may be too large.
 MIN_MODEL_SHARE = 0.5
+# Largest number of unknowns with which further families of joint errors are tested: correction curves, which
+# take long, explain what the families would.
+MAX_TESTED = 200
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -364,6 +368,9 @@ class FittedModel:
             self.problem.temperature,
             self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
+        uncertainty = replace(uncertainty, fit=self._model_fit)
+        if len(self.x) > MAX_COLUMNS:
+            uncertainty = replace(uncertainty, information=self._information(scale, root))
         if self.rank == len(self.x) or not robot:
             return uncertainty
         # Even a small last step rotates the null space, so take the Jacobian at x.
@@ -374,6 +381,39 @@ class FittedModel:
         )
         q, _ = different_configurations(self.inliers)
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    @property
+    def _model_fit(self) -> ModelFit:
+        """How well the model explains the measurements.
+
+        Correlated residuals are errors of the model, which the uncertainty contains.
+        """
+        is_stated = self.problem.temperature == 1 and all(item.has_stated_sigma for item in self.data)
+        chi_square = self.unit_weight_std**2 * self.degrees_of_freedom
+        has_chi_square = is_stated and np.isfinite(chi_square)
+        is_tested = self.degrees_of_freedom > 0 and len(self.x) <= MAX_TESTED
+        gains = family_gains(self.problem, self.x, self.weights) if is_tested else {}
+        return ModelFit(chi_square if has_chi_square else None, self.degrees_of_freedom, gains)
+
+    def _information(self, scale: float, root: Array) -> Information | None:
+        """Return what the covariance scale²·root·rootᵀ of the parameters follows from."""
+        samples = Samples.of(self.problem, self.x)
+        if samples is None:
+            return None
+        robot = len(self.errors.parameters)
+        rows = Uncertainty.from_errors(
+            self.errors, self.x[:robot], self.chain, np.eye(robot), np.empty((robot, 0))
+        )
+        n_coefficients = len(rows.entries)
+        n_bodies, n_geometric = len(rows.sqrt_covariance) - n_coefficients, robot - n_coefficients
+        factor = 1 / (scale**2 * self.problem.temperature)
+        return Information(
+            samples,
+            rows.sqrt_covariance[:n_bodies, :n_geometric],
+            np.sqrt(factor) * self.problem.weights[:robot],
+            factor / max(self._sigma_scale, MIN_SCALE) ** 2,
+            root=scale * root[:robot],
+        )
 
     @property
     def has_free_frames(self) -> bool:

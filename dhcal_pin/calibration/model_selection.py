@@ -74,6 +74,7 @@ from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import minimize
+from ..estimation.uncertainty import FamilyGain
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import design_effect, find_residual_correlation
@@ -708,29 +709,40 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
 
 
-def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
-    """Suggest an extension if one family explains a significant part of the residuals.
+def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:
+    """Compute what each family that is not in the model would explain of the residuals.
 
-    The hint is computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
-    measurement. It requires a change of the cost that chance causes less than once in a million fits, by
-    the bound P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
+    The gains are computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
+    measurement.
     """
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
     missing = _missing_parameters(solved, [name for name in EXTENSIONS if not FAMILIES[name].is_curve])
     problem, x, family = _with_families(replace(solved, data=tuple(data)), x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
-    cost_before, best = solve_columns(system, problem.weights, x, family == "")[1], (MAX_HINT_RATIO, "")
+    before = solve_columns(system, problem.weights, x, family == "")[1]
+    gains = {}
     for name in missing:
         columns = (family == "") | (family == name)
         added, remaining = int(np.sum(family == name)), n_rows - int(np.sum(columns))
-        cost_after = solve_columns(system, problem.weights, x, columns)[1]
-        if remaining < MIN_ROWS_PER_PARAMETER * added or not cost_after > 0:
-            continue
-        threshold = added + 2 * np.sqrt(HINT_LOG_P * added) + 2 * HINT_LOG_P
-        if (cost_before - cost_after) / (cost_after / remaining) > threshold:
-            ratio = float(np.sqrt(cost_after / remaining / (cost_before / (remaining + added))))
-            best = min(best, (ratio, name))
+        after = solve_columns(system, problem.weights, x, columns)[1]
+        if remaining > 0 and after > 0:
+            gain = max((before - after) / (after / remaining), 0.0)
+            gains[name] = FamilyGain(float(gain), added, remaining)
+    return gains
+
+
+def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
+    """Suggest an extension if one family explains a significant part of the residuals.
+
+    It requires a change of the cost that chance causes less than once in a million fits, by the bound
+    P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
+    """
+    best = MAX_HINT_RATIO, ""
+    for name, each in family_gains(solved, x, weights).items():
+        threshold = each.added + 2 * np.sqrt(HINT_LOG_P * each.added) + 2 * HINT_LOG_P
+        if each.gain > threshold and each.remaining >= MIN_ROWS_PER_PARAMETER * each.added:
+            best = min(best, (each.ratio, name))
     ratio, name = best
     return name and (
         f"residuals vary with the joint values ({FAMILIES[name].description}?); "

@@ -52,6 +52,8 @@ MAX_FRAME_ITERATIONS = 20
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # Probability that chance makes a robot appear better that is not.
 MAX_CHANCE = 0.025
+# Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
+MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
@@ -130,6 +132,7 @@ def judge(fit: Evidence) -> Verdict:
             *_convergence(fit),
             *_hand_eye_images(fit),
             *_held_out_errors(fit),
+            *_unexplained_holdout(fit),
             *_few_measurements(fit),
             *_hidden_outliers(fit),
             *_outliers(fit),
@@ -331,6 +334,20 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
+
+
+def _unexplained_holdout(fit: Evidence) -> list[Finding]:
+    """Advise caution if noise and uncertainty do not explain the errors of hold-out samples."""
+    found = fit.holdout_chi_square
+    if found is None or found[0] < MIN_UNEXPLAINED or found[1] > MAX_UNEXPLAINED_CHANCE:
+        return []
+    text = (
+        f"The model does not explain the arm: hold-out samples have {np.sqrt(found[0]):.1f} times the errors"
+    )
+    text += " that the noise of the fitted ones and the uncertainty of the parameters explain."
+    remedy = "Measure all regions of joint space"
+    remedy += ", and allow joint errors (--extend auto)." if fit.extension is None else "."
+    return [Finding("caution", f"{text} {remedy}")]
 
 
 def _overfitting(fit: Evidence) -> float:

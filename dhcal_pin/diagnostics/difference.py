@@ -12,8 +12,19 @@ orthonormal basis Q of G and P = I - Q·Qᵀ,
 has a χ² distribution with k = rank(P·S) degrees of freedom if both calibrations are of the same robot, their
 models describe it, and their uncertainties are right. Reduced chi-square is χ²/k. It scatters by √(2/k).
 
-If it is too large, joints are named in turn: that whose zero, or whose placement and joint errors, reduces χ²
-most beyond what each coefficient must reduce.
+With few parameters, that is a wide interval. The residuals of both calibrations add to it: the hypothesis
+that the robot is one, that the model describes it, and that the noise is the stated one has the chi-square
+
+    χ²_A + χ²_B + χ²,    with ν_A + ν_B + k degrees of freedom,
+
+with χ²_A of the residuals of one calibration in stated standard deviations of the instrument, and their ν_A
+degrees of freedom. If the noise was estimated from the residuals, χ²_A is ν_A, and only χ² scatters.
+
+Residuals that vary with the joint values are evidence of their own. Calibrations state by how much each
+family of joint errors that the model lacks would decrease the cost. An F test judges the gains of both.
+
+If the difference is too large, joints are named in turn: that whose zero, or whose placement and joint
+errors, reduces χ² most beyond what each coefficient must reduce.
 
 Reference: W. Baarda, S-transformations and criterion matrices, Netherlands Geodetic Commission, 1973.
 
@@ -32,11 +43,12 @@ from scipy import stats
 from .. import se3
 from .._typing import Array
 from ..estimation.frame_gauge import frame_effects
-from ..estimation.uncertainty import Uncertainty
+from ..estimation.uncertainty import ModelFit, Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..formatting import Quantity
 from ..measurements.measured_region import MeasuredRegion, draw_joint_space
 from ..robot.chain import Chain
+from ..robot.error_families import FAMILIES
 
 # Number of configurations at which the robots are compared.
 N_COMPARED = 200
@@ -55,8 +67,10 @@ RANK_RTOL = 1e-3
 MAX_OUTSIDE = 1e-3
 # Effects of base and tool below this part of the largest one are none.
 EFFECT_RTOL = 1e-6
-# Probability of a chi-square below which two calibrations are different.
-DIFFERENT_P = 0.01
+# Probability below which calibrations are different: of the chi-square of the parameters, and of that of all.
+DIFFERENT_P = 0.005
+# Probability of the gain of a family of joint errors below which the models lack it.
+LACKING_P = 1e-4
 # Smallest reduction of chi-square by each coefficient of a joint that is named.
 MIN_REDUCTION = 12.0
 # Displacement that no uncertainty explains and that counts as a difference of the models [m].
@@ -118,6 +132,48 @@ STATISTICS = {
 }
 
 
+@dataclass(frozen=True)
+class ChiSquare:
+    """Chi-square of a hypothesis.
+
+    Attributes:
+        value: Chi-square.
+        freedom: Degrees of freedom.
+        constant: Part of both that does not scatter, as the noise was estimated from it.
+    """
+
+    value: float
+    freedom: float
+    constant: float = 0.0
+
+    @property
+    def reduced(self) -> float:
+        """Reduced chi-square."""
+        return self.value / max(self.freedom, 1)
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-square at least this large if the hypothesis is true."""
+        return float(stats.chi2.sf(self.value - self.constant, self.freedom - self.constant))
+
+    @property
+    def usual(self) -> tuple[float, float]:
+        """Interval that contains the reduced chi-square of 95 % of cases if the hypothesis is true."""
+        ends = (stats.chi2.ppf(p, self.freedom - self.constant) for p in (0.025, 0.975))
+        low, high = ((self.constant + float(end)) / max(self.freedom, 1) for end in ends)
+        return low, high
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content for a JSON document."""
+        return {
+            "chi_square": self.value,
+            "degrees_of_freedom": self.freedom,
+            "reduced_chi_square": self.reduced,
+            "reduced_chi_square_95": list(self.usual),
+            "p_value": self.p_value,
+        }
+
+
 @dataclass(frozen=True, eq=False)
 class Difference:
     """Difference of two calibrations of one robot.
@@ -128,10 +184,11 @@ class Difference:
         region: Distances in the measured region of both; None without a common one.
         everywhere: Distances in configurations drawn from the joint limits.
         q: These configurations, (m, n) [rad or m].
-        chi_square: Chi-square of the difference; None if no uncertainty is known.
-        freedom: Its degrees of freedom.
+        of_parameters: Chi-square of the difference of the parameters; None if no uncertainty is known.
+        overall: Chi-square of the residuals of both calibrations and of the difference.
         unexplained: RMS distance that no uncertainty can explain [m].
         joints: Joints that differ, that of the largest part of chi-square first, and these parts.
+        lacking: Families of joint errors that both models lack, and the probability that chance causes it.
     """
 
     first: Chain
@@ -139,47 +196,39 @@ class Difference:
     region: Distances | None
     everywhere: Distances
     q: Array
-    chi_square: float | None = None
-    freedom: int = 0
+    of_parameters: ChiSquare | None = None
+    overall: ChiSquare | None = None
     unexplained: float = 0.0
     joints: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def reduced(self) -> float | None:
-        """Reduced chi-square."""
-        return None if self.chi_square is None else self.chi_square / max(self.freedom, 1)
-
-    @property
-    def p_value(self) -> float | None:
-        """Probability of a chi-square at least this large without a difference."""
-        return None if self.chi_square is None else float(stats.chi2.sf(self.chi_square, self.freedom))
-
-    @property
-    def usual(self) -> tuple[float, float]:
-        """Interval that contains the reduced chi-square of 95 % of equal robots."""
-        low, high = (float(stats.chi2.ppf(p, self.freedom)) / max(self.freedom, 1) for p in (0.025, 0.975))
-        return low, high
+    lacking: dict[str, float] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
         """Whether the robots are "equal" or "different" within their uncertainties, or "unknown"."""
-        if self.p_value is None:
+        if self.of_parameters is None or self.overall is None:
             return "unknown"
         is_other = self.unexplained > max(MIN_UNEXPLAINED, self.everywhere.expected or 0.0)
-        return "different" if self.p_value < DIFFERENT_P or is_other else "equal"
+        least = min(self.of_parameters.p_value, self.overall.p_value)
+        return "different" if least < DIFFERENT_P or is_other or self.lacking else "equal"
 
     @property
     def sentences(self) -> list[str]:
         """What the difference means."""
-        if self.reduced is None:
+        if self.of_parameters is None or self.overall is None:
             return [
                 "No calibration states its uncertainty, so that nothing says how large a difference may be."
             ]
-        low, high = self.usual
-        texts = [
-            f"Reduced chi-square {self.reduced:.2f} with {self.freedom} degrees of freedom; equal robots "
-            f"have {low:.2f} to {high:.2f}."
-        ]
+        texts = [f"{_described(self.of_parameters)}; equal robots have {_interval(self.of_parameters)}."]
+        if self.overall.freedom > self.of_parameters.freedom:
+            texts.append(
+                f"With the residuals of both: {_described(self.overall)}; one robot that the model describes "
+                f"has {_interval(self.overall)}."
+            )
+        if self.lacking:
+            names = ", ".join(f"{name} ({FAMILIES[name].description})" for name in self.lacking)
+            texts.append(f"The model does not explain the arm: residuals of both vary with {names}.")
+        elif self.overall.p_value < DIFFERENT_P <= self.of_parameters.p_value:
+            texts.append("The noise is larger than stated, or the model does not explain the arm.")
         if self.unexplained > MIN_UNEXPLAINED:
             part = Quantity.error(self.unexplained, "m")
             texts.append(f"{part} RMS is of errors that only one of the models has.")
@@ -194,14 +243,26 @@ class Difference:
             "reasons": self.sentences,
             "measured_region": self.region and self.region.to_dict(),
             "joint_space": self.everywhere.to_dict(),
-            "chi_square": self.chi_square,
-            "degrees_of_freedom": self.freedom,
-            "reduced_chi_square": self.reduced,
-            "reduced_chi_square_95": None if self.reduced is None else list(self.usual),
-            "p_value": self.p_value,
+            **(self.overall.to_dict() if self.overall else dict.fromkeys(CHI_SQUARE_KEYS)),
+            "parameters": self.of_parameters and self.of_parameters.to_dict(),
+            "lacking": [{"name": name, "p_value": value} for name, value in self.lacking.items()],
             "unexplained_rms_m": self.unexplained,
             "joints": [{"name": name, "chi_square": value} for name, value in self.joints.items()],
         }
+
+
+# Keys of a chi-square in a JSON document.
+CHI_SQUARE_KEYS = tuple(ChiSquare(0.0, 1.0).to_dict())
+
+
+def _described(found: ChiSquare) -> str:
+    """Describe a chi-square."""
+    return f"Reduced chi-square {found.reduced:.2f} with {found.freedom:.0f} degrees of freedom"
+
+
+def _interval(found: ChiSquare) -> str:
+    """Describe the usual interval of a chi-square."""
+    return "{:.2f} to {:.2f}".format(*found.usual)
 
 
 def compare(first: Calibrated, second: Calibrated) -> Difference:
@@ -337,10 +398,13 @@ def _tested(difference: Difference, pair, q: Array, lever: float, n: int) -> Dif
     d = _without_frames(a, q, lever, n, _displacements(a, b, q, lever)[..., None])
     left = d - u[:, :rank] @ (u[:, :rank].T @ d)
     z = (whiten @ d)[:, 0]
+    of_parameters = ChiSquare(float(z @ z), rank)
+    fits = [each.fit for each in pair if each is not None and each.fit is not None]
     difference = replace(
         difference,
-        chi_square=float(z @ z),
-        freedom=rank,
+        of_parameters=of_parameters,
+        overall=_with_residuals(of_parameters, fits),
+        lacking=_lacking(fits),
         unexplained=float(np.sqrt(np.sum(left**2) / len(q))),
     )
     if difference.verdict != "different":
@@ -351,6 +415,30 @@ def _tested(difference: Difference, pair, q: Array, lever: float, n: int) -> Dif
         outside = np.sum((own - u[:, :rank] @ (u[:, :rank].T @ own)) ** 2, 0)
         columns.append((name, whiten @ own[:, outside < MAX_OUTSIDE * np.sum(own**2, 0)]))
     return replace(difference, joints=_named_joints(columns, z))
+
+
+def _with_residuals(of_parameters: ChiSquare, fits: Sequence[ModelFit]) -> ChiSquare:
+    """Add the chi-squares of the residuals of calibrations."""
+    value, freedom, constant = of_parameters.value, of_parameters.freedom, 0.0
+    for fit in fits:
+        freedom += fit.freedom
+        value += fit.freedom if fit.chi_square is None else fit.chi_square
+        constant += fit.freedom if fit.chi_square is None else 0.0
+    return ChiSquare(value, freedom, constant)
+
+
+def _lacking(fits: Sequence[ModelFit]) -> dict[str, float]:
+    """Return the families of joint errors that all models lack, with the probabilities of their gains."""
+    found = {}
+    for name in set.intersection(*(set(fit.gains) for fit in fits)) if fits else ():
+        gains = [fit.gains[name] for fit in fits]
+        gain, added, remaining = (
+            sum(getattr(each, key) for each in gains) for key in ("gain", "added", "remaining")
+        )
+        p_value = float(stats.f.sf(gain / added, added, remaining))
+        if p_value < LACKING_P / len(fits[0].gains):
+            found[name] = p_value
+    return dict(sorted(found.items(), key=lambda item: (item[1], item[0])))
 
 
 def _joint_effects(chain: Chain, q: Array, lever: float) -> Iterator[tuple[str, Array]]:

@@ -253,16 +253,7 @@ class Linearization:
         motions = self.chain.motions(frames, joints, observation.body)
         joint_rows = np.empty((len(motions), residual_dim, m))
         apply_observation_matrix(motions, observation, joint_rows)
-        by_joint = np.argsort(joints, kind="stable")
-        starts = np.unique(np.sort(joints), return_index=True)
-        ends = [*starts[1][1:].tolist(), len(entries)]
-        blocks = tuple(
-            (joint, slice(start, end))
-            for joint, start, end in zip(starts[0].tolist(), starts[1].tolist(), ends, strict=True)
-        )
-        dense_columns = np.delete(np.arange(self._n_columns), first + np.arange(len(entries)))
-        columns = np.concatenate([dense_columns, first + by_joint])
-        return StructuredRows(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
+        return StructuredRows.of(dense, joint_rows, joints, terms, first)
 
     def rows(self, chunk: Chunk) -> Array:
         """Compute the whitened rows [J | r] of a chunk."""
@@ -317,6 +308,22 @@ class StructuredRows:
     terms: Array  # Term of each of the e coefficients, sorted by joint, shape (e, m)
     blocks: tuple[tuple[int, slice], ...]  # Each joint that coefficients move, with its part of the terms
     columns: Array  # Column of [J | r] of each dense column, then of each coefficient, shape (c+e,)
+
+    @classmethod
+    def of(
+        cls, dense: Array, joint_rows: Array, joints: Sequence[int], terms: Sequence[Array], first: int
+    ) -> StructuredRows:
+        """Sort the coefficients, which are the columns of [J | r] from a first one on, by their joints."""
+        by_joint = np.argsort(joints, kind="stable")
+        numbers, starts = np.unique(np.sort(joints), return_index=True)
+        ends = [*starts[1:].tolist(), len(joints)]
+        blocks = tuple(
+            (joint, slice(start, end))
+            for joint, start, end in zip(numbers.tolist(), starts.tolist(), ends, strict=True)
+        )
+        dense_columns = np.delete(np.arange(len(dense) + len(joints)), first + np.arange(len(joints)))
+        columns = np.concatenate([dense_columns, first + by_joint])
+        return cls(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
 
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""

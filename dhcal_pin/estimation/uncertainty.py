@@ -19,21 +19,30 @@ is added, σ_v² for positions and σ_ω² for orientations:
 Noise of future measurements is not included. Directions that neither data nor priors determine are stored
 separately; a tool component that depends on them has infinite variance.
 
+The compact form of a large uncertainty, for files, is the information that it follows from (`information`).
+Its corrections A and B are the eigenvectors of the difference of both, in units of the standard deviations,
+whose eigenvalues are above `MAX_ERROR`. No variance of anything that is predicted can therefore differ by
+more than this part.
+
 Shapes: m samples, k moving joints, e uncertain transmission coefficients, r columns of the square root.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import lapack, solve_triangular
 
 from .. import se3
 from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..robot.chain import Chain, link_frame, twists_in_bodies
 from .error_model import ErrorModel
+from .information import Information
+from .problem import StructuredRows
 from .qr import RANK_RTOL
 
 # Largest squared component in undetermined directions for which a variance counts as determined: of a
@@ -42,6 +51,13 @@ UNBOUNDED_TOL = 1e-6
 
 # Number of configurations at which the effects of two parameter sets are compared.
 N_MATCHING_SAMPLES = 200
+
+# An uncertainty of at most this many columns has no compact form.
+MAX_COLUMNS = 120
+# Largest relative error of a variance by the compact form.
+MAX_ERROR = 2e-3
+# Singular values of free frames below this part of the largest one are rounding errors.
+FRAME_RTOL = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +107,36 @@ class Predictor(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class FamilyGain:
+    """What a family of joint errors that a model lacks would explain of the residuals."""
+
+    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`.
+    added: int  #: Number of its parameters.
+    remaining: int  #: Number of rows less the number of all parameters.
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the residuals with the family to those without it."""
+        return float(np.sqrt((self.remaining + self.added) / (self.remaining + self.gain)))
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """How well a model explains the measurements that it was fitted to.
+
+    Attributes:
+        chi_square: Sum of the squared residuals in stated standard deviations of the instrument; None if they
+            are not stated.
+        freedom: Degrees of freedom of the residuals.
+        gains: Families of joint errors that the model lacks, by name, and what they would explain.
+    """
+
+    chi_square: float | None
+    freedom: float
+    gains: Mapping[str, FamilyGain] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """Calibrated chain and the covariance of its errors.
@@ -112,6 +158,10 @@ class Uncertainty:
     #: pose of a base or tool that the measurements leave free, see `frame_gauge`; shape (0, 0) if they leave
     #: none free.
     frame_part: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: Information that the covariance follows from; None if it is not known.
+    information: Information | None = None
+    #: How well the calibrated model explains its measurements; None if it is not known.
+    fit: ModelFit | None = None
 
     @property
     def has_free_frames(self) -> bool:
@@ -132,6 +182,7 @@ class Uncertainty:
             sqrt_covariance=self.sqrt_covariance - parts[0],
             unbounded_directions=self.unbounded_directions - parts[1],
             frame_part=np.empty((0, 0)),
+            information=None,
         )
 
     @classmethod
@@ -212,3 +263,67 @@ class Uncertainty:
         samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)
         covariance[samples, components, components] = np.inf
         return Prediction(frames.poses(), covariance)
+
+
+# --- compact form for files -----------------------------------------------------------------------
+
+
+def compact(known: Uncertainty) -> Information | None:
+    """Return the compact form of an uncertainty; None if it is small or there is no shorter form."""
+    exact = known.information
+    if exact is None or known.sqrt_covariance.shape[1] <= MAX_COLUMNS or known.unbounded_directions.shape[1]:
+        return None
+    if not exact.root.size:
+        return exact
+    root = np.linalg.qr(exact.root.T, mode="r").T
+    difference = root.T @ _information_matrix(exact, known) @ root
+    difference.flat[:: len(root) + 1] -= 1.0
+    parts = [np.empty((len(root), 0))] * 2
+    if np.linalg.norm(difference) > MAX_ERROR:
+        values, axes = np.linalg.eigh(difference)
+        directions = solve_triangular(root, axes * np.sqrt(np.abs(values)), trans=1, lower=True)
+        parts = [directions[:, sign * values > MAX_ERROR].astype(np.float32) for sign in (-1, 1)]
+    if 2 * sum(part.shape[1] for part in parts) > len(root):
+        return None
+    found = replace(exact, added=parts[0], removed=parts[1])
+    if not known.has_free_frames:
+        return found
+    u, s, vt = np.linalg.svd(known.frame_part, full_matrices=False)
+    count = int(np.sum(s > FRAME_RTOL * s[0]))
+    coordinates = np.linalg.lstsq(exact.root.T, vt[:count].T * s[:count], rcond=None)[0]
+    return replace(found, gauge=u[:, :count], coordinates=coordinates)
+
+
+def expand(found: Information, known: Uncertainty) -> Uncertainty | None:
+    """Return an uncertainty without columns with those of its compact form; None if they are not finite."""
+    matrix = _information_matrix(found, known)
+    matrix += found.added @ found.added.T - found.removed @ found.removed.T
+    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    upper, info = lapack.dpotrf((matrix / scale / scale[:, None]).T)
+    if info:
+        return None
+    root = lapack.dtrtri(upper)[0] / scale[:, None]
+    n_geometric = found.geometry.shape[1]
+    columns = np.concatenate([found.geometry @ root[:n_geometric], root[n_geometric:]])
+    if not np.isfinite(columns).all():
+        return None
+    known = replace(known, sqrt_covariance=columns, information=found)
+    return (
+        replace(known, frame_part=found.gauge @ (found.coordinates.T @ root)) if found.gauge.size else known
+    )
+
+
+def _information_matrix(information: Information, known: Uncertainty) -> Array:
+    """Compute the information of samples and priors about the parameters, (p, p)."""
+    chain, samples, n_geometric = known.chain, information.samples, information.geometry.shape[1]
+    frames = chain.forward_kinematics(samples.conditions)
+    # A column of zeros takes the place of the residuals.
+    directions = np.zeros((len(information.geometry) + len(known.entries), n_geometric + 1))
+    directions[: len(information.geometry), :-1] = information.geometry
+    dense = samples.rows(known.tool_twists(frames, directions).transpose(2, 1, 0))
+    numbers, terms = chain.transmission_terms(frames, known.entries) if len(known.entries) else ([], [])
+    motions = samples.rows(chain.motions(frames, numbers))
+    rows = StructuredRows.of(dense, motions, numbers, terms, n_geometric)
+    products = information.factor * rows.products()[:-1, :-1]
+    products.flat[:: len(products) + 1] += information.prior**2
+    return products

@@ -43,16 +43,22 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     unbounded_directions = "..."
     frame_part = "..."                 # absent if the measurements determine base and tool
 
-    [uncertainty.compact]              # in place of these three: `estimation.compact_uncertainty`
-    step = 2e-7                        # unit of `leading` and `of_joint` [rad]
-    leading = "..."                    # rows of 16-bit integers, compressed, in base85
-    of_joint = "..."
-    geometry = "..."                   # rows of 32-bit floats, compressed, in base85
-    angle_std = "..."
-    gauge = "..."
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
     model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
     model_std_rad = 1e-4               # the same of the orientation
+    chi_square = 512.3                 # of the residuals with the stated noise; absent if it is not stated
+    degrees_of_freedom = 498.0         # of the residuals
+    left_out = [["harmonics", 31.2, 24, 474]]   # families that the model lacks: `estimation.FamilyGain`
+
+    [uncertainty.information]          # in place of the three arrays: `estimation.information`
+    factor = 0.09                      # on the information of the samples
+    units = [...]                      # of the columns of `roots`
+    roots = "..."                      # rows of 16-bit integers, compressed, in base85
+    geometry = "..."                   # rows of doubles, compressed, in base85; so are `prior` and `gauge`
+    added = "..."                      # rows of 32-bit floats, compressed, in base85
+
+    [uncertainty.information.conditions]
+    q = "..."                          # conditions of the samples by name, as `added`
 
     [manifest]
     urdf_sha256 = "..."                # hash of the URDF that this file was written with
@@ -81,22 +87,22 @@ import lzma
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
 import tomli_w
 
 from .._typing import Array, PathLike
-from ..estimation.compact_uncertainty import MAX_COMPACT_COLUMNS, CompactUncertainty, compact, compact_rows
+from ..estimation.information import Information, Samples
 from ..estimation.parameters import PARAMETER_SETS, fold_harmonics
-from ..estimation.uncertainty import Uncertainty
+from ..estimation.uncertainty import FamilyGain, ModelFit, Uncertainty, compact, expand
 from ..exceptions import FileFormatError, UnknownNameError
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..messages import quote
 from ..robot.chain import Chain
-from ..robot.conditions import MAX_PAYLOAD, TEMPERATURE_RANGE
+from ..robot.conditions import MAX_PAYLOAD, TEMPERATURE_RANGE, Conditions
 from ..robot.error_families import (
     COUPLING,
     FAMILIES,
@@ -136,6 +142,18 @@ _HARMONIC = Key(
         and 1 <= value[0] <= MAX_CURVE_ORDER
     ),
 )
+_FAMILY_GAIN = Key(
+    '[family, gain, added, remaining], such as ["harmonics", 31.2, 24, 474]',
+    {"type": "array", "minItems": 4, "maxItems": 4},
+    lambda value: (
+        isinstance(value, list)
+        and len(value) == 4
+        and isinstance(value[0], str)
+        and value[0] in FAMILIES
+        and all(toml.is_number(each) and each >= 0 for each in value[1:])
+        and all(isinstance(each, int) and each > 0 for each in value[2:])
+    ),
+)
 _NAMES = Key("a list of names", {"type": "array", "items": {"type": "string"}})
 _BASE64 = Key("base64 text", {"type": "string"})
 _PAYLOAD_KEYS = {
@@ -163,13 +181,27 @@ _JOINT_KEYS = {
     **dict.fromkeys(_JOINT_TERM_KEYS, _COEFFICIENT),
     _COUPLING: toml.table_by_name(_COEFFICIENT),
 }
-# Types of the numbers of a compact uncertainty, whose texts are compressed.
-_COMPACT_TYPES = {
-    "leading": "<i2",
-    "of_joint": "<i2",
-    "geometry": "<f4",
-    "angle_std": "<f4",
-    "gauge": "<f4",
+# Types of the numbers of arrays that are compressed.
+_INFORMATION_TYPES = {
+    "geometry": "<f8",
+    "prior": "<f8",
+    "added": "<f4",
+    "removed": "<f4",
+    "gauge": "<f8",
+    "coordinates": "<f8",
+}
+_ROOTS_TYPE, _CONDITION_TYPE = "<i2", "<f4"
+# Rows of the upper part of a root, and shape of the conditions of a sample that are matrices.
+_N_UPPER = 21
+_CONDITION_SHAPES = {"base_motion": (4, 4), "tool_motion": (4, 4), "temperature": (), "payload": ()}
+# Largest number of columns of such an array.
+_MAX_COLUMNS = 1 << 18
+_INFORMATION_KEYS = {
+    "factor": toml.number(above=0),
+    "units": toml.vector(6),
+    "roots": _BASE64,
+    **dict.fromkeys(_INFORMATION_TYPES, _BASE64),
+    "conditions": toml.table_by_name(_BASE64),
 }
 _UNCERTAINTY_KEYS = {
     "joints": _NAMES,
@@ -178,10 +210,13 @@ _UNCERTAINTY_KEYS = {
     "sqrt_covariance": replace(_BASE64, is_optional=True),
     "unbounded_directions": replace(_BASE64, is_optional=True),
     "frame_part": replace(_BASE64, is_optional=True),
-    "compact": toml.table_of({"step": toml.number(above=0), **dict.fromkeys(_COMPACT_TYPES, _BASE64)}),
+    "information": toml.table_of(_INFORMATION_KEYS),
     "temperature": toml.number(1, default=1.0),
     "model_std_m": toml.number(0, default=0.0),
     "model_std_rad": toml.number(0, default=0.0),
+    "chi_square": toml.number(0, is_optional=True),
+    "degrees_of_freedom": toml.number(0, is_optional=True),
+    "left_out": toml.list_of(_FAMILY_GAIN, default=()),
 }
 _MEASURED_KEYS = {
     "joints": _NAMES,
@@ -244,7 +279,8 @@ _UNCERTAINTY_HEADER = """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
 # a prior determine; frame_part: what of both is only another pose of base or tool, which the measurements
 # leave free. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then the
-# terms. Little-endian doubles in base64. compact: the same for hundreds of terms, in fewer numbers.
+# terms. Little-endian doubles in base64. information: samples and priors from which they follow, for hundreds
+# of terms.
 """
 _MEASURED_HEADER = """\
 # measured: configurations that represent the measured region of joint space. A configuration is in the region
@@ -459,11 +495,14 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
         chain = chain.with_transmission(Transmission.zero(chain.loads))
     model_std = (values["model_std_m"], values["model_std_rad"])
     nothing = np.empty((n_rows, 0))
-    known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std)
-    if values["compact"] is not None:
-        return _read_compact(table.table("compact"), values["compact"], known)
+    gains = {name: FamilyGain(*numbers) for name, *numbers in values["left_out"]}
+    freedom = values["degrees_of_freedom"]
+    fit = None if freedom is None else ModelFit(values["chi_square"], freedom, gains)
+    known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std, fit=fit)
+    if values["information"] is not None:
+        return _read_information(table.table("information"), values["information"], known)
     if missing := [key for key in ("sqrt_covariance", "unbounded_directions") if values[key] is None]:
-        raise table.error(missing[0], "expected base64 text, or a table [uncertainty.compact]")
+        raise table.error(missing[0], "expected base64 text, or a table [uncertainty.information]")
     columns = {
         key: _decode_rows(values[key], n_rows, f"{table.where}: {key}")
         for key in ("sqrt_covariance", "unbounded_directions", "frame_part")
@@ -475,24 +514,55 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     return replace(known, **columns)
 
 
-def _read_compact(table: TomlTable, values: Mapping[str, Any], known: Uncertainty) -> Uncertainty:
-    """Read the table [uncertainty.compact] of an uncertainty without columns."""
+def _read_information(table: TomlTable, values: Mapping[str, Any], known: Uncertainty) -> Uncertainty:
+    """Read the table [uncertainty.information] of an uncertainty without columns."""
+    n_rows, texts = len(known.sqrt_covariance), values["conditions"]
+    n_bodies, where = n_rows - len(known.entries), f"{table.where}: conditions"
+    n_of = _condition_sizes(known.chain)
+    if "q" not in texts:
+        raise FileFormatError(f"{where}: q is missing; calibrate again to replace it")
+    if unknown := [name for name in texts if name not in n_of]:
+        raise FileFormatError(
+            f"{where}: unknown condition {quote(unknown[0])}; choose from {', '.join(n_of)}"
+        )
+    conditions = {
+        name: _read_compressed(text, n_of[name], _CONDITION_TYPE, f"{where}: {name}")
+        for name, text in texts.items()
+    }
+    roots = _read_compressed(values["roots"], _N_UPPER, _ROOTS_TYPE, f"{table.where}: roots")
+    if len({array.shape[1] for array in (roots, *conditions.values())}) > 1:
+        raise table.error("roots", "expected as many columns as each of the conditions")
+    shaped = {
+        name: array.T.reshape(-1, *_CONDITION_SHAPES.get(name, array.shape[:1]))
+        for name, array in conditions.items()
+    }
+    samples = Samples(Conditions(**shaped), roots, np.array(values["units"]))
     arrays: dict[str, Array] = {}
-    for key, n_rows in compact_rows(known).items():
-        where = f"{table.where}: {key}"
-        # The coordinates of free frames are further rows.
-        n_rows += arrays["gauge"].shape[1] if key == "geometry" else 0
-        arrays[key] = _read_compressed(values[key], n_rows, _COMPACT_TYPES[key], where)
-    found = CompactUncertainty(values["step"], **arrays)
-    if problem := found.problem:
-        raise table.error(*problem)
-    return found.expand(known)
+    n_parameters = 0
+    for key, number in _INFORMATION_TYPES.items():
+        rows = {"geometry": n_bodies, "gauge": n_rows}.get(key, n_parameters)
+        arrays[key] = _read_compressed(values[key], rows, number, f"{table.where}: {key}")
+        n_parameters = arrays["geometry"].shape[1] + len(known.entries)
+    if arrays["prior"].shape[1] != 1:
+        raise table.error("prior", f"expected {n_parameters} numbers")
+    arrays["prior"] = arrays["prior"][:, 0]
+    found = expand(Information(samples, factor=values["factor"], **arrays), known)
+    if found is None:
+        raise FileFormatError(f"{table.where} has no finite covariance; calibrate again to replace it")
+    return found
+
+
+def _condition_sizes(chain: Chain) -> dict[str, int]:
+    """Return the numbers per sample of the conditions that the model of a robot depends on."""
+    n = chain.n_joints
+    sizes = {"q": n, "approach": n, "zeros": n, "temperature": 1, "payload": 1}
+    return {**sizes, "base_motion": 16, "tool_motion": 16, "growth": len(chain.moving_joints) + 1}
 
 
 def _read_compressed(text: str, n_rows: int, number: str, where: str) -> Array:
     """Return an array with n rows from the text of `_compressed_text`."""
     size = np.dtype(number).itemsize
-    max_bytes = size * n_rows * MAX_COMPACT_COLUMNS
+    max_bytes = size * n_rows * _MAX_COLUMNS
     decompressor = lzma.LZMADecompressor(lzma.FORMAT_XZ, MAX_SIDECAR_BYTES << 2)
     try:
         content = decompressor.decompress(base64.b85decode("".join(text.split())), max_bytes + 1)
@@ -605,7 +675,7 @@ def sidecar_text(
         "joint": _transmission_content(chain),
         **_link_content(chain),
         "instrument": {name: float(value) for name, value in (instrument or {}).items()},
-        "uncertainty": _uncertainty_content(uncertainty, measured_region),
+        "uncertainty": _uncertainty_content(uncertainty),
         "measured": _measured_content(chain, measured_region),
         **(rig_content(rig.cameras, rig.boards) if rig else {}),
     }
@@ -686,14 +756,13 @@ def _link_content(chain: Chain) -> dict[str, Any]:
     return content
 
 
-def _uncertainty_content(uncertainty: Uncertainty | None, region: MeasuredRegion | None) -> dict[str, Any]:
+def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
     """Return the table [uncertainty]; empty if the noise, and with it the covariance, is unknown."""
     if uncertainty is None or not np.isfinite(uncertainty.sqrt_covariance).all():
         return {}
     indices = _coefficient_indices(uncertainty.chain)
     names = {index: name for name, index in indices.items()}
-    measured = np.empty((0, uncertainty.chain.n_joints)) if region is None else region.configurations
-    found = compact(uncertainty, measured)
+    found = compact(uncertainty)
     if found is None:
         columns: dict[str, Any] = {
             "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
@@ -701,15 +770,44 @@ def _uncertainty_content(uncertainty: Uncertainty | None, region: MeasuredRegion
             **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
         }
     else:
-        texts = {key: _compressed_text(getattr(found, key), kind) for key, kind in _COMPACT_TYPES.items()}
-        columns = {"compact": {"step": found.step, **texts}}
+        columns = {"information": _information_content(found)}
     return {
         "joints": list(uncertainty.chain.moving_joints),
         "terms": _folded([names[int(index)] for index in uncertainty.entries], list(indices)),
         "temperature": uncertainty.temperature,
         "model_std_m": uncertainty.model_std[0],
         "model_std_rad": uncertainty.model_std[1],
+        **_fit_content(uncertainty.fit),
         **columns,
+    }
+
+
+def _fit_content(fit: ModelFit | None) -> dict[str, Any]:
+    """Return the keys of [uncertainty] that say how well the model explains its measurements."""
+    if fit is None:
+        return {}
+    left_out = [[name, *astuple(each)] for name, each in fit.gains.items()]
+    return {
+        **({} if fit.chi_square is None else {"chi_square": fit.chi_square}),
+        "degrees_of_freedom": float(fit.freedom),
+        **({"left_out": left_out} if left_out else {}),
+    }
+
+
+def _information_content(found: Information) -> dict[str, Any]:
+    """Return the table [uncertainty.information]."""
+    samples = found.samples
+    texts = {key: _compressed_text(getattr(found, key), number) for key, number in _INFORMATION_TYPES.items()}
+    conditions = {
+        name: getattr(samples.conditions, name).reshape(len(samples.conditions.q), -1).T
+        for name in sorted(samples.conditions.names | {"q"})
+    }
+    return {
+        "factor": found.factor,
+        "units": samples.units.tolist(),
+        **texts,
+        "roots": _compressed_text(samples.roots, _ROOTS_TYPE),
+        "conditions": {name: _compressed_text(rows, _CONDITION_TYPE) for name, rows in conditions.items()},
     }
 
 

@@ -54,7 +54,7 @@ from .timeline import order_samples
 # Largest share of unchanged robots that are called changed.
 MAX_FALSE_ALARMS = 0.001
 # Number of sets of residuals that are drawn to find the limit of the evidence.
-N_DRAWS = 8000
+N_DRAWS = 3000
 # Smallest share of the evidence with which a change is named.
 MIN_SHARE = 0.75
 # Share of the evidence from which a change that has the same effect is named, too.
@@ -335,9 +335,12 @@ class _CheckModel:
         turned = self.axes.T @ residuals
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
-    def log_likelihoods(self, columns: Array, sets: Sequence[Array]) -> Array:
-        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
-        square, nothing = WIDTHS[:, None] ** 2, self.null_likelihoods(sets)
+    def log_likelihoods(self, columns: Array, sets: Sequence[Array], nothing: Array) -> Array:
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d).
+
+        `nothing` has those without a change, (σ, d).
+        """
+        square = WIDTHS[:, None] ** 2
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):
             values, vectors = np.linalg.eigh(a.T @ a)
@@ -356,8 +359,9 @@ class _CheckModel:
         """Return the ratio for any change that `MAX_FALSE_ALARMS` of unchanged robots exceed."""
         draws = np.random.default_rng(0).standard_normal((len(self.numbers), N_DRAWS))
         sets = [draws * np.sqrt(self.variances[self.likely_noise] / each)[:, None] for each in self.variances]
-        nothing = _log_means(self.null_likelihoods(sets)[:, None])
-        ratios = np.array([_log_means(self.log_likelihoods(each, sets)) - nothing for each in columns])
+        nothing = self.null_likelihoods(sets)
+        ratios = np.array([_log_means(self.log_likelihoods(each, sets, nothing)) for each in columns])
+        ratios -= _log_means(nothing[:, None])
         return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
 
     def estimate(self, block: Block) -> tuple[Array, Array, Array]:
@@ -395,15 +399,13 @@ class _CheckModel:
         samples = [np.eye(len(self.numbers))[:, self.numbers == i] / self._sigma[i] for i in range(count)]
         priors = [ROBOT_PRIOR if block.kind == "robot" else 1.0 for block in blocks] + [1 / count] * count
         log_priors = np.log(np.array(priors) / np.sum(priors))
-        residual = self.scaled_sets(self.rows[:, -1:])
-        likelihoods = [
-            *(
-                self.log_likelihoods(columns, self.scaled_sets(undone[:, None]))
-                for _, columns, undone in estimates
-            ),
-            *(self.log_likelihoods(columns, residual) for columns in samples),
-        ]
-        nothing = _log_means(self.null_likelihoods(residual)[:, None])
+        pairs = [*((columns, undone[:, None]) for _, columns, undone in estimates)]
+        pairs += [(columns, self.rows[:, -1:]) for columns in samples]
+        likelihoods = []
+        for columns, residual in pairs:
+            sets = self.scaled_sets(residual)
+            likelihoods.append(self.log_likelihoods(columns, sets, self.null_likelihoods(sets)))
+        nothing = _log_means(self.null_likelihoods(self.scaled_sets(self.rows[:, -1:]))[:, None])
         ratios = np.array([_log_means(each) - nothing for each in likelihoods])[:, 0]
         total = float(_log_sums((ratios + log_priors)[:, None])[0])
         shares = np.exp(ratios + log_priors - total)
@@ -419,14 +421,18 @@ class _CheckModel:
         limit = self.limit(columns, log_priors)
         return sorted(hypotheses, key=lambda each: -each.share), total, limit
 
-    def position_rms(self) -> tuple[float, float]:
-        """Return the RMS distance of the measured positions from the robot's, and what is expected [m]."""
+    @cached_property
+    def _positions(self) -> tuple[Array, Array]:
+        """Numbers of the rows of positions, and their standard deviations [m], (3N,) each."""
         width = len(self.is_row) // (self.numbers[-1] + 1)
         is_position = (np.arange(len(self.is_row)) % width < 3)[self.is_row]
-        sigma = np.concatenate([np.asarray(item.sigma).ravel() for item in self.data])
-        residual = self.rows[is_position, -1] * sigma
-        variances = np.einsum("ij,j,ij->i", self.axes, self.variances[0], self.axes)[is_position] * sigma**2
-        count = self.numbers[-1] + 1
+        return np.flatnonzero(is_position), np.concatenate([item.sigma.ravel() for item in self.data])
+
+    def position_rms(self) -> tuple[float, float]:
+        """Return the RMS distance of the measured positions from the robot's, and what is expected [m]."""
+        (rows, sigma), count = self._positions, self.numbers[-1] + 1
+        residual, axes = self.rows[rows, -1] * sigma, self.axes[rows]
+        variances = np.einsum("ij,j,ij->i", axes, self.variances[0], axes) * sigma**2
         expected = np.sqrt(variances.sum() / count) if len(self.noise_factors) == 1 else np.nan
         return float(np.sqrt(np.sum(residual**2) / count)), float(expected)
 
@@ -463,14 +469,8 @@ class _CheckModel:
 
     def _revealed(self, block: Block, covariance: Array) -> float:
         """Return the displacement of the tool by a change in its worst direction that is revealed [m]."""
-        frames = self.chain.forward_kinematics(np.concatenate([item.q for item in self.data]))
-        chain, bodies, twists = self.layout.problem.errors.derivative(
-            np.zeros(len(self.layout.problem.errors.parameters))
-        )
-        full = np.zeros((self.layout.n_columns, 3, frames.tool.shape[-1]))
-        full[: len(bodies)] = chain.tool_jacobian(frames, bodies, twists)[:, :3]
-        full[self.layout.joints] = chain.joint_jacobian(frames, None)[:, :3]
-        effects = full[block.columns].reshape(len(block.columns), -1).T / np.sqrt(full.shape[2])
+        rows, sigma = self._positions
+        effects = self.rows[rows][:, block.columns] * sigma[:, None] / np.sqrt(self.numbers[-1] + 1)
         r = np.linalg.qr(effects, mode="r")
         return REVEALED_RATIO * float(np.sqrt(max(np.linalg.eigvalsh(r @ covariance @ r.T).max(), 0.0)))
 

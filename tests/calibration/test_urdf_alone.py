@@ -49,9 +49,9 @@ def calibrated():
     return truth, tool, dh.calibrate(nominal, data), dh.calibrate(nominal, data, extend="none")
 
 
-def error_of(chain: Chain, data: Measurement) -> float:
+def error_of(chain: Chain, *data: Measurement) -> float:
     """Return the RMS error of the position with the base and the tool that fit best [m]."""
-    return fit_frames(chain, [data], {}).comparisons[-1].after["position_rms_m"]
+    return fit_frames(chain, data, {}).comparisons[-1].after["position_rms_m"]
 
 
 def test_urdf_alone_is_as_good_as_a_calibration_without_joint_errors(calibrated):
@@ -163,6 +163,31 @@ def test_urdf_alone_of_half_a_real_series(series):
     alone = error_of(fit.chain.urdf_alone, other)
     assert alone <= MAX_RATIO * error_of(geometry.chain, other)
     assert error_of(fit.chain, other) < 0.4 * alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", ["panda_1", "panda_2_clean"])
+def test_urdf_alone_at_places_that_are_left_out(arm, tmp_path):
+    """A ball on the hand in two sockets, 50 mm apart, at several places; one place judges each fit."""
+    folder = DATA / "mukca_panda"
+    if not folder.exists():
+        missing(f"measurements at {folder}")
+    nominal = read_robot(folder / "panda_with_ball.urdf", "ball_link")
+    places = {}
+    for place in sorted(path for path in (folder / arm).iterdir() if path.is_dir()):
+        known = tmp_path / f"{place.name}.csv"
+        known.write_text(f"point_a,point_b,distance[mm]\n{place.name}/hole_0,{place.name}/hole_1,50\n")
+        files = [*sorted(place.glob("hole_[01].csv")), known]
+        columns = [MAPS / "mukca_panda.toml"] * 2 + [None]
+        pairs = zip(files, columns, strict=True)
+        places[place.name] = [read_measurements(file, nominal, columns=each) for file, each in pairs]
+    errors = []
+    for left_out, judged in places.items():
+        fitted = [item for name, items in places.items() if name != left_out for item in items]
+        fits = [dh.calibrate(nominal, fitted, "placement,tool", extend=each) for each in ("auto", "none")]
+        errors.append([error_of(fits[0].chain.urdf_alone, *judged), error_of(fits[1].chain, *judged)])
+    alone, geometry = np.sqrt(np.mean(np.square(errors), 0))
+    assert alone <= MAX_RATIO * geometry, errors
 
 
 def test_commands_state_both_accuracies(calibrated, tmp_path, monkeypatch, capsys):

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import zipfile
+from pathlib import Path
 
 import pytest
 from robots import URDF
+from slow_cases import some_slow
 
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import FileFormatError
@@ -108,3 +111,53 @@ def test_another_robot_must_have_the_joints_of_the_bundle(first, tmp_path, capsy
     other = str(URDF / "ur10.dh.toml")
     assert main(["calibrate", "--from", str(first / "arm.dhcal.zip"), other, "-o", output]) == 2
     assert "its joints are" in capsys.readouterr().err
+
+
+def continued(first, folder, *options) -> dict:
+    """Continue a calibration with options; return its JSON document."""
+    outputs = ["-o", str(folder / "out.urdf"), "--json", str(folder / "r.json")]
+    assert main(["calibrate", "--from", str(first / "arm.dhcal.zip"), *map(str, options), *outputs]) == 0
+    return json.loads((folder / "r.json").read_text())
+
+
+def test_a_bundle_is_continued_with_more_measurements(first, tmp_path):
+    more, bundle = tmp_path / "laser.csv", tmp_path / "next.dhcal.zip"
+    robot = str(URDF / "sim_6dof.dh.toml")
+    assert main(["simulate", robot, "-m", "9", "--noise", "0.1mm", "--seed", "5", "-o", str(more)]) == 0
+    found = continued(first, tmp_path, more, "--bundle", bundle)
+    assert found["samples"] == 29
+    # The name of the added file is another one in the bundle.
+    names = sorted(read_bundle(bundle).inputs)
+    assert len(names) == 3
+    assert {"laser.csv", "sim_6dof.dh.toml"} < set(names)
+    again = tmp_path / "again"
+    again.mkdir()
+    assert main(["calibrate", "--from", str(bundle), "-o", str(again / "out.urdf")]) == 0
+    assert (again / "out.urdf").read_bytes() == (tmp_path / "out.urdf").read_bytes()
+
+
+def test_a_bundle_is_continued_with_another_robot_and_other_options(first, tmp_path):
+    old = json.loads((first / "r.json").read_text())
+    robot = tmp_path / "other.dh.toml"
+    text = (URDF / "sim_6dof.dh.toml").read_text()
+    robot.write_text(re.sub(r"(?m)^d = ([1-9]\S*)", lambda match: f"d = {float(match[1]) + 1}", text))
+    assert robot.read_text() != text
+    found = continued(first, tmp_path, robot, "--holdout", "0.25", "--loss", "linear")
+    assert any(name.endswith("other.dh.toml") for name in found["inputs"])
+    assert found["before"]["position_rms_m"] != old["before"]["position_rms_m"]
+    assert (old["samples"], found["samples"], found["samples_holdout"]) == (20, 15, 5)
+
+
+@pytest.mark.parametrize("curves", some_slow(["", ",curves"], [0]))
+def test_a_bundle_with_a_report_is_repeated_with_equal_bytes(first, tmp_path, monkeypatch, curves):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    monkeypatch.chdir(tmp_path / "a")
+    more = ("--parameters", f"minimal,base,tool{curves}", "--report", "r.html", "--bundle", "c.dhcal.zip")
+    assert main(["calibrate", "--from", str(first / "arm.dhcal.zip"), *more, "-o", "out.urdf"]) == 0
+    monkeypatch.chdir(tmp_path / "b")
+    assert main(["calibrate", "--from", "../a/c.dhcal.zip", "-o", "out.urdf"]) == 0
+    assert ("[uncertainty.information]" in Path("out.calibration.toml").read_text()) == bool(curves)
+    for path in (tmp_path / "b").iterdir():
+        assert path.read_bytes() == (tmp_path / "a" / path.name).read_bytes(), path.name
+    assert {path.name for path in (tmp_path / "b").iterdir()} >= {"out.urdf", "r.html"}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from robots import paper
 from scipy import stats
-from sessions import NOISE, Simulation
+from sessions import ANGLE_NOISE, NOISE, Simulation
 
 from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
@@ -31,40 +31,86 @@ def of(fit: Result) -> Calibrated:
     return Calibrated(fit.chain, fit.uncertainty, fit.measured_region, "arm.urdf")
 
 
-def halves(arm: str, seed: int, kind: type[Measurement], count: int = 120, curves: float = 0.0) -> Difference:
-    """Compare two halves of a set; with curves, the halves are two regions of the second joint."""
-    sim = Simulation(arm, count, seed)
-    order = np.arange(count)
-    if curves:
-        sine, cosine = sim.rng.normal(0, curves, (2, sim.chain.n_joints))
-        poses = sim.poses
-        sim.poses = lambda q, model=None: poses(q + sine * np.sin(2 * q) + cosine * np.cos(q), model)
-        order = np.argsort(sim.q[:, 1])
-        order = np.concatenate([order[: count // 2], order[count // 2 :]]).reshape(2, -1).T.ravel()
-    data = sim.measure(kind)
-    return compare(*(calibration(sim, data.take(order[i::2])) for i in (0, 1)))
+@dataclass(frozen=True)
+class Case:
+    """Two halves of one set of measurements."""
+
+    arm: str
+    kind: type[Measurement]
+    is_stated: bool = True
+    is_by_region: bool = False  # Small and large angles of the second joint, else random halves
+    curves: float = 0.0  # Standard deviation of the sine and cosine of q of each joint [rad]; half for 2q
+    count: int = 100
+
+    def compare(self, seed: int) -> Difference:
+        """Calibrate both halves without joint errors and compare them."""
+        sim = Simulation(self.arm, self.count, seed)
+        if self.curves:
+            sim.add_eccentricities(self.curves)
+        data = sim.measure(self.kind)
+        if self.is_stated:
+            data = with_noise(data)
+        order = np.argsort(sim.q[:, 1]) if self.is_by_region else np.arange(self.count)
+        return compare(*(calibration(sim, data.take(np.sort(part))) for part in np.array_split(order, 2)))
+
+
+def with_noise(data: Measurement) -> Measurement:
+    """State the noise of simulated measurements."""
+    return (
+        Position(data.q, data.positions(), NOISE)
+        if isinstance(data, Position)
+        else Pose(data.q, data.poses, NOISE, ANGLE_NOISE)
+    )
+
+
+def reduced(found: Difference) -> float:
+    """Return the reduced chi-square of residuals and parameters."""
+    assert found.overall is not None
+    return found.overall.reduced
+
+
+# Reduced chi-square of robots that the model describes.
+LOW, HIGH = 0.8, 1.25
+CASES = [
+    Case(arm, kind, is_stated, is_by_region)
+    for arm, kind in (("ur10", Position), ("panda", Pose))
+    for is_stated in (True, False)
+    for is_by_region in (False, True)
+]
 
 
 def test_halves_without_model_error_are_equal():
-    found = [halves("ur10", seed, Position) for seed in range(3)]
+    found = [CASES[0].compare(seed) for seed in range(3)]
     assert [each.verdict for each in found] == ["equal"] * 3
-    assert 0.5 < np.mean([each.reduced or 0.0 for each in found]) < 1.6
+    assert all(LOW < reduced(each) < HIGH for each in found)
+
+
+def test_curves_that_the_model_lacks_are_named_in_random_halves():
+    for is_stated in (True, False):
+        found = Case("ur10", Position, is_stated, curves=2e-4).compare(0)
+        assert found.verdict == "different"
+        assert "harmonics" in found.lacking
+        assert "The model does not explain the arm" in " ".join(found.sentences)
+        assert (reduced(found) > HIGH) == is_stated
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("arm", "kind"), [("ur10", Position), ("panda", Pose)])
-def test_chi_square_of_halves_has_its_distribution(arm, kind):
-    found = [halves(arm, seed, kind) for seed in range(100)]
-    assert 0.8 < np.mean([each.reduced or 0.0 for each in found]) < 1.25
-    inside = [each.usual[0] < (each.reduced or 0.0) < each.usual[1] for each in found]
-    assert np.mean(inside) >= 0.9
-    assert stats.kstest([each.p_value for each in found], "uniform").pvalue > 1e-3
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_chi_square_of_halves_has_its_distribution(case):
+    found = [case.compare(seed) for seed in range(100)]
+    values = np.array([reduced(each) for each in found])
+    assert np.mean((values > LOW) & (values < HIGH)) >= 0.95
+    assert np.mean([each.verdict == "equal" for each in found]) >= 0.97
+    of_parameters = [each.of_parameters for each in found if each.of_parameters]
+    assert np.mean([each.usual[0] < each.reduced < each.usual[1] for each in of_parameters]) >= 0.9
+    assert stats.kstest([each.p_value for each in of_parameters], "uniform").pvalue > 1e-3
 
 
 @pytest.mark.slow
-def test_curves_that_the_model_lacks_make_regions_different():
-    found = [halves("ur10", seed, Position, 600, 1e-3) for seed in range(40)]
-    assert np.mean([each.verdict == "different" for each in found]) >= 0.95
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_curves_that_the_model_lacks_are_named(case):
+    found = [replace(case, curves=2e-4).compare(seed) for seed in range(40)]
+    assert np.mean([each.verdict == "different" and "harmonics" in each.lacking for each in found]) >= 0.95
 
 
 def test_a_changed_joint_is_named_whatever_base_and_tool_are():
@@ -116,6 +162,10 @@ def test_command(tmp_path: Path, capsys):
     assert main(["diff", *names, "--tip", "tool0", "--report", str(report), "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["verdict"] == "equal"
+    # Both sidecars state the residuals.
+    assert found["degrees_of_freedom"] > found["parameters"]["degrees_of_freedom"] + 100
+    assert LOW < found["reduced_chi_square"] < HIGH
+    assert found["lacking"] == []
     assert found["joint_space"]["position_rms_m"] < 5 * NOISE
     assert "Distance of the tools" in report.read_text()
     (tmp_path / "other.urdf").write_bytes(

@@ -14,7 +14,7 @@ from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
-from dhcal_pin.estimation.uncertainty import UNBOUNDED_TOL
+from dhcal_pin.estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.io.dh_file import read_dh
@@ -87,10 +87,12 @@ def test_predictions_from_a_file_agree_with_those_of_the_fit(ur10, tmp_path, set
     # Joints that moved by less than 10 nm keep their bytes in the URDF.
     mine, theirs = fit.predict(q), known.predict(q)
     np.testing.assert_allclose(theirs.poses, mine.poses, atol=1e-8)
-    np.testing.assert_allclose(theirs.position_std, mine.position_std, rtol=1e-7)
-    np.testing.assert_allclose(theirs.orientation_std, mine.orientation_std, rtol=1e-7)
+    # Hundreds of columns follow from rounded samples.
+    rtol = 1e-7 if len(fit.x) <= MAX_COLUMNS else 1e-5
+    np.testing.assert_allclose(theirs.position_std, mine.position_std, rtol=rtol)
+    np.testing.assert_allclose(theirs.orientation_std, mine.orientation_std, rtol=rtol)
     size = np.sqrt(np.einsum("mii->mi", mine.covariance))
-    assert np.max(np.abs(theirs.covariance - mine.covariance) / (size[:, :, None] * size[:, None])) <= 1e-7
+    assert np.max(np.abs(theirs.covariance - mine.covariance) / (size[:, :, None] * size[:, None])) <= rtol
     # And with the parameter covariance, without body twists.
     wanted = covariance_by_differences(fit, q[:20])
     gap = np.abs(mine.covariance[:20] - wanted) / (size[:20, :, None] * size[:20, None])
