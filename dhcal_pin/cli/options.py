@@ -128,6 +128,11 @@ PACKAGE_DIR: dict[str, Any] = {
     "folders above the URDF, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH)",
 }
 COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files in another layout"}
+SHEET: dict[str, Any] = {
+    "metavar": "NAME",
+    "default": "",
+    "help": "sheet of Excel files (default: the first one with rows of numbers)",
+}
 SERVOS: dict[str, Any] = {
     "metavar": "FILE",
     "help": "servo file of columns NAME[ticks] with counts: LeRobot's calibration of the arm (.json), or "
