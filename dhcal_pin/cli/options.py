@@ -175,6 +175,17 @@ def add_urdf_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
 
 
+def add_open_option(parser: argparse.ArgumentParser, what: str, default: bool | None = False) -> None:
+    """Add --open and --no-open, the options of commands that can show a page."""
+    parser.add_argument(
+        "--open",
+        action=argparse.BooleanOptionalAction,
+        help=f"open {what} in the browser" + " (default)" * bool(default),
+    )
+    # argparse would add a default of its own to the help.
+    parser.set_defaults(open=default)
+
+
 def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
     """Add --quiet and --verbose, which exclude each other."""
     group = parser.add_mutually_exclusive_group()
