@@ -22,9 +22,9 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -72,6 +72,8 @@ from .shrinkage import compute_shrinkage_factor
 REFERENCE_DECIMALS = 1
 
 Method = Literal["lm", "gn"]
+# Robust stages of the default loss.
+AUTO = robust.LOSSES["auto"].stages
 SessionOption = Literal["auto", "unordered", "off"]
 
 
@@ -196,6 +198,11 @@ def calibrate(
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
     start = partial(_first_fit, errors, priors=priors, known=known, bounds=bounds, options=solver)
     fit = start(data)
+    # The confirmation of changes and the calibration itself often need the same fits.
+    reweighted = cache(
+        lambda fit, stages: reweight(fit, stages, _prior_groups(fit, priors), max_iterations, progress)
+    )
+    extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
     found = None
     if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
         unweighted = replace(fit.problem, data=fit.data)
@@ -204,7 +211,7 @@ def calibrate(
             changed = found.applied(data, holdout)
             refit = start(changed[0])
             if found.has_two_robots or confirm_changes(
-                found, fit, refit, _prior_groups(refit, priors), max_iterations
+                found, fit, refit, lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0]
             ):
                 fit, holdout = refit, changed[1]
             else:
@@ -212,16 +219,16 @@ def calibrate(
     data = fit.data
     if method != "lm":
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
-    groups = _prior_groups(fit, priors)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(groups, stages, max_iterations, progress)
+        fitting = ImageFitting(_prior_groups(fit, priors), stages, max_iterations, progress)
         images = calibrate_images(fitting, fit, chain, holdout, exchanges)
         return replace(images, signs=signs, with_auto=with_auto)
-    fit = reweight(fit, stages, groups, max_iterations, progress)
+    groups = _prior_groups(fit, priors)
+    fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress, signs)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs)
     return replace(result, session=found, with_auto=with_auto)
 
 
@@ -299,8 +306,7 @@ def _calibrate_samples(
     groups: PriorGroups,
     families: Sequence[str],
     holdout: tuple[Measurement, ...],
-    max_iterations: int,
-    progress: Progress | None,
+    extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
     signs: SignDecision | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
@@ -310,9 +316,9 @@ def _calibrate_samples(
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
-    fit, extension = model_selection.extend(fit, families, max_iterations, progress)
-    extended = make_result(fit, shrinkage_factor, holdout, "lm")
-    return replace(extended, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
+    fit, extension = extended(fit, families)
+    result_with_families = make_result(fit, shrinkage_factor, holdout, "lm")
+    return replace(result_with_families, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
 
 
 def _initialize(

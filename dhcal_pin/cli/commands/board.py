@@ -5,7 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from ...exceptions import InvalidArgumentError
-from ..options import RIG
+from ..options import JSON, RIG
 
 EXAMPLE = "dhcal board rig.toml -o board.pdf"
 
@@ -17,23 +17,26 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
     )
     parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
     """Draw a board."""
     from ...detection import board_pdf  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block
     from ..screens.screen import Screen
 
-    require_writable_outputs([args.output], [args.rig])
+    require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
         raise InvalidArgumentError(f"{args.output}: unknown ending; write the board as .pdf")
     rig = read_rig(args.rig)
     board = only_entry(rig.boards, args.board, "board", args.rig)
-    write_outputs({args.output: board_pdf(board)})
+    write_with_json(
+        {args.output: board_pdf(board)}, args.json, {"output": args.output}, [args.rig], board=board.name
+    )
     advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
     console.show(Screen([files_block([args.output])]), args.verbosity)
     console.print_lines(advice)

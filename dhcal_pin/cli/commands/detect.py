@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
-from ..options import POSITIVE_INTEGER, RIG
+from ..options import JSON, POSITIVE_INTEGER, RIG
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
@@ -56,6 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="corners.csv", required=True, help="image coordinates to write"
     )
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
@@ -63,14 +64,15 @@ def run(args: Namespace) -> int:
     from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
     from ...io.tabular import csv_text
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
     paths = image_files(args.images)
-    require_writable_outputs([args.output], [args.rig, *files, *paths])
+    inputs = [args.rig, *files, *paths]
+    require_writable_outputs([args.output, args.json], inputs)
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
     joints, notes = _joints(args, paths)
@@ -83,7 +85,19 @@ def run(args: Namespace) -> int:
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
         contents |= pictures
         notes += remarks
-    write_outputs(contents)
+    boards = [
+        {
+            "board": each.board.name,
+            "images": len(each.images),
+            "used": len(each.used),
+            "problems": {
+                os.path.basename(image.path): image.problem for image in each.images if image.problem
+            },
+        }
+        for each in detections
+    ]
+    named = {"output": args.output} | ({"overlay": args.overlay} if args.overlay else {})
+    write_with_json(contents, args.json, named, inputs, boards=boards, notes=notes)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
     console.show(detection_screen(rig, detections, notes, written), args.verbosity)
     return 0
