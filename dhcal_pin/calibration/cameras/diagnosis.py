@@ -31,6 +31,7 @@ from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
+from ...subsampling import evenly_spaced_indices
 from ..partition import configuration_groups, k_fold
 from ..reweighting import Fit
 from .causes import (
@@ -77,6 +78,8 @@ MAX_REJECTED_SHARE = 0.03
 MIN_WRONG_RATIO = 5.0
 # Number of folds, smallest number of configurations, and largest number of causes.
 N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
+# Largest number of configurations in which causes are looked for: more of them do not change the cause.
+MAX_CONFIGURATIONS = 300
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
 # the images show.
 MIN_ROTATION = np.deg2rad(8.0)
@@ -303,8 +306,15 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     """Search the causes in some of the samples of a fit; None if they have too few configurations."""
     # The scatter within an image is the noise, whatever is stated.
     data = tuple(item.replace(has_stated_sigma=False) for item in data if len(item.rows))
-    if int(configuration_groups(data).max(initial=-1)) + 1 < MIN_CONFIGURATIONS:
+    label = configuration_groups(data)
+    count = int(label.max(initial=-1)) + 1
+    if count < MIN_CONFIGURATIONS:
         return None
+    if count > MAX_CONFIGURATIONS:
+        is_used = np.isin(label, evenly_spaced_indices(count, MAX_CONFIGURATIONS))
+        ends = np.cumsum([len(item.rows) for item in data])[:-1]
+        parts = zip(data, np.split(is_used, ends), strict=True)
+        data = tuple(item.take(used) for item, used in parts if used.any())
     sequence = file_sequence([*fit.data, *holdout])
     hand_eye = HandEyeData(fit.problem.errors, data, fit.problem.known, sequence)
     base = _State.of(hand_eye, Causes(), fit.problem.instruments(fit.solution.x))
