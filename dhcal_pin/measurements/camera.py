@@ -47,9 +47,10 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import BoardViews, Corners, estimate_views, first_values
+from .images.camera_start import BoardViews, Corners, estimate_views, first_values, moving_poses
 from .images.names import label_images, name_array, whole_images
 from .mounting import MountedRig, mount_rig
+from .pose import Pose
 from .validation import validated_array, validated_joint_positions, validated_sigma
 
 # Standard deviation [px] of image coordinates that state none.
@@ -565,6 +566,10 @@ class CameraCorners(Measurement):
     def board_views(self) -> BoardViews:
         """Poses of the boards in the cameras, from each image alone."""
         return estimate_views(self.corners)
+
+    def tool_poses(self) -> Pose:
+        """Return the poses of the tool, for some base and some tool, that the images show one by one."""
+        return Pose(*moving_poses(self.corners, self.board_views))
 
     # ------------------------------------------------------------------------------------------- files
     def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:

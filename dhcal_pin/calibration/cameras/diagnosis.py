@@ -64,6 +64,8 @@ MAX_NOISE_RATIO = 1.5
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
 # Errors of images above this are those of wrong joint values rather than of arm, board or lens [px].
 LARGE_ERROR = 10.0
+# The same of an arm with play and sag: 2° for a lens of 1150 px [px].
+MAX_PLAY_ERROR = 40.0
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
 # explain images that are paired with wrong joint values.
 MAX_LINKS_ERROR = 0.05
