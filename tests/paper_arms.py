@@ -35,7 +35,9 @@ class PaperArm:
     arm: ServoArm
     nominal: Chain
     images: CameraCorners
-    held_out: tuple[np.ndarray, np.ndarray]  # Joint values as read (k, 5), true poses of the board in the camera
+    held_out: tuple[
+        np.ndarray, np.ndarray
+    ]  # Joint values as read (k, 5), true poses of the board in the camera
 
     def held_out_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
         """Return the distances of the middle of the board in the camera from the truth, (k,) [m]."""

@@ -195,7 +195,9 @@ def calibrate(
         require_no_selection(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
     first = first_errors(chain, data) if LOW_COST in robot_sets else {}
-    start = partial(_first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver)
+    start = partial(
+        _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
+    )
     fit = start(data)
     found = None
     if session != "off" and method == "lm" and can_have_session((*data, *holdout)):

@@ -111,7 +111,7 @@ def calibrate_images(
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
     ungated = with_lens_priors(fit)
-    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations)
+    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.has_play)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
@@ -124,7 +124,9 @@ def calibrate_images(
         input_warnings=tuple(warnings),
         camera_stages=(*axis_stages(exchanges), *stages),
     )
-    if gate.is_open and fitted_error(gated.fit).pixels < (MAX_PLAY_ERROR if fitting.has_play else LARGE_ERROR):
+    if gate.is_open and fitted_error(gated.fit).pixels < (
+        MAX_PLAY_ERROR if fitting.has_play else LARGE_ERROR
+    ):
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))

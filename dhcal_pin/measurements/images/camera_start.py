@@ -147,8 +147,8 @@ def first_values(
 def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
     """Return joint values (k, n) and poses (k, 4, 4) of the moving one of camera and board in the other one.
 
-    They are those of the pair with the most views, without badly fitting ones: poses of the tool for some base
-    and some tool. Both are empty if no camera and board move against each other.
+    They are those of the pair with the most views, without badly fitting ones: poses of the tool for some
+    base and some tool. Both are empty if no camera and board move against each other.
     """
     pairs = np.stack([item.camera, item.board], 1)[views.sample]
     camera_moves, board_moves = (
