@@ -45,7 +45,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.signs import SignDecision, decide_signs, known_signs
+from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
@@ -196,7 +196,10 @@ def calibrate(
     if has_images(data):
         require_no_selection(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
-    start = partial(_first_fit, errors, priors=priors, known=known, bounds=bounds, options=solver)
+    first = first_errors(chain, data) if LOW_COST in robot_sets else {}
+    start = partial(
+        _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
+    )
     fit = start(data)
     # The confirmation of changes and the calibration itself often need the same fits.
     reweighted = cache(
@@ -219,12 +222,11 @@ def calibrate(
     data = fit.data
     if method != "lm":
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
-    stages = robust.LOSSES[loss].stages
+    groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(_prior_groups(fit, priors), stages, max_iterations, progress)
+        fitting = ImageFitting(groups, stages, max_iterations, progress, LOW_COST in robot_sets)
         images = calibrate_images(fitting, fit, chain, holdout, exchanges)
         return replace(images, signs=signs, with_auto=with_auto)
-    groups = _prior_groups(fit, priors)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
@@ -252,13 +254,17 @@ class _SolverOptions:
 def _first_fit(
     errors: ErrorModel,
     data: tuple[Measurement, ...],
+    first: Mapping[str, float],
     priors: Priors,
     known: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]] | None,
     options: _SolverOptions,
 ) -> Fit:
-    """Initialize base, tool and instruments, and solve for the first time."""
-    errors, data, weights = _initialize(errors, data, known, options.max_iterations, options.is_robust)
+    """Initialize base, tool and instruments, and solve for the first time, from first errors of the robot."""
+    started = replace(errors, chain=errors.at(_start(errors, first))) if first else errors
+    started, data, weights = _initialize(started, data, known, options.max_iterations, options.is_robust)
+    if not first:
+        errors = started
     data, distortion = with_stated_distortion(data)
     problem = make_problem(errors, data, prior_weights(errors, priors), known)
     problem = replace(problem, executor=options.executor)
@@ -266,7 +272,7 @@ def _first_fit(
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    start = _start(problem, distortion)
+    start = np.concatenate([_start(errors, first), _instrument_start(problem, distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
 
 
@@ -293,12 +299,14 @@ def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> Non
             )
 
 
-def _start(problem: Problem, distortion: Mapping[str, float]) -> Array:
-    """Return the start x (p,) of the solver: the nominal robot, and lenses with the distortion of the rig."""
-    start = np.zeros(len(problem.weights))
-    for i, parameter in enumerate(problem.instrument_parameters, len(problem.errors.parameters)):
-        start[i] = distortion.get(parameter.name, parameter.nominal) - parameter.nominal
-    return start
+def _start(errors: ErrorModel, first: Mapping[str, float]) -> Array:
+    """Return the start (p,) of the errors of the robot: the nominal robot, or first values by name."""
+    return np.array([first.get(p.name, 0.0) for p in errors.parameters])
+
+
+def _instrument_start(problem: Problem, first: Mapping[str, float]) -> Array:
+    """Return the start (s,) of the instruments: first values by name, such as the distortion of the rig."""
+    return np.array([first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters])
 
 
 def _calibrate_samples(

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, RIG
 
-EXAMPLE = "dhcal board rig.toml -o board.pdf"
+EXAMPLE = "dhcal board rig.toml --paper a4 -o board.pdf"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -15,6 +15,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("rig", metavar=RIG["metavar"], help="rig file with the board")
     parser.add_argument(
         "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
+    )
+    parser.add_argument(
+        "--paper",
+        metavar="SIZE",
+        choices=("a4", "letter"),
+        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig file, "
+        "corrects the scale of the printer (default: a page of the size of the board)",
     )
     parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
     parser.add_argument("--json", **JSON)
@@ -34,10 +41,14 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError(f"{args.output}: unknown ending; write the board as .pdf")
     rig = read_rig(args.rig)
     board = only_entry(rig.boards, args.board, "board", args.rig)
-    write_with_json(
-        {args.output: board_pdf(board)}, args.json, {"output": args.output}, [args.rig], board=board.name
-    )
+    page = board_pdf(board, args.paper)
+    write_with_json({args.output: page}, args.json, {"output": args.output}, [args.rig], board=board.name)
     advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
+    if args.paper:
+        advice = (
+            "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length to "
+            f"[board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a flat plate."
+        )
     console.show(Screen([files_block([args.output])]), args.verbosity)
     console.print_lines(advice)
     return 0

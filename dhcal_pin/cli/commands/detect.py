@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
@@ -20,7 +22,18 @@ EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal detect`."""
-    parser.add_argument("images", metavar="IMAGES", nargs="+", help="image files, or folders of images")
+    parser.add_argument(
+        "images",
+        metavar="IMAGES",
+        nargs="+",
+        help="image files, folders of images, or videos, of which one still is taken in each pause of the arm",
+    )
+    parser.add_argument(
+        "--stills",
+        metavar="DIR",
+        help="folder for the stills of videos, VIDEO-001.png, VIDEO-002.png and so on in the order of the "
+        "pauses; --joints has these names in the column `image` (default: they are not kept)",
+    )
     parser.add_argument(
         "--rig", **{**RIG, "required": True, "help": "rig file with the camera and the boards"}
     )
@@ -61,6 +74,36 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Find the corners and write them."""
+    with ExitStack() as kept:
+        return _run(args, *_with_stills(args, kept))
+
+
+def _with_stills(args: Namespace, kept: ExitStack) -> tuple[list[str], list[str]]:
+    """Return images with the stills of videos in their place, and a note on each video."""
+    from ...detection import is_video, save_stills  # lazy import: slow to load
+
+    paths, notes = [], []
+    videos = [path for path in args.images if is_video(path)]
+    if args.stills and not videos:
+        raise InvalidArgumentError("--stills: needs a video among the images; omit it")
+    folder = args.stills or kept.enter_context(TemporaryDirectory()) if videos else ""
+    if args.stills:
+        os.makedirs(args.stills, exist_ok=True)
+    for path in args.images:
+        if path not in videos:
+            paths.append(path)
+            continue
+        if not os.path.isfile(path):
+            raise InvalidArgumentError(f"{path}: no such file; expected a video")
+        stills = save_stills(path, folder)
+        paths += [file for file, _ in stills]
+        times = ", ".join(f"{time:.1f}" for _, time in stills)
+        notes.append(f"{path}: {len(stills)} pauses, with stills at {times} s")
+    return paths, notes
+
+
+def _run(args: Namespace, images: Sequence[str], video_notes: Sequence[str]) -> int:
+    """Find the corners in images and write them."""
     from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
     from ...io.tabular import csv_text
@@ -70,12 +113,13 @@ def run(args: Namespace) -> int:
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
-    paths = image_files(args.images)
+    paths = image_files(images)
     inputs = [args.rig, *files, *paths]
     require_writable_outputs([args.output, args.json], inputs)
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
     joints, notes = _joints(args, paths)
+    notes = [*video_notes, *notes]
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = corner_columns(rig, camera, detections, joints)
