@@ -16,11 +16,11 @@ import numpy as np
 CHROMIUM = shutil.which("chromium")
 # The checker of accessibility, as the package ships it.
 AXE = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
-# Software rendering, which works without a graphics card and in a container. Smooth edges would take most of
-# the time.
+# Software rendering, which works without a graphics card and in a container. Smooth edges, and pages that are
+# drawn like scenes, would take most of the time.
 ARGUMENTS = (
     "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --hide-scrollbars --webgl-antialiasing-mode=none"
+    "--enable-unsafe-swiftshader --hide-scrollbars --webgl-antialiasing-mode=none --disable-gpu-rasterization"
 ).split()
 VIEWPORT = {"width": 700, "height": 400}
 SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"

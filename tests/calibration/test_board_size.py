@@ -51,7 +51,7 @@ def test_large_errors_of_the_arm_are_not_taken_for_a_wrong_size(seed):
 def test_exchanged_links_are_named(is_on_wrist):
     """The rig states a camera on the wrist for a fixed one, or the other way round."""
     arm, images = photograph(0, 1e-3, is_on_wrist)
-    images = images.take(images.image < 8)
+    images = images.take(images.image < 12)
     images = with_rig(images.with_rig(images.rig.with_exchanged_links()))
     fit = dh.calibrate(arm, images, loss="linear", max_iterations=20)
     assert fit.verdict.status == "refused"
