@@ -337,7 +337,7 @@ def test_few_rows_are_not_examined():
     assert session_of(fit).found == ()
 
 
-def test_commands_state_what_happened(tmp_path, capsys):
+def test_commands_state_what_happened(tmp_path, capsys, undrawn):
     simulation = Simulation("ur10", 100, 9)
     robot, file = robot_file(ARMS["ur10"][0]), tmp_path / "bump.csv"
     write_csv(file, simulation, simulation.measure(Position, Changes("base", 5e-3)))
