@@ -17,6 +17,8 @@ from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
 from robots import missing, paper
 
 from dhcal_pin import plots
+from dhcal_pin.calibration import evidence
+from dhcal_pin.plausibility.mixups import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 
@@ -61,6 +63,14 @@ def mimicking() -> Chain:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the plots of reports, which take a second, where only their texts are looked at."""
     monkeypatch.setattr(plots.SvgPanels, "draw", lambda self, plot, key, *_, **__: f'<svg id="{key}"></svg>')
+
+
+@pytest.fixture(scope="module")
+def unsuspected() -> Iterator[None]:
+    """Leave out the search for mistakes in measurements, which takes seconds if an arm has large errors."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,9 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import Measurement, Noise, PointContact, Pose, Position
 from dhcal_pin.robot import Chain
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def fitted(kind: type[Measurement] = Position, m: int = 40) -> Result:
     """Calibrate the simulated arm of the paper on simulated measurements."""

@@ -16,6 +16,9 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, PointContact, Pose, Position
 from dhcal_pin.robot import Chain
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 SETS = "minimal,base,tool"
 NOISE = Noise(5e-5, 5e-5)
 KEY = "position_rms_m"

@@ -30,6 +30,9 @@ from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.measurements.mounting import mount_rig
 from dhcal_pin.robot import Chain
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 SIGMA = 1e-4
 KINDS = {kind.kind: kind for kind in (Pose, Position, Wires, PointContact)}
 CONTACTS = (PointContact, PlaneContact, SphereContact)

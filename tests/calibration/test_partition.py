@@ -29,6 +29,9 @@ from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.measurements import Measurement, PointContact, PointDistance, Position, RelativePose
 from dhcal_pin.robot import Chain
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 N_JOINTS = 6
 
 

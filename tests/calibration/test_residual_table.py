@@ -10,6 +10,9 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate, split
 from dhcal_pin.measurements import Distance, Noise, PlaneContact, Pose, Position, PositionComponents
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(2e-4, 1e-3)
 
 

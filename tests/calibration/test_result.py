@@ -17,6 +17,9 @@ from dhcal_pin.estimation.solver import next_iterate
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 # Standard deviations of the simulated noise [m], [rad].
 POSITION_STD, ROTATION_STD = 1e-4, np.deg2rad(0.01)
 NOISE = Noise(POSITION_STD, ROTATION_STD)

@@ -8,6 +8,9 @@ import pytest
 from dhcal_pin.calibration import calibrate, reweighting
 from dhcal_pin.measurements import Noise, PointContact, PointDistance, Pose
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 @pytest.mark.parametrize(("stated", "expected"), [(False, 1e-4), (True, 1e-3)])
 def test_single_distance_takes_the_pooled_noise(sim_6dof, sim_6dof_actual, stated, expected):

@@ -29,6 +29,9 @@ from dhcal_pin.report.context import ReportContext
 from dhcal_pin.report.figures import accuracy_figures
 from dhcal_pin.report.provenance import Provenance
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def with_outliers(kind, chain, seed, m=100, fraction=0.1):
     """Return clean measurements, the same with outliers of 50 to 500 sigma, and the rows of the outliers."""

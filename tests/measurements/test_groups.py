@@ -17,6 +17,9 @@ from dhcal_pin.measurements.position import PointMeasurement
 from dhcal_pin.measurements.validation import validated_array, validated_joint_positions
 from dhcal_pin.report import result_to_dict, write_report
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = 2e-4
 
 

@@ -21,6 +21,9 @@ from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload, parse_urdf
 from dhcal_pin.robot.transmission import MAX_CURVE_ORDER, Transmission, fill_harmonics, n_coefficients
 
+# Calibrations of arms with large errors, of which nothing asks for mistakes.
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def ur10() -> Chain:
     return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
