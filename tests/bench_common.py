@@ -35,7 +35,7 @@ class Row:
 
 def fit_geometry(chain: Chain, data: Measurement, sets: str, **options: Any) -> Result:
     """Calibrate the geometry by least squares, as other programs do; no outliers, no joint errors."""
-    return calibrate(chain, data, sets, extend="none", loss="linear", **options)
+    return calibrate(chain, data, sets, extend="none", loss="linear", session="off", **options)
 
 
 def clocked(ways: Sequence[Callable[[], object]], repeats: int, turn: float = 5e-3) -> list[float]:

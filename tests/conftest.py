@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any
 
 # The workers of pytest share the processors, and NumPy reads this when it is loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -14,9 +13,10 @@ os.environ.setdefault("MKL_NUM_THREADS", "1")
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
-from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Window, window_of
+from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
 from robots import missing, paper
 
+from dhcal_pin import plots
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 
@@ -57,20 +57,26 @@ def mimicking() -> Chain:
     return Chain.from_urdf(parse_urdf(data, "mimicking.urdf"), "tool0")
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the plots of reports, which take a second, where only their texts are looked at."""
+    monkeypatch.setattr(plots.SvgPanels, "draw", lambda self, plot, key, *_, **__: f'<svg id="{key}"></svg>')
+
+
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
+def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         missing("Chromium")
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield browser
-        browser.close()
+        process = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield Browser(process)
+        process.close()
 
 
 @pytest.fixture(scope="session")
-def shared_window(browser: Any) -> Iterator[Window]:
+def shared_window(browser: Browser) -> Iterator[Window]:
     with window_of(browser) as out:
         yield out
 

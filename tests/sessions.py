@@ -14,7 +14,7 @@ import pinocchio as pin
 from robots import robot_file
 from scipy.interpolate import CubicSpline
 
-from dhcal_pin.measurements import Measurement, Pose, Position
+from dhcal_pin.measurements import Measurement, MultiTargetPosition, Pose, Position, Wires
 from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
 
@@ -144,6 +144,23 @@ class Simulation:
         matrices[:, :3, :3] = [pose.rotation @ pin.exp3(w) for pose, w in zip(poses, noise, strict=True)]
         return Pose(self.q, matrices)
 
+    def measure_wires(self, changes: Changes | None = None) -> Wires:
+        """Return the lengths of four wires from known anchors."""
+        pose = self.measure(Pose, changes)
+        around = np.array([[1.5, 0, -1], [-1.2, 1.3, -1], [-1, -1.4, -1], [0.2, 0.3, 2.2]])
+        anchors = self.base.translation + around
+        lengths = np.linalg.norm(pose.positions()[:, None] - anchors, axis=2)
+        return Wires(self.q, lengths, anchors=anchors)
+
+    def measure_targets(self, changes: Changes | None = None) -> MultiTargetPosition:
+        """Return the positions of three targets on the tool, one after the other at each configuration."""
+        pose = self.measure(Pose, changes)
+        offsets = np.array([[0.05, 0, 0], [0, 0.06, 0], [-0.04, -0.03, 0.02]])
+        points = pose.positions()[:, None] + np.einsum("mij,tj->mti", pose.rotations(), offsets)
+        points += self.rng.normal(0, NOISE, points.shape)
+        labels = ["a", "b", "c"] * self.count
+        return MultiTargetPosition(np.repeat(self.q, 3, 0), points.reshape(-1, 3), labels)
+
     def _grown(self, growth: float) -> pin.Model:
         """Return the arm with longer links."""
         model = self.model.copy()
@@ -174,7 +191,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class Changes:
-    """What happens in a session: a step at a share of it, a linear or an exponential drift."""
+    """What happens in a session: a step at a share of it, or a linear, exponential or periodic drift."""
 
     of: str = ""
     length: float = 0.0
@@ -188,11 +205,14 @@ class Changes:
     has_second_robot: bool = False
     at: float | None = 0.5
     time_constant: float | None = None
+    periods: float = 0.0
 
     def shape(self, share: np.ndarray) -> np.ndarray:
         """Return the change over the session, from 0 to about 1."""
         if self.at is not None:
             return (np.arange(len(share)) >= round(self.at * len(share))).astype(float)
+        if self.periods:
+            return 0.5 - 0.5 * np.cos(2 * np.pi * self.periods * share)
         if self.time_constant is None:
             return share
         return 1 - np.exp(-share / self.time_constant)

@@ -217,7 +217,7 @@ def hold_out_errors(dhcal, folder, arm, places, left, *more):
     return [[1e3 * one[key] for key in ("position_rms_m", "residual_rms")] for one in found]
 
 
-@pytest.mark.parametrize("step", some_slow([1, 2], {1}))
+@pytest.mark.parametrize("step", some_slow([1, 2, 4], {2}))
 def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path, step):
     fitted, nominal = np.array(
         [hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2[::step]]
@@ -379,7 +379,7 @@ REAL_SERIES = {
 }
 
 
-@pytest.mark.parametrize("name", REAL_SERIES)
+@pytest.mark.parametrize("name", some_slow(list(REAL_SERIES), range(1, len(REAL_SERIES))))
 def test_no_real_series_is_refused(tmp_path, capsys, name):
     robot, files, options, columns = REAL_SERIES[name]
     output = tmp_path / "result.json"

@@ -240,6 +240,7 @@ SMALLER = {
     "02_your_robot": {
         **{"np.s_[::3]": "np.s_[:]", "split([data], 0.5": "split([data.take(np.s_[::3])], 0.5"},
         'tool", holdout=held)\nprint': 'tool", holdout=held, session="off")\nprint',
+        'tool", holdout=held)\nfit': 'tool", holdout=held, session="off")\nfit',
         'holdout=held, extend="none")': 'holdout=held, extend="none", session="off")',
     },
     "04_plan_and_trust": {

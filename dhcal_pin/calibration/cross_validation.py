@@ -192,7 +192,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
             [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
             for masks in ([~mask for mask in fold], fold)
         )
-        chain, instruments = fit_nominal(nominal, fitted, fit.problem.known)
+        chain, instruments = fit_nominal(nominal, fitted, fit.problem.known, fit.nominal_instruments)
         before += compute_errors(chain, held_out, instruments)
     after: list[dict[str, Array]] = []
     alone: list[dict[str, Array]] = []

@@ -135,7 +135,10 @@ class Accuracy(Mapping[str, Any]):
 
 
 def fit_instrument_parameters(
-    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]
+    chain: Chain,
+    data: Sequence[Measurement],
+    known: Mapping[str, float],
+    start: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Fit the instrument parameters that are not known to measurements of a given chain."""
     parameters = merge_instrument_parameters(data)
@@ -144,16 +147,21 @@ def fit_instrument_parameters(
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
         return given
-    return problem.instruments(minimize(problem).x)
+    start = start or {}
+    x = np.array([start.get(p.name, p.nominal) - p.nominal for p in parameters if p.name not in given])
+    return problem.instruments(minimize(problem, x=x).x)
 
 
 def fit_nominal(
-    nominal: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+    nominal: ErrorModel,
+    data: Sequence[Measurement],
+    known: Mapping[str, float],
+    start: Mapping[str, float] | None = None,
 ) -> tuple[Chain, dict[str, float]]:
-    """Fit base, tool and instrument parameters of the nominal robot to measurements."""
+    """Fit base, tool and instrument parameters of the nominal robot to measurements, from a start if any."""
     chain = fit_frames(nominal, tuple(data), known)
     data = [item.initialized(chain) for item in data]
-    values = fit_instrument_parameters(chain, data, known)
+    values = fit_instrument_parameters(chain, data, known, start)
     used = {
         parameter.name
         for item in data

@@ -22,9 +22,9 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -45,7 +45,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.signs import SignDecision, decide_signs, known_signs
+from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
@@ -72,6 +72,8 @@ from .shrinkage import compute_shrinkage_factor
 REFERENCE_DECIMALS = 1
 
 Method = Literal["lm", "gn"]
+# Robust stages of the default loss.
+AUTO = robust.LOSSES["auto"].stages
 SessionOption = Literal["auto", "unordered", "off"]
 
 
@@ -194,8 +196,16 @@ def calibrate(
     if has_images(data):
         require_no_selection(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
-    start = partial(_first_fit, errors, priors=priors, known=known, bounds=bounds, options=solver)
+    first = first_errors(chain, data) if LOW_COST in robot_sets else {}
+    start = partial(
+        _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
+    )
     fit = start(data)
+    # The confirmation of changes and the calibration itself often need the same fits.
+    reweighted = cache(
+        lambda fit, stages: reweight(fit, stages, _prior_groups(fit, priors), max_iterations, progress)
+    )
+    extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
     found = None
     if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
         unweighted = replace(fit.problem, data=fit.data)
@@ -204,7 +214,7 @@ def calibrate(
             changed = found.applied(data, holdout)
             refit = start(changed[0])
             if found.has_two_robots or confirm_changes(
-                found, fit, refit, _prior_groups(refit, priors), max_iterations
+                found, fit, refit, lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0]
             ):
                 fit, holdout = refit, changed[1]
             else:
@@ -212,16 +222,15 @@ def calibrate(
     data = fit.data
     if method != "lm":
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
-    groups = _prior_groups(fit, priors)
-    stages = robust.LOSSES[loss].stages
+    groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(groups, stages, max_iterations, progress)
+        fitting = ImageFitting(groups, stages, max_iterations, progress, LOW_COST in robot_sets)
         images = calibrate_images(fitting, fit, chain, holdout, exchanges)
         return replace(images, signs=signs, with_auto=with_auto)
-    fit = reweight(fit, stages, groups, max_iterations, progress)
+    fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, max_iterations, progress, signs)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs)
     return replace(result, session=found, with_auto=with_auto)
 
 
@@ -245,13 +254,17 @@ class _SolverOptions:
 def _first_fit(
     errors: ErrorModel,
     data: tuple[Measurement, ...],
+    first: Mapping[str, float],
     priors: Priors,
     known: Mapping[str, float],
     bounds: Mapping[str, tuple[float, float]] | None,
     options: _SolverOptions,
 ) -> Fit:
-    """Initialize base, tool and instruments, and solve for the first time."""
-    errors, data, weights = _initialize(errors, data, known, options.max_iterations, options.is_robust)
+    """Initialize base, tool and instruments, and solve for the first time, from first errors of the robot."""
+    started = replace(errors, chain=errors.at(_start(errors, first))) if first else errors
+    started, data, weights = _initialize(started, data, known, options.max_iterations, options.is_robust)
+    if not first:
+        errors = started
     data, distortion = with_stated_distortion(data)
     problem = make_problem(errors, data, prior_weights(errors, priors), known)
     problem = replace(problem, executor=options.executor)
@@ -259,7 +272,7 @@ def _first_fit(
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    start = _start(problem, distortion)
+    start = np.concatenate([_start(errors, first), _instrument_start(problem, distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
 
 
@@ -286,12 +299,14 @@ def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> Non
             )
 
 
-def _start(problem: Problem, distortion: Mapping[str, float]) -> Array:
-    """Return the start x (p,) of the solver: the nominal robot, and lenses with the distortion of the rig."""
-    start = np.zeros(len(problem.weights))
-    for i, parameter in enumerate(problem.instrument_parameters, len(problem.errors.parameters)):
-        start[i] = distortion.get(parameter.name, parameter.nominal) - parameter.nominal
-    return start
+def _start(errors: ErrorModel, first: Mapping[str, float]) -> Array:
+    """Return the start (p,) of the errors of the robot: the nominal robot, or first values by name."""
+    return np.array([first.get(p.name, 0.0) for p in errors.parameters])
+
+
+def _instrument_start(problem: Problem, first: Mapping[str, float]) -> Array:
+    """Return the start (s,) of the instruments: first values by name, such as the distortion of the rig."""
+    return np.array([first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters])
 
 
 def _calibrate_samples(
@@ -299,8 +314,7 @@ def _calibrate_samples(
     groups: PriorGroups,
     families: Sequence[str],
     holdout: tuple[Measurement, ...],
-    max_iterations: int,
-    progress: Progress | None,
+    extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
     signs: SignDecision | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
@@ -310,9 +324,9 @@ def _calibrate_samples(
     # Residuals of mixed-up measurements say nothing about other errors.
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
-    fit, extension = model_selection.extend(fit, families, max_iterations, progress)
-    extended = make_result(fit, shrinkage_factor, holdout, "lm")
-    return replace(extended, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
+    fit, extension = extended(fit, families)
+    result_with_families = make_result(fit, shrinkage_factor, holdout, "lm")
+    return replace(result_with_families, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
 
 
 def _initialize(

@@ -73,6 +73,7 @@ class Fit:
     weights: tuple[Array, ...]  # Robust weight of each sample, one array of shape (m,) per measurement
     previous_iterations: int = 0  # Number of iterations of the solutions before this one
     stage: str = robust.KEPT  # Robust stage that the weights are from, see `robust.LOSSES`
+    start: Array | None = None  # Unknowns (p+s,) at which a fit without outliers starts; zero if None
 
     @property
     def iterations(self) -> int:
@@ -172,7 +173,7 @@ def _next_round(
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     start, priors = solution.x, update_prior_scales(problem, solution, groups)
     if stage == robust.TRIMMED and change.size:
-        start, priors = np.zeros_like(start), expected
+        start, priors = np.zeros_like(start) if fit.start is None else fit.start, expected
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
     has_settled = max(change.size, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
     state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)

@@ -7,21 +7,17 @@ kept only if the measurements support them beside all families of joint errors, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from .._typing import Array
-from ..estimation import robust
-from ..estimation.parameters import EXTENSIONS
-from ..estimation.priors import PriorGroups
 from ..session import Session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
-from . import model_selection
-from .reweighting import Fit, reweight
+from .reweighting import Fit
 
 # Logarithm of the evidence that each coefficient of a change costs.
 COST_PER_COEFFICIENT = 5.0
@@ -29,18 +25,17 @@ COST_PER_COEFFICIENT = 5.0
 MIN_GROSS_RATIO = 10.0
 
 
-def confirm_changes(
-    session: Session, without: Fit, fit: Fit, groups: PriorGroups, max_iterations: int
-) -> bool:
+def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
     """Return whether changes explain measurements beside all families of joint errors.
 
-    `without` and `fit` are the first fits without and with the changes. Joint errors do not imitate changes
+    `without` and `fit` are the first fits without and with the changes; `extended` adds all families of joint
+    errors that the measurements support. Joint errors do not imitate changes
     that are far larger than what they leave.
     """
     noises = [_noise(_residuals(each)) for each in (without, fit)]
     if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
         return True
-    residuals = [_residuals(_extended(each, groups, max_iterations)) for each in (without, fit)]
+    residuals = [_residuals(extended(each)) for each in (without, fit)]
     noise = _noise(residuals[1])
     costs = [
         sum(
@@ -57,12 +52,6 @@ def confirm_changes(
     share = min([1.0, *(min(each, 1 - each) for each in shares)])
     needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
     return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
-
-
-def _extended(fit: Fit, groups: PriorGroups, max_iterations: int) -> Fit:
-    """Add all families of joint errors that the measurements support."""
-    fit = reweight(fit, robust.LOSSES["auto"].stages, groups, max_iterations, None)
-    return model_selection.extend(fit, EXTENSIONS, max_iterations, None)[0]
 
 
 def _noise(residuals: Sequence[Array]) -> list[Array]:

@@ -24,6 +24,7 @@ from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
+from .cameras.diagnosis import MAX_PLAY_ERROR
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -230,7 +231,8 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that does not fit the measurements after the calibration either."""
     for group, after in fit.comparisons[-1].after.groups.items():
         error = after.rms / (workspace_radius(fit.chain) if after.unit == "m" else 1.0)
-        if error <= MAX_USUAL_ERROR[after.unit]:
+        has_play = fit.signs is not None and after.unit == "px"
+        if error <= (MAX_PLAY_ERROR if has_play else MAX_USUAL_ERROR[after.unit]):
             continue
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
         text = f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms}"

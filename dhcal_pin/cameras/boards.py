@@ -11,7 +11,7 @@ along a column, and z = 0. Corners are numbered row by row, as OpenCV does:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,8 @@ from .._typing import Array
 
 # Kinds of boards in rig files.
 BOARD_TYPES = ("checkerboard", "charuco", "aprilgrid", "points")
+# Length of the ruler line on a printed page [m].
+RULER = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,7 @@ class Board:
         has_exact_points: Whether they are exact, so that it is not tried to estimate them.
         pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
         source: File and table that describe it, for messages; empty for a board from Python.
+        print_scale: Size of the print relative to the drawn board; all lengths here are those of the print.
     """
 
     name: str
@@ -59,11 +62,18 @@ class Board:
     has_exact_points: bool = False
     pose: Array | None = None
     source: str = ""
+    print_scale: float = 1.0
 
     @property
     def where(self) -> str:
         """Begin of messages about this board."""
         return self.source or f"board {self.name!r}"
+
+    @property
+    def drawn(self) -> Board:
+        """Board as it is drawn, with the lengths before the printer changed them."""
+        lengths = {name: getattr(self, name) / self.print_scale for name in ("square", "marker", "spacing")}
+        return replace(self, **lengths, print_scale=1.0)
 
     @property
     def n_markers(self) -> int:

@@ -71,6 +71,7 @@ class Job:
     root: str | None = field(default=None, metadata=options.ROOT)
     package_dir: tuple[str, ...] = field(default=(), metadata=options.PACKAGE_DIR)
     columns: str | None = field(default=None, metadata=options.COLUMNS)
+    sheet: str = field(default="", metadata=options.SHEET)
     rig: str | None = field(default=None, metadata=options.RIG)
     servos: str | None = field(default=None, metadata=options.SERVOS)
     skip_bad_rows: bool = field(default=False, metadata=options.SKIP_BAD_ROWS)

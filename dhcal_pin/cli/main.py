@@ -40,6 +40,7 @@ COMMANDS = (
     Command("board", "board", "draw a board to print, at its true scale"),
     Command("app", "app", "serve a page on this computer that calibrates a robot from dropped files"),
     Command("doctor", "doctor", "say what is installed and whether it works"),
+    Command("completion", "completion", "print a completion script for bash, zsh or fish"),
     Command("study", "study", "simulate calibrations over a grid of settings"),
 )
 

@@ -128,6 +128,11 @@ PACKAGE_DIR: dict[str, Any] = {
     "folders above the URDF, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH)",
 }
 COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files in another layout"}
+SHEET: dict[str, Any] = {
+    "metavar": "NAME",
+    "default": "",
+    "help": "sheet of Excel files (default: the first one with rows of numbers)",
+}
 SERVOS: dict[str, Any] = {
     "metavar": "FILE",
     "help": "servo file of columns NAME[ticks] with counts: LeRobot's calibration of the arm (.json), or "
@@ -168,6 +173,17 @@ def add_urdf_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tip", **TIP)
     parser.add_argument("--root", **ROOT)
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
+
+
+def add_open_option(parser: argparse.ArgumentParser, what: str, default: bool | None = False) -> None:
+    """Add --open and --no-open, the options of commands that can show a page."""
+    parser.add_argument(
+        "--open",
+        action=argparse.BooleanOptionalAction,
+        help=f"open {what} in the browser" + " (default)" * bool(default),
+    )
+    # argparse would add a default of its own to the help.
+    parser.set_defaults(open=default)
 
 
 def add_verbosity_options(parser: argparse.ArgumentParser) -> None:

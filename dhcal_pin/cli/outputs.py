@@ -12,6 +12,7 @@ from .._typing import PathLike
 from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.sidecar import existing_sidecar
 from ..report.json_document import json_text
+from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
 
@@ -75,6 +76,21 @@ def write_outputs(
     with defer_signals():
         write_files(contents, print_json if json_target == STDOUT else None)
         _written.extend(os.fspath(path) for path, content in contents.items() if content is not None)
+
+
+def write_with_json(
+    contents: Mapping[PathLike, str | bytes | None],
+    json_target: str | None,
+    files: Mapping[str, str],
+    inputs: Sequence[str],
+    **facts: object,
+) -> None:
+    """Write all outputs of a command, and a JSON document with files, inputs and facts on the result."""
+    document = None
+    if json_target:
+        digests = file_digests([path for path in inputs if os.path.isfile(path)])
+        document = {**facts, "files": files, "inputs": digests, "versions": versions()}
+    write_outputs(contents, json_target, document)
 
 
 def print_to_stdout(text: str) -> None:

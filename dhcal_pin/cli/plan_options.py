@@ -20,8 +20,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal plan`."""
     parser.add_argument("robot", **options.ROBOT)
     parser.add_argument(
-        "-n",
-        "--count",
+        *("-n", "--count", "-m", "--samples"),
+        dest="count",
         type=options.POSITIVE_INTEGER,
         metavar="N",
         help=f"number of poses; {N_RECHECKED} with --recheck if it is not given",

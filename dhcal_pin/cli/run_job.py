@@ -251,7 +251,13 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
     limited = with_wide_limits(chain) if LOW_COST in chain.parameters else chain
     for path in [*job.data, *filter(None, [holdout_file])]:
         read = read_measurement_file(
-            path, chain, job.columns, skip_bad_rows=job.skip_bad_rows, rig=rig, servos=servos
+            path,
+            chain,
+            job.columns,
+            skip_bad_rows=job.skip_bad_rows,
+            rig=rig,
+            servos=servos,
+            sheet=job.sheet,
         )
         if not job.mend:
             require_joint_units(chain, read)

@@ -7,13 +7,18 @@ import zlib
 import numpy as np
 
 from .._typing import Array
-from ..cameras.boards import Board
+from ..cameras.boards import RULER, Board
 from ..exceptions import InvalidArgumentError
 from .corners import charuco_board, marker_dictionary
 
 # Points of a PDF per metre, and white margin around a board [m].
 _POINTS_PER_METRE = 72 / 0.0254
 MARGIN = 0.01
+# Short and long side of a sheet of paper [m].
+PAPERS = {"a4": (0.21, 0.297), "letter": (0.2159, 0.2794)}
+# Height of the strip with the ruler at the lower edge of a sheet, and of the marks at its ends; width of its
+# lines [m]; size of the text [points].
+_STRIP, _MARK, _LINE_WIDTH, _FONT_SIZE = 0.02, 0.006, 3e-4, 9
 # Black modules around the bits of a marker.
 _BORDER_BITS = 1
 
@@ -66,21 +71,62 @@ def _marker(board: Board, number: int, left: float, top: float, size: float) -> 
     return np.array(out)
 
 
-def board_pdf(board: Board) -> bytes:
-    """Draw a board at its true scale."""
-    rectangles, (width, height) = black_rectangles(board)
+def _sheet(board: Board, size: tuple[float, float], paper: str) -> tuple[float, float]:
+    """Return the width and height of a sheet of paper [m] on which a board and a ruler fit."""
+    if paper not in PAPERS:
+        raise InvalidArgumentError(f"--paper {paper}: unknown paper; choose from {', '.join(PAPERS)}")
+    short, long = PAPERS[paper]
+    for sheet in ((short, long), (long, short)):
+        if size[0] + 2 * MARGIN <= sheet[0] and size[1] + 2 * MARGIN + _STRIP <= sheet[1]:
+            return sheet
+    room = (long - 2 * MARGIN, short - 2 * MARGIN - _STRIP)
+    raise InvalidArgumentError(
+        f"{board.where}: {1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm does not fit on {paper}; expected up to "
+        f"{1e3 * room[0]:.0f} x {1e3 * room[1]:.0f} mm or {1e3 * (short - 2 * MARGIN):.0f} x "
+        f"{1e3 * (long - 2 * MARGIN - _STRIP):.0f} mm"
+    )
+
+
+def _ruler(sheet_width: float) -> list[str]:
+    """Return the drawing commands of the ruler line with its marks and text."""
+    left, middle = (sheet_width - RULER) / 2, MARGIN + _MARK / 2
+    bars = [
+        (left, middle - _LINE_WIDTH / 2, RULER, _LINE_WIDTH),
+        # The outer edges of both marks are the ends.
+        (left, middle - _MARK / 2, _LINE_WIDTH, _MARK),
+        (left + RULER - _LINE_WIDTH, middle - _MARK / 2, _LINE_WIDTH, _MARK),
+    ]
     scale = _POINTS_PER_METRE
-    page = [(side + 2 * MARGIN) * scale for side in (width, height)]
+    lines = [" ".join(f"{scale * value:.5f}" for value in bar) + " re" for bar in bars]
+    text = (
+        f"Measure this line from end to end and write its length to the rig file: ruler_mm = {1e3 * RULER:g}"
+    )
+    place = f"{scale * left:.5f} {scale * (MARGIN + _MARK + 0.002):.5f}"
+    return [*lines, "f", f"BT /F1 {_FONT_SIZE} Tf {place} Td ({text}) Tj ET"]
+
+
+def board_pdf(board: Board, paper: str | None = None) -> bytes:
+    """Draw a board at its true scale, on a page of its size or with a ruler on a sheet of paper."""
+    rectangles, (width, height) = black_rectangles(board.drawn)
+    scale = _POINTS_PER_METRE
+    sheet = _sheet(board, (width, height), paper) if paper else (width + 2 * MARGIN, height + 2 * MARGIN)
+    page = [side * scale for side in sheet]
+    margin = (sheet[0] - width) / 2
     lines = ["0 g"]
     for left, top, w, h in rectangles.tolist():
-        x, y = (left + MARGIN) * scale, page[1] - (top + h + MARGIN) * scale
+        x, y = (left + margin) * scale, page[1] - (top + h + MARGIN) * scale
         lines.append(f"{x:.5f} {y:.5f} {w * scale:.5f} {h * scale:.5f} re")
-    content = zlib.compress("\n".join([*lines, "f"]).encode())
+    lines.append("f")
+    font = ""
+    if paper:
+        lines += _ruler(sheet[0])
+        font = "/Font << /F1 << /Type /Font /Subtype /Type1 /BaseFont /Helvetica >> >> "
+    content = zlib.compress("\n".join(lines).encode())
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
         f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {page[0]:.5f} {page[1]:.5f}] /Contents 4 0 R "
-        "/Resources << >> /ViewerPreferences << /PrintScaling /None >> >>".encode(),
+        f"/Resources << {font}>> /ViewerPreferences << /PrintScaling /None >> >>".encode(),
         f"<< /Length {len(content)} /Filter /FlateDecode >>\nstream\n".encode() + content + b"\nendstream",
     ]
     out, starts = b"%PDF-1.6\n", []

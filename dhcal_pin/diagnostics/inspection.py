@@ -29,7 +29,7 @@ from ..io.measurement_files.reading import (
     parse_measurements,
 )
 from ..io.servo_file import ServoFile
-from ..io.tables import Column, DataTable, read_table
+from ..io.tables import Column, DataTable, TextLayout, read_table
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
@@ -89,12 +89,13 @@ def inspect_file(
     columns: PathLike | None = None,
     rig: MountedRig | None = None,
     servos: ServoFile | None = None,
+    sheet: str = "",
 ) -> FileInspection:
     """Say what a measurement file contains."""
     if chain is None:
-        table = read_table(source)
+        table = read_table(source, TextLayout(sheet=sheet))
         return _inspect_table(table, None)
-    table = open_measurement_table(source, chain, columns, servos)
+    table = open_measurement_table(source, chain, columns, servos, sheet)
     try:
         file = parse_measurements(table, chain, skip_bad_rows=True, rig=rig)
     except DhcalError as error:

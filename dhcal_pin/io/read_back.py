@@ -7,11 +7,16 @@ normalized, for example, are read differently.
 
 from __future__ import annotations
 
+import builtins
 import io
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib.machinery import SourceFileLoader
 from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,17 +79,53 @@ def _pinocchio_poses(chain: Chain, q: Array) -> Array:
 
 
 def _yourdfpy_poses(chain: Chain, q: Array) -> Array:
-    """Compute the poses of the tip by yourdfpy."""
-    import yourdfpy  # lazy import: takes most of a second
-
-    robot: Any = yourdfpy.URDF.load(
-        io.BytesIO(chain.urdf.data), load_meshes=False, build_collision_scene_graph=False
-    )
+    """Compute the poses of the tip by the joints that yourdfpy reads."""
+    robot: Any = _yourdfpy_reader()["URDF"].load(io.BytesIO(chain.urdf.data), build_scene_graph=False)
+    by_child = {joint.child: joint for joint in robot.robot.joints}
     out = []
     for row in q:
         robot.update_cfg(dict(zip(chain.joint_names, row, strict=True)))
-        out.append(robot.get_transform(chain.tip, chain.root))
+        root, tip = (_pose_in_base(robot, by_child, link) for link in (chain.root, chain.tip))
+        out.append(se3.inverse(root) @ tip)
     return np.array(out)
+
+
+def _pose_in_base(robot: Any, by_child: Mapping[str, Any], link: str) -> Array:
+    """Multiply the poses of yourdfpy's joints from the base to a link."""
+    pose = np.eye(4)
+    while link in by_child:
+        joint = by_child[link]
+        pose = robot._forward_kinematics_joint(joint)[0] @ pose
+        link = joint.parent
+    return pose
+
+
+@cache
+def _yourdfpy_reader() -> dict[str, Any]:
+    """Return the names of yourdfpy's module that reads URDF, with a replacement of trimesh.
+
+    The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it.
+    """
+    trimesh: Any = ModuleType("trimesh")
+    trimesh.Trimesh = trimesh.Scene = object  # in annotations
+    trimesh.transformations = SimpleNamespace(
+        compose_matrix=lambda translate, angles: se3.transform(pin.rpy.rpyToMatrix(angles), translate),
+        translation_matrix=se3.translation,
+        rotation_matrix=lambda angle, axis: se3.exp6(np.r_[0, 0, 0, angle * axis / np.linalg.norm(axis)]),
+    )
+
+    def import_module(name: str, *args: Any) -> Any:
+        return trimesh if name.split(".")[0] == "trimesh" else builtins.__import__(name, *args)
+
+    package = find_spec("yourdfpy")
+    assert package is not None
+    assert package.origin is not None
+    path = Path(package.origin).with_name("urdf.py")
+    names = {"__name__": __name__, "__builtins__": vars(builtins) | {"__import__": import_module}}
+    code = SourceFileLoader(__name__, str(path)).get_code(__name__)
+    assert code is not None
+    exec(code, names)
+    return names
 
 
 def _mujoco_poses(chain: Chain, q: Array) -> Array:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .._typing import Array, PathLike
-from ..cameras.boards import BOARD_TYPES, Board
+from ..cameras.boards import BOARD_TYPES, RULER, Board
 from ..cameras.lens import FOCAL_AND_CENTRE, LENSES, Lens
 from ..cameras.rig import INTRINSICS_CHOICES, Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError, UnknownNameError
@@ -31,23 +31,35 @@ _LENGTH = toml.number(
 _FIRST_POSE = {
     key: replace(declared, default=None, is_optional=True) for key, declared in toml.POSE_KEYS.items()
 }
+# Measured length of the ruler line of a page that `dhcal board --paper` drew. Printers change lengths by 1 %.
+_MAX_PRINT_CHANGE = 0.1
+_RULER = replace(
+    toml.number(
+        above=1e3 * RULER * (1 - _MAX_PRINT_CHANGE),
+        at_most=1e3 * RULER * (1 + _MAX_PRINT_CHANGE),
+        description=f"the measured length of the ruler line, which is drawn {1e3 * RULER:g} mm long",
+    ),
+    is_optional=True,
+)
 _SIZE = {"columns": toml.whole(1, _MAX_COUNT), "rows": toml.whole(1, _MAX_COUNT)}
 # Keys of each type of board, in addition to those of all boards.
 _TYPE_KEYS: dict[str, dict[str, Key]] = {
     "points": {"points_mm": toml.list_of(toml.vector(3, _MAX_MM, "[x, y, z] in millimetres"))},
-    "checkerboard": {**_SIZE, "square_mm": _LENGTH},
+    "checkerboard": {**_SIZE, "square_mm": _LENGTH, "ruler_mm": _RULER},
     "charuco": {
         **_SIZE,
         "square_mm": _LENGTH,
         "marker_mm": _LENGTH,
         "dictionary": toml.text('a dictionary such as "DICT_5X5_100"'),
         "legacy": toml.flag(False),
+        "ruler_mm": _RULER,
     },
     "aprilgrid": {
         **_SIZE,
         "marker_mm": _LENGTH,
         "spacing_mm": _LENGTH,
         "dictionary": toml.text(default="DICT_APRILTAG_36h11"),
+        "ruler_mm": _RULER,
     },
 }
 
@@ -251,7 +263,8 @@ def _read_board(table: TomlTable) -> Board:
     lengths |= {"spacing": "spacing_mm"}
     names = {"columns": "columns", "rows": "rows", "dictionary": "dictionary", "is_legacy": "legacy"}
     own: dict[str, Any] = {field: values[key] for field, key in names.items() if key in values}
-    own |= {field: values[key] / 1e3 for field, key in lengths.items() if key in values}
+    print_scale = (values.get("ruler_mm") or 1e3 * RULER) / (1e3 * RULER)
+    own |= {field: print_scale * values[key] / 1e3 for field, key in lengths.items() if key in values}
     if kind == "points":
         own["listed_points"] = np.array(values["points_mm"]) / 1e3
     return Board(
@@ -262,6 +275,7 @@ def _read_board(table: TomlTable) -> Board:
         has_exact_points=values["points"] == "fixed",
         pose=_first_pose(values),
         source=table.where,
+        print_scale=print_scale,
         **own,
     )
 

@@ -136,6 +136,8 @@ class Measurement(ABC):
     has_length_scale: ClassVar[bool] = True
     # Name of the direction about which the measuring frame can turn without changing a measurement.
     symmetry_axis: ClassVar[str] = ""
+    # Whether each sample depends on the tool point in all directions: it shows changes during a session.
+    shows_changes: ClassVar[bool] = False
     # Whether a file may have poses of the tip in place of joint values.
     accepts_tool_poses: ClassVar[bool] = False
 

@@ -47,9 +47,10 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import BoardViews, Corners, estimate_views, first_values
+from .images.camera_start import BoardViews, Corners, estimate_views, first_values, moving_poses
 from .images.names import label_images, name_array, whole_images
 from .mounting import MountedRig, mount_rig
+from .pose import Pose
 from .validation import validated_array, validated_joint_positions, validated_sigma
 
 # Standard deviation [px] of image coordinates that state none.
@@ -486,7 +487,7 @@ class CameraCorners(Measurement):
         out = np.zeros((len(self.instrument_parameters), 2, m))
         start = 0
         for number, camera in enumerate(self.rig.cameras):
-            of_camera = np.flatnonzero(self.camera == number)
+            of_camera = _samples_of(self.camera, number)
             out[start : start + 6, :, of_camera] = found.by_camera[:, :, of_camera].swapaxes(0, 1)
             start += 6
             if camera.intrinsics != "fixed":
@@ -494,13 +495,13 @@ class CameraCorners(Measurement):
                 out[start : start + size, :, of_camera] = found.by_lens[number].swapaxes(0, 1)
                 start += size
         for number, board in enumerate(self.rig.boards):
-            of_board = np.flatnonzero(self.board == number)
+            of_board = _samples_of(self.board, number)
             out[start : start + 6, :, of_board] = found.by_board[:, :, of_board].swapaxes(0, 1)
             start += 6
             if board.has_free_points:
                 for axis in range(3):
                     columns = start + 3 * self.corner[of_board] + axis
-                    out[columns, :, of_board] = found.by_point[:, axis, of_board].T
+                    out[columns, :, np.arange(m)[of_board]] = found.by_point[:, axis, of_board].T
                 start += 3 * len(board.points)
         return self._whiten(out)
 
@@ -565,6 +566,10 @@ class CameraCorners(Measurement):
     def board_views(self) -> BoardViews:
         """Poses of the boards in the cameras, from each image alone."""
         return estimate_views(self.corners)
+
+    def tool_poses(self) -> Pose:
+        """Return the poses of the tool, for some base and some tool, that the images show one by one."""
+        return Pose(*moving_poses(self.corners, self.board_views))
 
     # ------------------------------------------------------------------------------------------- files
     def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -648,14 +653,20 @@ def left_jacobian(rotvec: Array) -> Array:
     return np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
 
 
+def _samples_of(numbers: Array, number: int) -> slice | Array:
+    """Return the index of the samples with a number, a slice without copies if all samples have it."""
+    return slice(None) if np.all(numbers == number) else np.flatnonzero(numbers == number)
+
+
 def _rotate(rotations: Array, vectors: Array) -> Array:
     """Return R·v of rotations (3, 3, m) and vectors (3, m)."""
-    return np.einsum("ijm,jm->im", rotations, vectors)
+    return rotations[:, 0] * vectors[0] + rotations[:, 1] * vectors[1] + rotations[:, 2] * vectors[2]
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Return the products of matrices (i, j, m) and (j, k, m)."""
-    return np.einsum("ijm,jkm->ikm", a, b)
+    """Return the products of matrices (i, 3, m) and (3, k, m)."""
+    # Sums of three products take less than half the time of np.einsum.
+    return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]
 
 
 def _cross(rows: Array, vectors: Array) -> Array:

@@ -55,6 +55,7 @@ class Wires(PointMeasurement):
     offsets: Array
 
     kind = "wires"
+    shows_changes = True
     residual_groups: ClassVar = {"length": Group.of(LENGTHS, slice(None))}
     COLUMNS = length_columns(
         "lengths", "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1)), plausible_range=instrument_range

@@ -161,6 +161,7 @@ class Pose(PoseMeasurement):
     """
 
     kind = "pose"
+    shows_changes = True
     COLUMNS = length_columns("poses", "x", "y", "z") + angle_columns("poses", "rx", "ry", "rz")
 
     def __init__(

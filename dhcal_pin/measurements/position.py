@@ -150,6 +150,7 @@ class Position(PointMeasurement):
     """
 
     kind = "position"
+    shows_changes = True
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES)
 
@@ -281,6 +282,7 @@ class MultiTargetPosition(PointMeasurement):
     names: tuple[str, ...]
 
     kind = "targets"
+    shows_changes = True
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES) + text_column("targets", "target")
     sample_fields = (*PointMeasurement.sample_fields, "label")

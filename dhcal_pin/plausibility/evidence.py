@@ -24,7 +24,7 @@ Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -75,6 +75,8 @@ class Evidence:
     angle_scale: float  #: Standard deviation of an angle residual [rad]; NaN if no angles are measured.
     #: Robot that was fitted, with base and tool; None without a fit.
     chain: Chain | None = field(default=None, repr=False, compare=False)
+    #: Errors of the robot, base and tool by name [m or rad].
+    errors: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
 
 
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Evidence:
@@ -109,6 +111,7 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACT
         factor * noise.length_scale,
         factor * noise.angle_scale,
         errors.at(solution.x[: len(errors.parameters)]),
+        dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
     )
 
 

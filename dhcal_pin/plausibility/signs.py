@@ -11,7 +11,7 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -22,6 +22,7 @@ from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
+from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 from ..robot.urdf_edit import with_turned_joints
@@ -141,8 +142,8 @@ def known_signs(chain: Chain, turned: Sequence[str]) -> SignDecision:
 def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
     """Decide which joints of a low-cost arm turn the other way."""
     undecided = replace(known_signs(chain, ()), is_compared=False)
-    samples = draw_samples(comparable_items(data))[0]
-    if not samples or not has_enough_rows(samples):
+    samples = _samples(data)
+    if not samples:
         return undecided
     fits: dict[tuple[int, ...], Evidence] = {}
     for turned in _hypotheses(chain):
@@ -160,6 +161,27 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
         turned=_names(chain, chosen),
         open=tuple(_open_signs(chain, chosen, other, fits) for other in others),
     )
+
+
+def first_errors(chain: Chain, data: Sequence[Measurement]) -> Mapping[str, float]:
+    """Estimate the errors of a low-cost arm by name, at which a fit of images starts; empty with few images.
+
+    A fit that starts at the nominal arm often ends in another minimum where zeros are wrong by 15°.
+    """
+    samples = _samples(data) if all(isinstance(item, CameraCorners) for item in data) else []
+    return fit_evidence(chain, samples, HAND_BUILT).errors if samples else {}
+
+
+def _samples(data: Sequence[Measurement]) -> list[Measurement]:
+    """Draw the samples that arms are fitted to; none if they are too few.
+
+    Images show poses of the tool, one by one. Those of another camera have a base and a tool of their own.
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    if images and len(images) == len(data):
+        data = [max((item.tool_poses() for item in images), key=lambda item: len(item.rows))]
+    samples = draw_samples(comparable_items(data))[0]
+    return samples if has_enough_rows(samples) else []
 
 
 def _hypotheses(chain: Chain) -> list[tuple[int, ...]]:

@@ -1,12 +1,18 @@
 """Causes of errors during a session, and how they change the robot over time.
 
-A cause is a block of columns of the linear model, such as the six of the base, times a function f of time:
+A cause is a block of columns of the linear model, such as the six of the base, times functions f of time:
 
 - a step: f is -1 before it and 0 after it;
 - a drift: f rises from -1 at the begin to 0 at the end, linearly or as 1 - exp(-t/τ);
+- a free drift: the first functions of the Karhunen-Loève expansion of a random walk that ends at 0,
+  f = √2·sin(ω·(1 - s))/ω with ω = (i - ½)·π, for i = 1, 2, ... and the time s from 0 to 1;
 - a constant: f = 1, for a lag of the joint values and a scale of the instrument.
 
 Every f but the constant is 0 at the end, so that the robot of the fit is that at the end of the session.
+
+Reference: M. Loève, Probability Theory II, 4th edition, 1978, section 37.5.
+
+Shapes: m samples, F functions of time, c columns of a block.
 """
 
 from __future__ import annotations
@@ -17,6 +23,11 @@ from typing import Literal
 import numpy as np
 
 from .._typing import Array
+
+# Size of a change that is held at zero.
+HELD_SIZE = 1e-12
+# Number of functions of a free drift.
+N_FUNCTIONS = 8
 
 Kind = Literal["base", "tool", "joint", "links", "robot", "lag", "scale"]
 
@@ -41,6 +52,12 @@ class Block:
     sizes: Array
     is_constant: bool = False
 
+    @property
+    def levers(self) -> Array:
+        """Motion of the tool per unit of each column, (c,); 0 for columns that are held at zero."""
+        is_free = self.sizes > HELD_SIZE
+        return np.where(is_free, 1 / np.where(is_free, self.sizes, 1.0), 0.0)
+
 
 @dataclass(frozen=True)
 class Step:
@@ -53,8 +70,8 @@ class Step:
     number: int
 
     def values(self, numbers: Array, times: Array) -> Array:
-        """Return f at samples (m,)."""
-        return np.where(numbers < self.number, -1.0, 0.0)
+        """Return f at samples, (m, 1)."""
+        return np.where(numbers < self.number, -1.0, 0.0)[:, None]
 
 
 @dataclass(frozen=True)
@@ -72,13 +89,30 @@ class Drift:
     time_constant: float = np.inf
 
     def values(self, numbers: Array, times: Array) -> Array:
-        """Return f at samples (m,)."""
-        span = self.end - self.begin
-        share = np.clip((times - self.begin) / span, 0.0, 1.0) if span else np.ones(len(times))
+        """Return f at samples, (m, 1)."""
+        share = _elapsed(self.begin, self.end, times)
         if np.isinf(self.time_constant):
-            return share - 1
-        rate = span / self.time_constant
-        return np.expm1(-rate * share) / np.expm1(-rate) - 1
+            return (share - 1)[:, None]
+        rate = (self.end - self.begin) / self.time_constant
+        return (np.expm1(-rate * share) / np.expm1(-rate) - 1)[:, None]
+
+
+@dataclass(frozen=True)
+class FreeDrift:
+    """Drift without a simple law, as a random walk.
+
+    Attributes:
+        begin: Time of the first sample.
+        end: Time of the last sample.
+    """
+
+    begin: float
+    end: float
+
+    def values(self, numbers: Array, times: Array) -> Array:
+        """Return the functions f at samples, (m, F)."""
+        rates = (np.arange(N_FUNCTIONS) + 0.5) * np.pi
+        return np.sqrt(2) * np.sin(rates * (1 - _elapsed(self.begin, self.end, times)[:, None])) / rates
 
 
 @dataclass(frozen=True)
@@ -86,11 +120,17 @@ class Constant:
     """Cause that is the same for all samples."""
 
     def values(self, numbers: Array, times: Array) -> Array:
-        """Return f at samples (m,)."""
-        return np.ones(len(numbers))
+        """Return f at samples, (m, 1)."""
+        return np.ones((len(numbers), 1))
 
 
-Shape = Step | Drift | Constant
+def _elapsed(begin: float, end: float, times: Array) -> Array:
+    """Return the share of the session that has passed at times (m,)."""
+    return np.clip((times - begin) / (end - begin), 0.0, 1.0) if end > begin else np.ones(len(times))
+
+
+Change = Step | Drift | FreeDrift
+Shape = Change | Constant
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +140,8 @@ class Cause:
     Attributes:
         block: What changed.
         shape: How it changed over time.
-        values: Its c coefficients, (c,).
-        covariance: Their covariance, (c, c).
+        values: Its coefficients, (F·c,): those of the first function of time, of the second one, and so on.
+        covariance: Their covariance, (F·c, F·c).
         log_evidence: Logarithm of the ratio of the evidence with and without it.
         effect: RMS of its effect on the residuals of the samples that it concerns, in standard deviations.
     """
@@ -112,3 +152,19 @@ class Cause:
     covariance: Array
     log_evidence: float = 0.0
     effect: float = 0.0
+
+    @property
+    def sizes(self) -> Array:
+        """Change of each coefficient that moves the tool by about 1 m, (F·c,)."""
+        return np.tile(self.block.sizes, len(self.values) // len(self.block.sizes))
+
+    @property
+    def amplitudes(self) -> Array:
+        """Coefficients of each function of time, (F, c)."""
+        return self.values.reshape(-1, len(self.block.sizes))
+
+    def columns_of(self, rows: Array, numbers: Array, times: Array) -> Array:
+        """Return the columns of the coefficients in whitened rows (m, k, ·), (m, k, F·c)."""
+        f = self.shape.values(numbers, times)
+        own = rows[..., None, self.block.columns] * f[:, None, :, None]
+        return own.reshape(*rows.shape[:2], -1)

@@ -13,8 +13,8 @@ from .._typing import Array
 from ..formatting import format_fixed, format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .causes import Cause, Drift, Step
-from .linear_model import HELD_SIZE, growing_links
+from .causes import Block, Cause, Drift, FreeDrift, Step
+from .linear_model import growing_links
 from .robot_changes import RobotChanges, apply_changes
 from .timeline import Timeline
 
@@ -84,14 +84,15 @@ class Event:
 
 @dataclass(frozen=True)
 class SlowChange:
-    """Drift from the begin to the end.
+    """Drift during a session.
 
     Attributes:
         of: "base", "tool", "links", or the name of a joint.
-        size: Size of the whole change, in `unit`.
+        size: Largest difference from the end, in `unit`.
         std: Standard deviation of the size.
         unit: "m" or "rad".
-        time_constant: Time constant of an exponential; None for a linear drift.
+        shape: "linear", "exponential" or "free".
+        time_constant: Time constant of an exponential; else None.
         time_unit: "row" or "s".
     """
 
@@ -99,12 +100,13 @@ class SlowChange:
     size: float
     std: float
     unit: str
+    shape: str
     time_constant: float | None
     time_unit: str
 
     def to_dict(self) -> dict[str, Any]:
         """Return the drift for the JSON document."""
-        keys = ("of", "size", "std", "unit", "time_constant")
+        keys = ("of", "size", "std", "unit", "shape", "time_constant")
         return {key: getattr(self, key) for key in keys}
 
     @property
@@ -116,9 +118,11 @@ class SlowChange:
             unit = "s" if self.time_unit == "s" else "rows"
             how += f", with a time constant of {self.time_constant:.3g} {unit}"
         if self.of == "links":
-            return f"The lengths of the links changed {how}, which moved the tool by {size}."
+            by = f"up to {size}" if self.shape == "free" else size
+            return f"The lengths of the links changed {how}, which moved the tool by {by}."
         part = self.of if self.of in ("base", "tool") else f"zero of joint {self.of}"
-        return f"The {part} drifted by {size} {how}."
+        by = f"irregularly by up to {size}" if self.shape == "free" else f"by {size}"
+        return f"The {part} drifted {by} {how}."
 
     @property
     def consequence(self) -> str:
@@ -275,10 +279,16 @@ def histories(session: Session) -> Iterator[History]:
         causes = [cause for cause in changes if (cause.block.of or cause.block.kind) == of]
         values, variance, unit = np.zeros(len(numbers)), np.zeros(len(numbers)), "m"
         for cause in causes:
-            f = cause.shape.values(numbers, times)
             size, std, unit = cause_size(cause, session.changes, session.chain, session.timeline)
-            values += np.abs(f) * size
-            variance += (f * std) ** 2
+            f = cause.shape.values(numbers, times)
+            motion = np.linalg.norm(f @ cause.amplitudes * cause.block.levers, axis=1)
+            # The variance along the direction of the largest change.
+            peak = int(np.argmax(motion))
+            along = f[peak] @ cause.amplitudes * cause.block.levers**2
+            at = (f[:, :, None] * along).reshape(len(f), -1)
+            spread = np.einsum("ni,ij,nj->n", at, cause.covariance, at)
+            values += size * motion / max(float(motion[peak]), 1e-300)
+            variance += std**2 * spread / max(float(spread[peak]), 1e-300)
         yield History(of, unit, numbers, values, np.sqrt(variance))
 
 
@@ -297,46 +307,53 @@ def describe_events(
     return tuple(events)
 
 
-def _step_size(cause: Cause, changes: RobotChanges, chain: Chain) -> tuple[float, float, str]:
-    """Return the size of a step or of a change of a joint zero, its standard deviation and its unit."""
-    if cause.block.kind == "joint":
-        unit = "m" if chain.is_prismatic[cause.block.index] else "rad"
-        return abs(float(cause.values[0])), float(np.sqrt(cause.covariance[0, 0])), unit
+def _step_size(cause: Cause, step: Step, changes: RobotChanges, chain: Chain) -> tuple[float, float, str]:
+    """Return the size of a step of base or tool, its standard deviation and its unit."""
     motion = getattr(changes, cause.block.kind)
-    number = cause.shape.number if isinstance(cause.shape, Step) else 0
-    before, after = motion.poses[motion.segments(np.array([number - 1, number]))]
+    before, after = motion.poses[motion.segments(np.array([step.number - 1, step.number]))]
     if cause.block.kind == "base":
         moved = (after - before)[:3] @ chain.base[:, 3]
         turned, arm, axes = after @ se3.inverse(before), np.zeros(3), chain.base[:3, :3]
     else:
         moved = (after - before)[:3, 3]
         turned, arm, axes = after @ se3.inverse(before), before[:3, 3], np.eye(3)
-    return _motion_size(axes.T @ moved, se3.log3(turned[:3, :3]), arm, cause)
+    return _motion_size(axes.T @ moved, se3.log3(turned[:3, :3]), arm, cause.block, cause.covariance)
 
 
-def _motion_size(moved: Array, angles: Array, arm: Array, cause: Cause) -> tuple[float, float, str]:
+def _motion_size(
+    moved: Array, angles: Array, arm: Array, block: Block, covariance: Array
+) -> tuple[float, float, str]:
     """Return the size of a motion: of its translation, unless it mostly turns."""
     distance, angle = float(np.linalg.norm(moved)), float(np.linalg.norm(angles))
-    size = float(cause.block.sizes[3:].max())
     # Turns that the measurements do not show are held at zero.
-    reach = 1 / size if size > HELD_SIZE else 0.0
+    reach = float(block.levers[3:].max())
     if angle * reach > MIN_ANGLE_RATIO * distance:
         along = np.concatenate([np.zeros(3), angles / angle])
-        return angle, float(np.sqrt(along @ cause.covariance @ along)), "rad"
+        return angle, float(np.sqrt(along @ covariance @ along)), "rad"
     direction = moved / max(distance, 1e-300)
     along = np.concatenate([direction, np.cross(arm, direction)])
-    return distance, float(np.sqrt(along @ cause.covariance @ along)), "m"
+    return distance, float(np.sqrt(along @ covariance @ along)), "m"
 
 
 def cause_size(
     cause: Cause, changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> tuple[float, float, str]:
     """Return the size of a change, its standard deviation and its unit."""
-    if isinstance(cause.shape, Step) or cause.block.kind == "joint":
-        return _step_size(cause, changes, chain)
-    if cause.block.kind == "links":
-        return *_growth_size(cause, chain, timeline), "m"
-    return _motion_size(cause.values[:3], cause.values[3:], np.zeros(3), cause)
+    block, shape = cause.block, cause.shape
+    if isinstance(shape, Step) and block.kind != "joint":
+        return _step_size(cause, shape, changes, chain)
+    numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
+    f = shape.values(numbers, times)
+    peak = f[np.argmax(np.linalg.norm(f @ cause.amplitudes * block.levers, axis=1))]
+    values = peak @ cause.amplitudes
+    by_values = np.kron(peak[None], np.eye(len(values)))
+    covariance = by_values @ cause.covariance @ by_values.T
+    if block.kind == "joint":
+        unit = "m" if chain.is_prismatic[block.index] else "rad"
+        return abs(float(values[0])), float(np.sqrt(covariance[0, 0])), unit
+    if block.kind == "links":
+        return *_growth_size(values, covariance, chain, timeline), "m"
+    return _motion_size(values[:3], values[3:], np.zeros(3), block, covariance)
 
 
 def describe_drifts(
@@ -344,25 +361,28 @@ def describe_drifts(
 ) -> Iterator[SlowChange]:
     """Describe the slow changes."""
     for cause in causes:
-        if isinstance(cause.shape, Drift):
-            constant = cause.shape.time_constant
+        shape = cause.shape
+        if isinstance(shape, Drift | FreeDrift):
+            constant = shape.time_constant if isinstance(shape, Drift) else np.inf
+            law = "linear" if np.isinf(constant) else "exponential"
             yield SlowChange(
                 cause.block.of or cause.block.kind,
                 *cause_size(cause, changes, chain, timeline),
+                law if isinstance(shape, Drift) else "free",
                 None if np.isinf(constant) else constant,
                 timeline.unit,
             )
 
 
-def _growth_size(cause: Cause, chain: Chain, timeline: Timeline) -> tuple[float, float]:
+def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timeline) -> tuple[float, float]:
     """Return the RMS motion of the tool by a growth of the links, and its standard deviation [m]."""
     q = np.concatenate([item.q for item in timeline.data])
     motions = chain.growth_motions(chain.forward_kinematics(q))[:, :3]
-    if len(cause.values) == 1:
+    if len(values) == 1:
         motions = motions.sum(0, keepdims=True)
     else:
         motions = motions[growing_links(chain)]
-    moved = np.einsum("jcm,j->cm", motions, cause.values)
+    moved = np.einsum("jcm,j->cm", motions, values)
     size = float(np.sqrt(np.mean(np.sum(moved**2, 0))))
     gradient = np.einsum("jcm,cm->j", motions, moved) / (moved.shape[1] * max(size, 1e-300))
-    return size, float(np.sqrt(gradient @ cause.covariance @ gradient))
+    return size, float(np.sqrt(gradient @ covariance @ gradient))

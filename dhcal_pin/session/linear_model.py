@@ -20,12 +20,10 @@ from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.error_families import MIN_LINK_LENGTH
-from .causes import Block
+from .causes import HELD_SIZE, Block
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
 PRIOR_FACTOR = 10.0
-# Size of a change that is held at zero.
-HELD_SIZE = 1e-12
 # Largest entry of a column, relative to those of others, below which it is rounding.
 MIN_OBSERVED = 1e-9
 # Largest share of a constant error that the unknowns of the calibration may leave.
@@ -37,6 +35,11 @@ SCALE_AXES = ("", "x", "y", "z")
 def growing_links(chain: Chain) -> Array:
     """Return which links have a length that can grow, (k+1,)."""
     return np.linalg.norm(chain.link_vectors, axis=1) > MIN_LINK_LENGTH
+
+
+def measures_positions(problem: Problem) -> bool:
+    """Return whether all samples are positions or poses, so that a scale of their axes can be wrong."""
+    return all(len(item.positions()) == len(item.rows) for item in problem.data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ class Layout:
         blocks += [
             Block("scale", axis, i, scales[i : i + 1], np.array([1 / size]), is_constant=True)
             for i, axis in enumerate(SCALE_AXES)
-            if axis  # the size of the robot imitates a scale of all axes
+            if axis and measures_positions(problem)  # the size of the robot imitates a scale of all axes
         ]
         blocks.append(Block("lag", "", 0, np.array([lag]), np.array([1.0]), is_constant=True))
         return cls(

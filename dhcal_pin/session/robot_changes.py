@@ -23,7 +23,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from ..robot.joint_path import joint_path
-from .causes import Cause, Drift, Step
+from .causes import Cause, Change, Constant, Drift, FreeDrift, Step
 from .timeline import Timeline
 
 
@@ -34,12 +34,12 @@ class Motion:
     Attributes:
         steps: Numbers of the first samples of all segments but the first, ascending.
         poses: Motion of each segment, (S, 4, 4) [m].
-        drifts: Drifts with their twists (6,), from the begin to the end.
+        drifts: Drifts with the twists of their functions of time, (F, 6).
     """
 
     steps: tuple[int, ...] = ()
     poses: Array = field(default_factory=lambda: np.eye(4)[None])
-    drifts: tuple[tuple[Drift, Array], ...] = ()
+    drifts: tuple[tuple[Drift | FreeDrift, Array], ...] = ()
 
     @property
     def is_identity(self) -> bool:
@@ -52,7 +52,7 @@ class Motion:
 
     def twists(self, numbers: Array, times: Array) -> Array:
         """Return the twists of the drifts at samples, (m, 6)."""
-        parts = [drift.values(numbers, times)[:, None] * twist for drift, twist in self.drifts]
+        parts = [drift.values(numbers, times) @ twists for drift, twists in self.drifts]
         return sum(parts, np.zeros((len(numbers), 6)))
 
     def with_steps(self, steps: Sequence[int]) -> Motion:
@@ -69,15 +69,15 @@ class RobotChanges:
     Attributes:
         base: Motion of the base.
         tool: Motion of the tool.
-        zeros: Changes of joint zeros: number of the joint, function of time, and amplitude [rad or m].
-        growth: Growth of the links: function of time, and amplitude of each link, (k+1,).
+        zeros: Changes of joint zeros: number of the joint, functions of time, and amplitudes (F,) [rad or m].
+        growth: Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
         lag: Time by which the joint values are too early, in the unit of the timeline.
     """
 
     base: Motion = field(default_factory=Motion)
     tool: Motion = field(default_factory=Motion)
-    zeros: tuple[tuple[int, Step | Drift, float], ...] = ()
-    growth: tuple[tuple[Step | Drift, Array], ...] = ()
+    zeros: tuple[tuple[int, Change, Array], ...] = ()
+    growth: tuple[tuple[Change, Array], ...] = ()
     lag: float = 0.0
 
     @property
@@ -141,13 +141,13 @@ class RobotChanges:
             values["tool_motion"] = drift @ self.tool.poses[self.tool.segments(numbers)]
         if self.zeros or later is not None:
             zeros = np.zeros(conditions.q.shape)
-            for joint, shape, amplitude in self.zeros:
-                zeros[:, joint] += amplitude * shape.values(numbers, times)
+            for joint, shape, amplitudes in self.zeros:
+                zeros[:, joint] += shape.values(numbers, times) @ amplitudes
             if later is not None:
                 zeros += later - conditions.q
             values["zeros"] = zeros
         if self.growth:
-            parts = [shape.values(numbers, times)[:, None] * amplitudes for shape, amplitudes in self.growth]
+            parts = [shape.values(numbers, times) @ amplitudes for shape, amplitudes in self.growth]
             values["growth"] = sum(parts[1:], parts[0])
         return replace(conditions, **values)
 
@@ -200,13 +200,13 @@ def update(
     Args:
         changes: Changes before.
         causes: Causes.
-        steps: Increments of the coefficients of each cause, (c,) each.
+        steps: Increments of the coefficients of each cause, (F·c,) each.
         base: Pose of the base (4, 4) at the end [m].
         links: Columns of the growth of each link in the linear model, (k+1,).
     """
     motions = {"base": changes.base, "tool": changes.tool}
-    zeros: list[tuple[int, Step | Drift, float]] = []
-    growth: list[tuple[Step | Drift, Array]] = []
+    zeros: list[tuple[int, Change, Array]] = []
+    growth: list[tuple[Change, Array]] = []
     lag = changes.lag
     for kind, motion in motions.items():
         chosen = [(c.shape, d) for c, d in zip(causes, steps, strict=True) if c.block.kind == kind]
@@ -222,20 +222,23 @@ def update(
             poses = increments @ motion.poses
         before = dict(motion.drifts)
         drifts = [
-            (shape, before.get(shape, np.zeros(6)) + d) for shape, d in chosen if isinstance(shape, Drift)
+            (shape, before.get(shape, 0.0) + d.reshape(-1, 6))
+            for shape, d in chosen
+            if isinstance(shape, Drift | FreeDrift)
         ]
         motions[kind] = replace(motion, poses=poses, drifts=tuple(drifts))
-    of_joints = {(joint, shape): value for joint, shape, value in changes.zeros}
+    of_joints = {(joint, shape): values for joint, shape, values in changes.zeros}
     of_links = dict(changes.growth)
     for cause, d in zip(causes, steps, strict=True):
-        if isinstance(cause.shape, Step | Drift) and cause.block.kind == "joint":
+        shape = cause.shape
+        if not isinstance(shape, Constant) and cause.block.kind == "joint":
             joint = int(cause.block.index)
-            zeros.append((joint, cause.shape, of_joints.get((joint, cause.shape), 0.0) + float(d[0])))
-        if isinstance(cause.shape, Step | Drift) and cause.block.kind == "links":
-            each = np.isin(links, cause.block.columns) if len(d) > 1 else np.ones(len(links), bool)
-            amplitudes = of_links.get(cause.shape, np.zeros(len(links))).copy()
-            amplitudes[each] += d
-            growth.append((cause.shape, amplitudes))
+            zeros.append((joint, shape, of_joints.get((joint, shape), 0.0) + d))
+        if not isinstance(shape, Constant) and cause.block.kind == "links":
+            amplitudes = np.zeros((len(cause.amplitudes), len(links))) + of_links.get(shape, 0.0)
+            is_own = np.isin(links, cause.block.columns) if len(cause.block.columns) > 1 else slice(None)
+            amplitudes[:, is_own] += d.reshape(len(amplitudes), -1)
+            growth.append((shape, amplitudes))
         if cause.block.kind == "lag":
             lag += float(d[0])
     if not any(cause.block.kind == "lag" for cause in causes):

@@ -1,61 +1,118 @@
 """Scale of all measured lengths, which the size of the robot imitates.
 
 Positions and poses do not tell a scale of the instrument from the size of the robot. A wrong scale changes
-all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections of the
-lengths, in units of their prior standard deviations, are those of one factor, and a normal distribution of
-unknown width. The factor is reported if Student's t test rejects that it is 1. The number of lengths in this
-test is the effective number of those that are determined (MacKay 1992).
+all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections x of the
+arm are therefore
+
+    x = k·s + M·e + n,
+
+with the relative error k of the scale, the corrections s that a unit of it causes, errors e of all joint
+origins, which the fit carries into its own parameters by M, and the noise n of the fit. The errors of the
+lengths and of the angles are normal with their prior standard deviations times two unknown factors, whose
+logarithms are normal. The posterior distribution of k is a mixture of normal distributions over both
+factors, similar to Student's t distribution. The factor 1 + k is reported if the probability
+of the other sign of k is negligible.
+
+Reference: A. Gelman et al., Bayesian Data Analysis, 3rd edition 2013, section 14.2.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from .._typing import Array
+from ..estimation.parameters import placement
 from ..estimation.problem import Problem
 from ..robot.chain import BASE_FRAME
 from .facts import Scale
-from .linear_model import Layout, whitened_rows
+from .linear_model import Layout, measures_positions, whitened_rows
 
-# Smallest RMS correction in prior standard deviations and relative change of lengths that are reported.
+# Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
-# Smallest norm of the corrections by a change of scale of 1, in prior standard deviations.
-MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
 MAX_CHANCE = 1e-3
+# Factors of the prior standard deviations of lengths and of angles.
+LENGTH_FACTORS, ANGLE_FACTORS = np.geomspace(0.1, 10, 12), np.geomspace(0.1, 10, 6)
+# Prior standard deviations of unknowns without a prior, as a multiple of the expected ones.
+WIDE = 10.0
+# Smallest relative variance of a correction: redundant parameters have none in some directions.
+MIN_VARIANCE = 1e-6
+# Standard deviation of both factors, as a factor.
+FACTOR = 3.0
 # Largest number of samples that are examined.
 MAX_SAMPLES = 200
 
 
 def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
-    from scipy.special import stdtr  # lazy import: slow
-
     errors = problem.errors
     outside = (BASE_FRAME, errors.chain.tool_frame_index)
-    is_length = np.array([p.unit == "m" and p.error_frame not in outside for p in errors.parameters], bool)
-    (lengths,) = np.nonzero(is_length)
-    priors = errors.priors[lengths]
-    corrections = x[lengths] / priors
-    if not lengths.size or np.sqrt(np.mean(corrections**2)) < MIN_CORRECTION:
+    is_arm = np.array([p.error_frame not in outside for p in errors.parameters], bool)
+    is_length = is_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
+    sizes = (x[: len(is_arm)] / errors.priors)[is_length]
+    if not measures_positions(problem) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
         return None
-    # Columns of unknowns without a prior, such as those of an undetermined tool, have an inverse with this.
-    weights = np.where(problem.weights > 0, problem.weights, 1e-6)
-    layout = Layout.of(problem)
+    (arm,) = np.nonzero(is_arm)
+    noise, by_scale, by_lengths, by_angles = _responses(problem, x, arm)
+    unit = 1 / np.sqrt(np.diag(by_lengths + by_angles + noise))
+    by_both = unit * unit[:, None]
+    lengths, angles = (
+        each[:, None, None] ** 2 * matrix * by_both
+        for each, matrix in ((LENGTH_FACTORS, by_lengths), (ANGLE_FACTORS, by_angles))
+    )
+    rounding = MIN_VARIANCE * np.eye(len(arm))
+    covariances = lengths[:, None] + angles + noise * by_both + rounding
+    factors = np.linalg.inv(np.linalg.cholesky(covariances))
+    z, column = factors @ (x[arm] * unit), factors @ (by_scale * unit)
+    information = np.sum(column**2, -1)
+    changes = np.sum(column * z, -1) / np.maximum(information, 1e-300)
+    likelihood = np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.sum(z**2, -1)
+    likelihood += 0.5 * (changes**2 * information - np.log(information))
+    spread = np.log(LENGTH_FACTORS[:, None]) ** 2 + np.log(ANGLE_FACTORS) ** 2
+    likelihood -= 0.5 * spread / np.log(FACTOR) ** 2
+    weights = np.exp(likelihood - likelihood.max())
+    weights /= weights.sum()
+    change = float(np.sum(weights * changes))
+    if abs(change) < MIN_CHANGE:
+        return None
+    from scipy.special import ndtr  # lazy import: slow
+
+    chance = 2 * float(np.sum(weights * ndtr(-np.sign(change) * changes * np.sqrt(information))))
+    if chance > MAX_CHANCE:
+        return None
+    variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))
+    return Scale(1 + change, float(np.sqrt(variance)), "")
+
+
+def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what moves the estimates of the parameters `arm`.
+
+    That are the covariance of the noise, the change by a scale of 1, and the covariances by errors of the
+    lengths and of the angles of all joint origins.
+    """
+    names = [parameter.name for parameter in problem.errors.parameters]
+    origins = placement(problem.errors.chain)
+    extended = problem.errors.with_parameters(p for p in origins if p.name not in names)
+    all_names = [parameter.name for parameter in extended.parameters]
+    n_instrument = len(x) - len(names)
+    own = np.array([*map(all_names.index, names), *range(len(all_names), len(all_names) + n_instrument)])
+    expected = np.array([*problem.errors.priors, *(u.prior for u in problem.instrument_parameters)])
+    weights = np.where(problem.weights > 0, problem.weights, 1 / (WIDE * expected))
+    all_weights, values = np.ones(len(all_names) + n_instrument), np.zeros(len(all_names) + n_instrument)
+    all_weights[own], values[own] = weights, x
+    layout = Layout.of(replace(problem, errors=extended, weights=all_weights))
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_SAMPLES))]) for item in problem.data]
-    rates = np.zeros((sum(len(item.rows) for item in data), errors.chain.n_joints))
-    rows = whitened_rows(layout, x, data, rates).reshape(-1, layout.n_columns)
+    rates = np.zeros((sum(len(item.rows) for item in data), extended.chain.n_joints))
+    rows = whitened_rows(layout, values, data, rates).reshape(-1, layout.n_columns)
     model = rows[:, layout.model]
-    covariance = np.linalg.inv(model.T @ model + np.diag(weights**2))
-    pattern = (covariance @ (model.T @ rows[:, layout.scale]))[lengths] / priors
-    if not np.linalg.norm(pattern) > MIN_PATTERN:
-        return None
-    change = float(pattern @ corrections / (pattern @ pattern))
-    freedom = float(np.sum(1 - (np.diag(covariance) * weights**2)[lengths])) - 1
-    if freedom < 1 or abs(change) < MIN_CHANGE:
-        return None
-    remaining = float(np.linalg.norm(corrections - change * pattern)) / np.sqrt(freedom)
-    std = max(remaining, 1e-9) / float(np.linalg.norm(pattern))
-    if 2 * stdtr(freedom, -abs(change) / std) > MAX_CHANCE:
-        return None
-    return Scale(1 + change, std, "")
+    information = model[:, own].T @ model[:, own] + np.diag(weights**2)
+    half = np.linalg.inv(np.linalg.cholesky(information))
+    covariance = half.T @ half
+    gain = (covariance @ model[:, own].T)[arm]
+    carried = gain @ model[:, [all_names.index(p.name) for p in origins]] * [p.prior for p in origins]
+    is_length = np.array([p.unit == "m" for p in origins], bool)
+    lengths, angles = carried[:, is_length], carried[:, ~is_length]
+    noise = covariance[np.ix_(arm, arm)]
+    return noise, gain @ rows[:, layout.scale], lengths @ lengths.T, angles @ angles.T

@@ -23,7 +23,7 @@ Shapes: N samples in the order of measurement, K cells of consecutive samples, k
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
-from .causes import Block, Cause, Constant, Drift, Shape, Step
+from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
 from .linear_model import Layout, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
@@ -66,6 +66,8 @@ N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 MAX_OUTLIER_SHARE = 0.25
 # Time constants of drifts, relative to the duration of the session.
 TIME_CONSTANTS = (np.inf, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
+# The same, of which the one that fits best is taken.
+FINE_CONSTANTS = (np.inf, *np.geomspace(1.4, 0.08, 16))
 # Smallest logarithm of the evidence and RMS effect of a cause that is accepted before the first fit.
 MIN_GROSS_EVIDENCE, MIN_GROSS_EFFECT = 60.0, 3.0
 # Gain in the logarithm of the likelihood from which a drift is exponential rather than linear.
@@ -187,10 +189,7 @@ class _Search:
 
     def _cause_columns(self, rows: Array, causes: Sequence[Cause]) -> Array:
         """Return the columns of causes, (N, k, ·)."""
-        parts = [
-            rows[..., cause.block.columns] * cause.shape.values(self.numbers, self.times)[:, None, None]
-            for cause in causes
-        ]
+        parts = [cause.columns_of(rows, self.numbers, self.times) for cause in causes]
         return np.concatenate([rows[..., :0], *parts], -1)
 
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
@@ -198,7 +197,7 @@ class _Search:
         layout = self.layout
         columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
         residual = rows[..., -1]
-        sizes = np.concatenate([np.ones(0), *(cause.block.sizes for cause in causes)])
+        sizes = np.concatenate([np.ones(0), *(cause.sizes for cause in causes)])
         held = np.concatenate([np.zeros(0), *(cause.values for cause in causes)])
         # A prior of one metre decides what the measurements do not show, such as turns of a point.
         prior = np.concatenate([layout.weights, 1 / sizes])
@@ -236,7 +235,7 @@ class _Search:
         columns = columns / noise[..., None]
         equal, weighted = (
             _inverse(_information(columns, root) + np.diag(prior**2))
-            for root in (np.ones(len(rows)), np.sqrt(weights))
+            for root in (np.ones((len(rows), 1)), np.sqrt(weights)[:, None])
         )
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
         return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
@@ -255,9 +254,7 @@ class _Search:
     def _advance(self, fit: LinearFit) -> None:
         """Move unknowns and causes by the step of a fit."""
         p = len(self.x)
-        base = self.layout.problem.errors.at(
-            self.layout.errors_at(self.x)[: len(self.layout.problem.errors.parameters)]
-        ).base
+        base = self._base()
         self.x = self.x + fit.step[:p]
         steps, covariances, at = [], [], p
         for cause in self.causes:
@@ -271,22 +268,31 @@ class _Search:
             for cause, step, covariance in zip(self.causes, steps, covariances, strict=True)
         ]
 
+    def _base(self) -> Array:
+        """Return the pose of the base (4, 4) at the current unknowns [m]."""
+        errors = self.layout.problem.errors
+        return errors.at(self.layout.errors_at(self.x)[: len(errors.parameters)]).base
+
     # ------------------------------------------------------------------------------------------- test
     def best_cause(self, fit: LinearFit) -> Cause | None:
         """Return the cause of greatest evidence that is not in a fit."""
         cells, cross = self._products(fit)
+        # Blocks with the same number of columns and the same functions of time are tested at once.
+        alike: dict[tuple[int, tuple[Shape, ...]], list[Block]] = {}
+        for block in self.layout.blocks:
+            for shapes in self._shapes(block):
+                alike.setdefault((len(block.columns), tuple(shapes)), []).append(block)
         found = [
-            self._score(fit, block, shapes, cells, cross)
-            for block in self.layout.blocks
-            for shapes in self._shapes(block)
+            cause
+            for (_, shapes), blocks in alike.items()
+            for cause in self._scores(fit, blocks, shapes, cells, cross)
         ]
         best = max(found, key=lambda cause: cause.log_evidence, default=None)
         return best and replace(best, effect=self._effect(fit, best))
 
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
-        f = cause.shape.values(self.numbers, self.times)
-        own = np.einsum("nkc,c->nk", fit.rows[..., cause.block.columns], cause.values) * f[:, None]
+        own = cause.columns_of(fit.rows, self.numbers, self.times) @ cause.values
         others = np.einsum("nkp,nk->p", fit.columns, own)
         effect = own - fit.columns @ (fit.test_covariance @ others)
         return float(np.sqrt(np.sum(effect**2) / (np.sum(self.groups >= 0) * self._concerned(cause))))
@@ -321,47 +327,60 @@ class _Search:
             inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
             steps = [Step(int(number)) for number in self.numbers[inner]]
         drifts: list[Shape] = []
+        free: list[Shape] = []
         if self.is_ordered:
             begin, end = float(self.times[0]), float(self.times[-1])
-            drifts = [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
-            used = {(c.block.kind, c.block.of) for c in self.causes if isinstance(c.shape, Drift)}
-            drifts = [] if (block.kind, block.of) in used else drifts
-        return [s for s in (steps, drifts) if s and (block, type(s[0])) not in self.rejected]
+            used = {
+                type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)
+            }
+            if FreeDrift not in used:
+                free = [FreeDrift(begin, end)]
+                if Drift not in used:
+                    drifts = [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
+        kinds = (steps, drifts, free)
+        return [shapes for shapes in kinds if shapes and (block, type(shapes[0])) not in self.rejected]
 
-    def _score(
-        self, fit: LinearFit, block: Block, shapes: Sequence[Shape], cells: Array, cross: Array
-    ) -> Cause:
-        """Return the cause of greatest evidence among functions of time of one block."""
-        own = block.columns
+    def _scores(
+        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], cells: Array, cross: Array
+    ) -> Iterator[Cause]:
+        """Yield the cause of greatest evidence among functions of time of each of several blocks."""
+        own = np.array([block.columns for block in blocks])
         firsts = self.edges[:-1]
+        # Products of each cell, (K, B, c, ·).
+        parts = [cells[:, own[:, :, None], own[:, None]], cells[:, own, -1], cross[:, own]]
         if isinstance(shapes[0], Step):
             steps = [shape.number for shape in shapes if isinstance(shape, Step)]
             ends = np.searchsorted(self.numbers[firsts], steps)
+            inner, right, beside = (np.cumsum(part, 0)[ends - 1] for part in parts)
             # f is -1 before the step.
-            inner = np.cumsum(cells[:, own][:, :, own], 0)[ends - 1]
-            right = -np.cumsum(cells[:, own, -1], 0)[ends - 1]
-            beside = -np.cumsum(cross[:, own], 0)[ends - 1]
+            right, beside = -right, -beside
         else:
             f = np.array([shape.values(self.numbers[firsts], self.times[firsts]) for shape in shapes])
-            inner = np.tensordot(f**2, cells[:, own][:, :, own], 1)
-            right = np.tensordot(f, cells[:, own, -1], 1)
-            beside = np.tensordot(f, cross[:, own], 1)
-        sizes = block.sizes
+            n_functions = f.shape[2]
+            count = n_functions * own.shape[1]
+            squares = f[:, :, :, None] * f[:, :, None]
+            inner = np.moveaxis(np.tensordot(squares, parts[0], (1, 0)), 3, 1).swapaxes(3, 4)
+            inner = inner.reshape(len(f), len(own), count, count)
+            right, beside = (np.tensordot(f, part, (1, 0)).swapaxes(1, 2) for part in parts[1:])
+            right = right.reshape(len(f), len(own), count)
+            beside = beside.reshape(len(f), len(own), count, -1)
+        sizes = np.tile([block.sizes for block in blocks], right.shape[2] // own.shape[1])
         explained = beside @ fit.test_covariance
-        matrix = inner - explained @ beside.swapaxes(1, 2)
-        matrix += MIN_UNEXPLAINED * inner * np.eye(len(own))
+        matrix = inner - explained @ beside.swapaxes(2, 3)
+        matrix += MIN_UNEXPLAINED * inner * np.eye(sizes.shape[1])
         right = right - explained @ fit.score
-        matrix = matrix * sizes * sizes[:, None]
-        vector = right * sizes
-        values, vectors = np.linalg.eigh(matrix)
+        values, vectors = np.linalg.eigh(matrix * sizes[:, None] * sizes[:, :, None])
         values = np.maximum(values, 0.0)
-        along = np.einsum("sij,si->sj", vectors, vector)
-        square = WIDTHS[:, None, None] ** 2
+        along = np.einsum("sbij,sbi->sbj", vectors, right * sizes)
+        square = WIDTHS[:, None, None, None] ** 2
         gain = 0.5 * np.sum(along**2 * square / (1 + square * values) - np.log1p(square * values), -1)
-        width, index = np.unravel_index(np.argmax(gain), gain.shape)
-        log_evidence = float(gain[width, index]) - np.log(len(shapes)) - np.log(len(self.layout.blocks))
-        estimate = vectors[index] @ (along[index] / (values[index] + WIDTHS[width] ** -2)) * sizes
-        return Cause(block, shapes[int(index)], estimate, np.zeros((len(own),) * 2), log_evidence)
+        for i, block in enumerate(blocks):
+            width, index = np.unravel_index(np.argmax(gain[:, :, i]), gain.shape[:2])
+            log_evidence = float(gain[width, index, i])
+            log_evidence -= float(np.log(len(shapes)) + np.log(len(self.layout.blocks)))
+            scaled = along[index, i] / (values[index, i] + WIDTHS[width] ** -2)
+            estimate = vectors[index, i] @ scaled * sizes[i]
+            yield Cause(block, shapes[int(index)], estimate, np.zeros((len(estimate),) * 2), log_evidence)
 
     # ------------------------------------------------------------------------------------------- search
     def run(self) -> None:
@@ -380,7 +399,7 @@ class _Search:
             rows = self.linearize()
             judged = self._judge(rows, self.solve(rows, self.causes), len(self.causes) - 1)
             if judged.log_evidence < MIN_LOG_EVIDENCE:
-                self.rejected.add((judged.block, type(judged.shape)))
+                self.rejected.add((found.block, type(found.shape)))
                 fit = self._remove(len(self.causes) - 1)
                 if len(self.rejected) > MAX_REJECTED:
                     break
@@ -389,6 +408,7 @@ class _Search:
     def _remove(self, i: int) -> LinearFit:
         """Remove a cause, and fit without it."""
         del self.causes[i]
+        self._drop_others()
         return self._settle()
 
     def _add(self, cause: Cause) -> None:
@@ -405,30 +425,56 @@ class _Search:
         """Fit, and move the steps to the samples where they fit best."""
         fit = self.iterate()
         for _ in range(MAX_MOVES):
-            if not (self._move_steps(fit) or self._change_drifts()):
+            if not (self._move_steps(fit) or self._change_drifts(fit)):
                 break
             fit = self.iterate()
         return fit
 
-    def _change_drifts(self) -> bool:
-        """Give each drift the time constant that fits best; return whether one changed."""
+    def _change_drifts(self, fit: LinearFit) -> bool:
+        """Give each drift the law and the time constant that fit best; return whether one changed."""
+        n_rows, scaled = float(np.sum(self.groups >= 0)), np.sqrt(fit.weights)[:, None] / fit.noise
         has_changed = False
         for i, cause in enumerate(self.causes):
-            if not isinstance(cause.shape, Drift):
+            old = cause.shape
+            if not isinstance(old, Drift | FreeDrift):
                 continue
             others = [*self.causes[:i], *self.causes[i + 1 :]]
-            rows = self._undone(self.linearize(), cause)
-            span = cause.shape.end - cause.shape.begin
-            shapes = [replace(cause.shape, time_constant=ratio * span) for ratio in TIME_CONSTANTS]
-            costs = [self._log_noise(self.solve(rows, [*others, replace(cause, shape=f)])) for f in shapes]
-            # A linear drift is the simplest one.
-            costs[0] -= MIN_CURVATURE_GAIN / np.sum(self.groups >= 0)
-            best = shapes[int(np.argmin(costs))]
-            if best != cause.shape:
-                self.causes[i] = replace(cause, shape=best)
-                self.changes = self.changes.with_drift(cause.shape, best)
-                has_changed = True
+            rows = self.linearize()
+            simple, span = replace(cause, values=np.zeros(len(cause.block.sizes))), old.end - old.begin
+            tried = [
+                replace(simple, shape=Drift(old.begin, old.end, ratio * span)) for ratio in FINE_CONSTANTS
+            ]
+            if isinstance(old, FreeDrift):
+                tried.append(cause)
+            columns = [rows[..., self.layout.model], self._cause_columns(rows, [*others, *tried])]
+            stack = np.concatenate([*columns, self._undone(rows, cause)[..., -1:]], -1)
+            products = _information(stack, scaled)
+            sizes = np.concatenate([np.ones(0), *(1 / c.sizes for c in (*others, *tried))])
+            prior = np.concatenate([self.layout.weights, sizes])
+            ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
+            # Each coefficient costs the logarithm of the number of rows; a linear drift is the simplest one.
+            costs = [
+                _cost(products, products, prior, np.append(np.arange(ends[0]), np.arange(first, last)))
+                + (last - first) * np.log(n_rows)
+                for first, last in pairwise(ends)
+            ]
+            costs[0] -= 2 * MIN_CURVATURE_GAIN
+            best = tried[int(np.argmin(costs))]
+            if best.shape == old:
+                continue
+            if isinstance(old, Drift) and isinstance(best.shape, Drift):
+                self.causes[i] = replace(cause, shape=best.shape)
+                self.changes = self.changes.with_drift(old, best.shape)
+            else:
+                self.causes[i] = best
+                self._drop_others()
+            has_changed = True
         return has_changed
+
+    def _drop_others(self) -> None:
+        """Drop the changes of causes that are not among the present ones."""
+        held = [np.zeros_like(cause.values) for cause in self.causes]
+        self.changes = update(self.changes, self.causes, held, self._base(), self.layout.links)
 
     def log_noise(self) -> float:
         """Return the mean logarithm of the noise of the fit at the current unknowns."""
@@ -441,8 +487,7 @@ class _Search:
     def _undone(self, rows: Array, cause: Cause) -> Array:
         """Return the rows as if a cause had been left out of the model."""
         undone = rows.copy()
-        f = cause.shape.values(self.numbers, self.times)
-        undone[..., -1] += (rows[..., cause.block.columns] @ cause.values) * f[:, None]
+        undone[..., -1] += cause.columns_of(rows, self.numbers, self.times) @ cause.values
         return undone
 
     def _move_steps(self, fit: LinearFit) -> bool:
@@ -452,9 +497,10 @@ class _Search:
             if not isinstance(cause.shape, Step):
                 continue
             change = fit.rows[..., cause.block.columns] @ cause.values
-            number = self._best_place(fit, change, cause.shape.number)
-            if number != cause.shape.number:
+            old, number = cause.shape.number, self._best_place(fit, change, cause.shape.number)
+            if number != old:
                 self.causes[i] = replace(cause, shape=Step(number))
+                self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, number)
                 has_moved = True
         return has_moved
 
@@ -496,7 +542,7 @@ class _Search:
             undone[..., -1:],
         ]
         stack = np.concatenate(columns, -1) * scaled[..., None]
-        sizes = [1 / c.block.sizes for c in (*others, cause)]
+        sizes = [1 / c.sizes for c in (*others, cause)]
         prior = np.concatenate([self.layout.weights, *sizes])
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
@@ -527,12 +573,12 @@ class _Search:
             for fit in (without, full)
         ]
         start = len(self.x) + sum(len(c.values) for c in self.causes[:i])
-        own, sizes = slice(start, start + len(cause.values)), cause.block.sizes
+        own, sizes = slice(start, start + len(cause.values)), cause.sizes
         information = _inverse(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
         values = np.maximum(np.linalg.eigvalsh(information), 0.0)
         square = WIDTHS[:, None] ** 2
         width = np.sum(np.log1p(square * values) + (cause.values / sizes) ** 2 / square, 1)
-        n_places = len(self.edges) if isinstance(cause.shape, Step) else len(TIME_CONSTANTS)
+        n_places = {Step: len(self.edges), Drift: len(TIME_CONSTANTS)}.get(type(cause.shape), 1)
         prior = np.log(n_places) + np.log(len(self.layout.blocks))
         return 0.5 * (costs[0] - costs[1] - float(width.min())) - float(prior)
 
@@ -613,8 +659,8 @@ class _Search:
 
 
 def _information(columns: Array, root: Array) -> Array:
-    """Return the inner products of columns (N, k, p) with square roots of weights (N,)."""
-    flat = (columns * root[:, None, None]).reshape(-1, columns.shape[-1])
+    """Return the inner products of columns (N, k, p) with square roots of weights (N, k) or (N, 1)."""
+    flat = (columns * root[..., None]).reshape(-1, columns.shape[-1])
     return flat.T @ flat
 
 
@@ -634,16 +680,21 @@ def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[
     parts = _cell_products(stack, edges)
     total = parts.sum(0)
 
-    def cost(kept: Array, out: Array, count: int) -> float:
-        matrix = kept[:count, :count] + np.diag(prior[:count] ** 2)
-        x = np.append(-_inverse(matrix) @ kept[:count, -1], 1.0)
-        used = np.append(np.arange(count), len(kept) - 1)
-        return float(x @ out[np.ix_(used, used)] @ x)
-
-    n = len(prior)
-    inside = cost(total, total, p) - cost(total, total, n)
-    predicted = sum(cost(total - part, part, p) - cost(total - part, part, n) for part in parts)
+    without, with_all = np.arange(p), np.arange(len(prior))
+    inside = _cost(total, total, prior, without) - _cost(total, total, prior, with_all)
+    predicted = sum(
+        _cost(total - part, part, prior, without) - _cost(total - part, part, prior, with_all)
+        for part in parts
+    )
     return inside, predicted
+
+
+def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
+    """Return the squared residuals with products `out`, for the fit of some columns to products `kept`."""
+    matrix = kept[np.ix_(used, used)] + np.diag(prior[used] ** 2)
+    x = np.append(-_inverse(matrix) @ kept[used, -1], 1.0)
+    chosen = np.append(used, len(kept) - 1)
+    return float(x @ out[np.ix_(chosen, chosen)] @ x)
 
 
 def _bounded_cost(residual: Array) -> Array:
@@ -653,11 +704,8 @@ def _bounded_cost(residual: Array) -> Array:
 
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
-    """Return whether all samples are positions or poses of the tool, which show where base and tool are."""
-    return all(
-        item.configurations_per_row == 1 and item.has_joint_values and len(item.positions()) == len(item.rows)
-        for item in data
-    )
+    """Return whether all samples show where base and tool are."""
+    return all(item.shows_changes and item.has_joint_values for item in data)
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:

@@ -22,6 +22,7 @@ Exit status
 2      the input is wrong: one line on stderr names file, line or column, the problem and what is expected;
        nothing is written
 3      the calibration is refused and no robot is written, unless ``--force`` is given
+4      with ``--strict``: the robot is written with the verdict caution
 130    interrupted; the message says which files are written
 =====  ==========================================================================================
 """
@@ -60,7 +61,8 @@ def _page(name: str, parser: argparse.ArgumentParser) -> list[str]:
     lines += [*(f"   {line}" for line in usage), "", "Example:", "", ".. code-block:: text", ""]
     lines += [*(f"   {line.strip()}" for line in example), "", f".. program:: {title}", ""]
     for action in parser._actions:  # argparse has no public list
-        lines += _option(action, parser)
+        if action.help != argparse.SUPPRESS:
+            lines += _option(action, parser)
     return lines
 
 

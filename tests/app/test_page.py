@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from pages import AXE, READY, VIEWPORT
+from slow_cases import some_slow
 
 # Width and colours of the looks at the page.
 LOOKS = tuple(product((390, 768, 1200), ("light", "dark")))
@@ -195,14 +196,16 @@ def violations(page: Any) -> list[tuple[str, list[str]]]:
     return [(one["id"], [node["html"] for node in one["nodes"]]) for one in found]
 
 
-@pytest.mark.parametrize(
-    "checked", [{(390, "light"), (1200, "dark")}, pytest.param(set(LOOKS), marks=pytest.mark.slow)]
-)
-def test_every_state_is_accessible_at_every_width(page, example, checked):
+# Looks of the first page, of a refusal, of a run and of a result that are checked for all faults.
+SOME_LOOKS = [{(390, "light")}, {(1200, "dark")}, {(390, "light")}, {(390, "light"), (1200, "dark")}]
+
+
+@pytest.mark.parametrize("looks", some_slow([SOME_LOOKS, 4 * [set(LOOKS)]], {0}), ids=["some", "all"])
+def test_every_state_is_accessible_at_every_width(page, example, looks):
     """Nothing is wider than the page at any width; some looks are checked for all other faults."""
     page.evaluate(AXE)
 
-    def check() -> None:
+    def check(checked: set[tuple[int, str]]) -> None:
         for width, scheme in LOOKS:
             page.set_viewport_size({"width": width, "height": 900})
             page.emulate_media(color_scheme=scheme)
@@ -210,7 +213,7 @@ def test_every_state_is_accessible_at_every_width(page, example, checked):
             if (width, scheme) in checked:
                 assert violations(page) == [], (width, scheme)
 
-    check()
+    check(looks[0])
     urdf, data = example_files(example)
     drop(page, urdf, ("laser.csv", wrong_sign(example)))
     page.fill("#tip", "tool0")
@@ -218,14 +221,14 @@ def test_every_state_is_accessible_at_every_width(page, example, checked):
     page.click("#check summary")
     page.click("#calibrate")
     page.wait_for_selector("#result .refused")
-    check()
+    check(looks[1])
     drop(page, data)
     page.click("#calibrate")
-    check()  # while it runs
+    check(looks[2])  # while it runs
     page.wait_for_selector("#result .card.ok")
     page.wait_for_selector("#check .card.ok")
     page.click("#result summary")
-    check()
+    check(looks[3])
 
 
 def test_offered_parameter_sets_exist(page, sim_6dof):

@@ -85,7 +85,8 @@ def factor_by_definition(problem, solution, groups) -> float:
     return max(safe, default=0.0)
 
 
-def test_the_factor_follows_from_its_definition(monkeypatch):
+@pytest.mark.parametrize(("n", "n_partial"), some_slow([(12, 2), (24, 3)], {0}))
+def test_the_factor_follows_from_its_definition(monkeypatch, n, n_partial):
     calls = []
 
     def record(*args):
@@ -94,7 +95,7 @@ def test_the_factor_follows_from_its_definition(monkeypatch):
 
     monkeypatch.setattr(procedure, "compute_shrinkage_factor", record)
     nominal, found = measured_arm("paper"), []
-    for seed in range(12):
+    for seed in range(n):
         rng = np.random.default_rng(seed)
         errors = select_parameters(nominal, "dh")
         size = np.array([np.deg2rad(1.0) if p.unit == "rad" else 5e-3 for p in errors.parameters])
@@ -103,11 +104,11 @@ def test_the_factor_follows_from_its_definition(monkeypatch):
         data = Position.simulate(truth, joint_sample(nominal, 2 + seed % 5, rng), noise, rng)
         fit = calibrate(nominal, data, "dh", extend="none")
         found.append((fit.shrinkage_factor, factor_by_definition(*calls[-1])))
-    assert len(calls) == 12
+    assert len(calls) == n
     for factor, expected in found:
         assert factor == pytest.approx(expected, abs=0.011)
     # Some corrections are applied in part.
-    assert sum(0.05 < factor < 0.95 for factor, _ in found) >= 2
+    assert sum(0.05 < factor < 0.95 for factor, _ in found) >= n_partial
 
 
 def two_poses(chain: Chain, rng: np.random.Generator):

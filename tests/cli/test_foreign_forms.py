@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -60,6 +61,10 @@ def write(name, content):
     Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
+# The header with the units in a row of their own.
+UNITS_BELOW = "\n".join(
+    [re.sub(r"\[.*?\]", "", HEADER), re.sub(r"[^,]*?(?:\[(.*?)\])?(,|$)", r"\1\2", HEADER)]
+)
 CLOCK = ["time", [moment.strftime("%H:%M:%S") for moment in TIMES]]
 FORMS = {
     "semicolons": lambda: write("data.csv", TEXT.replace(",", ";")),
@@ -78,6 +83,7 @@ FORMS = {
         b"\xef\xbb\xbf" + TEXT.replace(",", ";").replace(".", ",").replace("\n", "\r\n").encode(),
     ),
     "separators at the end": lambda: write("data.csv", TEXT.replace("\n", ",,\n")),
+    "row of units": lambda: write("data.csv", TEXT.replace(HEADER, UNITS_BELOW)),
     "known time": lambda: write("data.csv", with_columns(["time[s]", [str(7.5 * i) for i in range(20)]])),
 }
 # Name of the form, function that writes it, and the note on it.

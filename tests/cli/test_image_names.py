@@ -51,7 +51,7 @@ def calibrate(run, *outputs):
     return unfolded(result[2]), json_of(result)
 
 
-def test_photographs_are_named(run, corners):
+def test_photographs_are_named(run, corners, undrawn):
     named = [f"{line},{name}" for line, name in zip(*corners, strict=True)]
     Path("corners.csv").write_text("\n".join(named))
     screen, result = calibrate(run, "--report", "report.html")

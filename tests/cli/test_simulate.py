@@ -54,7 +54,7 @@ def test_noise_of_images_is_in_pixels(run, robot_folder):
         status, _, err = run(
             "simulate", "arm.urdf", "-m", "5", "--kind", kind, "--noise", noise, "-o", "c.csv"
         )
-        assert (status, f"--noise '{noise}': not a number with a unit" in err) == (2, True)
+        assert (status, f"--sigma '{noise}': not a number with a unit" in err) == (2, True)
 
 
 def test_random_errors_have_the_given_standard_deviation(run, robot_folder):

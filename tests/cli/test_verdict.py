@@ -21,7 +21,7 @@ OUTPUTS = ("--json", "r.json", "--report", "r.html", "--report", "r.md", "--map"
 UNFINISHED = ("--max-iterations", "1")
 
 
-def test_refused_robot_is_not_written(run, robot_folder):
+def test_refused_robot_is_not_written(run, robot_folder, undrawn):
     status, _, err = run(*CALIBRATE, *OUTPUTS, *UNFINISHED)
     assert status == 3
     document = parse_json(Path("r.json").read_text())
@@ -38,7 +38,7 @@ def test_refused_robot_is_not_written(run, robot_folder):
     assert text.split("\n\n")[1:3] == ["**Verdict: refused**", reason]
 
 
-def test_force_writes_a_refused_robot(run, robot_folder):
+def test_force_writes_a_refused_robot(run, robot_folder, undrawn):
     status, _, _ = run(*CALIBRATE, *OUTPUTS, *UNFINISHED, "--force")
     assert status == 0
     document = parse_json(Path("r.json").read_text())

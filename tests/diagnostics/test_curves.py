@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ SETS = "minimal,base,tool,harmonics,curves"
 NOISE = Noise(2e-5, 2e-5)
 
 
+@lru_cache(1)
 def simulated(seed: int, count: int = 120) -> tuple[Chain, Result]:
     """Return a robot with random curves, and its calibration from poses in three quarters of each turn."""
     rng, chain = np.random.default_rng(seed), Chain.from_dh(paper("sim_6dof"))
@@ -27,7 +29,8 @@ def simulated(seed: int, count: int = 120) -> tuple[Chain, Result]:
         np.where(errors.priors < 1, errors.priors, 0.0) * rng.standard_normal(len(errors.priors))
     )
     q = rng.uniform(-np.pi, np.pi / 2, (count, 6))
-    return truth, calibrate(chain, Pose.simulate(truth, q, NOISE, rng), SETS, extend="none")
+    data = Pose.simulate(truth, q, NOISE, rng)
+    return truth, calibrate(chain, data, SETS, extend="none", session="off")
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ import pinocchio as pin
 import pytest
 from pages import AXE, wait_for
 from robots import robot_file
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate, split
@@ -68,11 +69,18 @@ def open_page(browser, path) -> Iterator[Callable[..., Any]]:
     assert all(url.startswith(("file:", "data:", "about:", "blob:")) for url in requests), requests
 
 
+@pytest.fixture(scope="module")
+def shared_page(open_page) -> Any:
+    return open_page()
+
+
 @pytest.fixture
-def page(open_page) -> Iterator[Any]:
-    page = open_page()
-    yield page
-    page.close()
+def page(shared_page, path) -> Iterator[Any]:
+    shared_page.goto(path.as_uri())
+    yield shared_page
+    # The next test loads the page anew, and until then nothing is drawn.
+    shared_page.goto("about:blank")
+    shared_page.mouse.move(0, 0)
 
 
 def sample(fit: Result, line: int) -> tuple[np.ndarray, float, float]:
@@ -296,32 +304,29 @@ def test_everything_is_there_without_scripts(open_page, path):
     page.close()
 
 
-@pytest.mark.parametrize(
-    ("width", "scheme", "is_checked"),
-    [
-        (390, "light", False),
-        (768, "dark", False),
-        (1200, "light", True),
-        pytest.param(390, "light", True, marks=pytest.mark.slow),
-        pytest.param(768, "dark", True, marks=pytest.mark.slow),
-    ],
-)
-def test_the_page_is_accessible_and_fits(browser, path, scheme, width, is_checked):
+LOOKS = ((390, "light"), (768, "dark"), (1200, "light"))
+
+
+@pytest.mark.parametrize("checked", some_slow([[LOOKS[2]], [*LOOKS]], {0}), ids=["one look", "all looks"])
+def test_the_page_is_accessible_and_fits(browser, path, checked):
     """The widths of all looks are checked, other faults in one of them and in the report of another test."""
     without_scene = path.with_name("without_scene.html")
     without_scene.write_text(re.sub('data-scene="[^"]*"', 'data-scene=""', path.read_text("utf-8")), "utf-8")
-    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme, bypass_csp=True)
+    page = browser.new_page(bypass_csp=True)
     page.goto(without_scene.as_uri())
     page.locator("#samples tbody button").first.click()
     page.locator("aside.selection").wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth") == width
-    # No table is cut off: where it would not fit, its rows are lists.
-    assert page.evaluate(CUT_OFF) == []
-    if is_checked:
-        page.evaluate(AXE)
-        found = page.evaluate("axe.run(document, {iframes: false, resultTypes: ['violations']})")
-        assert len(found["passes"]) > 15
-        assert not [(v["id"], v["nodes"][0]["html"]) for v in found["violations"]]
+    page.evaluate(AXE)
+    for width, scheme in LOOKS:
+        page.set_viewport_size({"width": width, "height": 800})
+        page.emulate_media(color_scheme=scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        # No table is cut off: where it would not fit, its rows are lists.
+        assert page.evaluate(CUT_OFF) == []
+        if (width, scheme) in checked:
+            found = page.evaluate("axe.run(document, {iframes: false, resultTypes: ['violations']})")
+            assert len(found["passes"]) > 15
+            assert not [(v["id"], v["nodes"][0]["html"]) for v in found["violations"]]
     page.close()
 
 
@@ -354,8 +359,9 @@ def test_the_report_of_1500_samples_takes_at_most_3_megabytes(browser, tmp_path)
     )
     assert 1e6 < path.stat().st_size <= 3e6
     # Its joints have long names, which fit a narrow page as well.
+    window = browser.new_page()
+    window.goto(path.as_uri())
     for width in (390, 768, 1200):
-        window = browser.new_page(viewport={"width": width, "height": 800})
-        window.goto(path.as_uri())
+        window.set_viewport_size({"width": width, "height": 800})
         assert window.evaluate(CUT_OFF) == []
-        window.close()
+    window.close()

@@ -57,14 +57,14 @@ def test_joint_values_that_were_measured(fit, quick):
     assert [row[2] for row in table.texts] == [f"{count} of 72" for count in counts]
 
 
-def test_joint_correction_curves_of_joints_with_harmonics(sim_6dof, quick):
+def test_joint_correction_curves_of_joints_with_harmonics(sim_3dof, quick):
     rng = np.random.default_rng(0)
-    errors = select_parameters(sim_6dof, "curves")
+    errors = select_parameters(sim_3dof, "curves")
     truth = errors.at(errors.priors * rng.standard_normal(len(errors.priors)))
-    data = Pose.simulate(truth, rng.uniform(-np.pi, 1.0, (60, 6)), Noise(1e-5, 1e-5), rng)
-    joint = sim_6dof.joint_names[1]
+    data = Pose.simulate(truth, rng.uniform(-np.pi, 1.0, (60, 3)), Noise(1e-5, 1e-5), rng)
+    joint = sim_3dof.joint_names[1]
     names = [p.name for p in errors.parameters if p.name.startswith(f"{joint}.")]
-    fit = calibrate(sim_6dof, data, "dh", free=names, extend="none", session="off")
+    fit = calibrate(sim_3dof, data, "dh", free=names, extend="none", session="off")
     context = ReportContext(fit, Provenance())
     section = joint_section(fit)
     assert section.title == "Joint correction curves"

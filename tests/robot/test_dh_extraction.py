@@ -125,7 +125,7 @@ def perturb(origins, rng):
     return origins @ se3.exp6(1e-3 * np.concatenate([v / size[0], w / size[1]], -1))
 
 
-COUNT = pytest.mark.parametrize("count", some_slow([80, 500], {0}))
+COUNT = pytest.mark.parametrize("count", some_slow([30, 500], {0}))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
@@ -163,9 +163,10 @@ def test_tables_of_nearly_parallel_chains_give_their_poses(convention, count):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("hayati", [False, True])
-def test_extraction_inverts_the_conversion_of_a_table(convention, hayati):
+@COUNT
+def test_extraction_inverts_the_conversion_of_a_table(convention, hayati, count):
     rng = np.random.default_rng(3)
-    for _ in range(150):
+    for _ in range(count):
         table = random_table(rng, convention)
         found = extract(table.origins(), table.prismatic, convention=convention, hayati=hayati)
         for key in ("d", "a", "alpha", "theta", "beta", "base", "tool"):
@@ -176,11 +177,12 @@ def test_extraction_inverts_the_conversion_of_a_table(convention, hayati):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_extraction_inverts_the_conversion_of_a_table_with_beta(convention):
+@COUNT
+def test_extraction_inverts_the_conversion_of_a_table_with_beta(convention, count):
     rng = np.random.default_rng(4)
     n = 6
     z = np.zeros(n)
-    for _ in range(100):
+    for _ in range(count):
         table = DHTable(
             convention,
             tuple("abcdef"),
@@ -214,10 +216,11 @@ def test_negative_entries_are_preserved():
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("source", ["table", "chain", "nearly parallel"])
-def test_frames_transform_changes_of_a_row(convention, source):
+@pytest.mark.parametrize("count", some_slow([8, 30], {0}))
+def test_frames_transform_changes_of_a_row(convention, source, count):
     """Finite changes, not derivatives: both sides are products of exact motions."""
     rng = np.random.default_rng(6)
-    for _ in range(30):
+    for _ in range(count):
         origins, prismatic = random_chain(rng)
         if source == "table":
             table = random_table(rng, convention)
@@ -248,7 +251,8 @@ def test_frames_transform_changes_of_a_row(convention, source):
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("robot", UR)
-def test_ur_arms_have_plain_rows_under_small_errors(robot, convention):
+@pytest.mark.parametrize("count", some_slow([15, 50], {0}))
+def test_ur_arms_have_plain_rows_under_small_errors(robot, convention, count):
     origins, names, q, poses = read_robot(*UR[robot])
     np.testing.assert_allclose(product(origins, np.zeros(6, bool), q), poses, atol=1e-14)
     reach = np.linalg.norm(origins[:, :3, 3], axis=1).sum()
@@ -256,7 +260,7 @@ def test_ur_arms_have_plain_rows_under_small_errors(robot, convention):
     nominal = extract(origins, convention=convention)
     assert worst(nominal, origins, np.zeros(6, bool), q) < 1e-14
     rng = np.random.default_rng(7)
-    for _ in range(50):
+    for _ in range(count):
         shaken = perturb(origins, rng)
         found = extract(shaken, convention=convention)
         assert worst(found, shaken, np.zeros(6, bool), q) < 2e-14

@@ -125,11 +125,19 @@ EVENTS = {
     },
     **{f"drift of joint {joint}": Changes(joint=(joint, 0.1 * DEGREE), at=None) for joint in (1, 2)},
     "growth": Changes(growth=1e-3, at=None),
+    **{f"drift of {of} there and back": Changes(of, 1e-3, at=None, periods=1.5) for of in ("base", "tool")},
 }
 # Events of the fast suite: one of each type.
 FAST = [
     list(EVENTS).index(name)
-    for name in ("base 5 mm at 0.9", "tool 0.3 mm at 0.5", "joint 2 at 0.1", "drift of base, 0.2", "growth")
+    for name in (
+        "base 5 mm at 0.9",
+        "tool 0.3 mm at 0.5",
+        "joint 2 at 0.1",
+        "drift of base, 0.2",
+        "growth",
+        "drift of tool there and back",
+    )
 ]
 
 
@@ -173,6 +181,20 @@ def test_events_are_named_and_handled(name, request):
         assert fit.verdict.status == "caution" or not session_of(fit).found
     assert np.mean(named) >= (1.0 if is_fast else 0.95), np.round(ratios, 2)
     assert np.median(ratios) <= (2.0 if is_fast else 1.3)
+
+
+@pytest.mark.parametrize("measure", [Simulation.measure_wires, Simulation.measure_targets])
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("", 0.0), ("tool 5 mm at 0.5", 5e-3), ("joint 2 at 0.9", 0.3 * DEGREE), ("drift of base, None", 1e-3)],
+)
+def test_changes_are_found_in_wires_and_several_targets(measure, name, size):
+    simulation = Simulation("ur10", 100, 5)
+    fit = calibrate(simulation.chain, measure(simulation, EVENTS.get(name)), extend="none")
+    assert [found.size for found in session_of(fit).found] == pytest.approx([size] if size else [], rel=0.1)
+    of = [getattr(found, "of", "") or getattr(found, "kind", "") for found in session_of(fit).found]
+    assert of == {"": [], "j": ["elbow_joint"], "t": ["tool"], "d": ["base"]}[name[:1]]
+    assert simulation.true_error(fit.chain) < 5e-5
 
 
 @pytest.mark.parametrize("count", some_slow([8, 400], {0}))
@@ -315,7 +337,7 @@ def test_few_rows_are_not_examined():
     assert session_of(fit).found == ()
 
 
-def test_commands_state_what_happened(tmp_path, capsys):
+def test_commands_state_what_happened(tmp_path, capsys, undrawn):
     simulation = Simulation("ur10", 100, 9)
     robot, file = robot_file(ARMS["ur10"][0]), tmp_path / "bump.csv"
     write_csv(file, simulation, simulation.measure(Position, Changes("base", 5e-3)))

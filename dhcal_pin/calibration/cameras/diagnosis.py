@@ -31,6 +31,7 @@ from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
+from ...subsampling import evenly_spaced_indices
 from ..partition import configuration_groups, k_fold
 from ..reweighting import Fit
 from .causes import (
@@ -63,6 +64,8 @@ MAX_NOISE_RATIO = 1.5
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
 # Errors of images above this are those of wrong joint values rather than of arm, board or lens [px].
 LARGE_ERROR = 10.0
+# The same of an arm with play and sag: 2° for a lens of 1150 px [px].
+MAX_PLAY_ERROR = 40.0
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
 # explain images that are paired with wrong joint values.
 MAX_LINKS_ERROR = 0.05
@@ -77,6 +80,8 @@ MAX_REJECTED_SHARE = 0.03
 MIN_WRONG_RATIO = 5.0
 # Number of folds, smallest number of configurations, and largest number of causes.
 N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
+# Largest number of configurations in which causes are looked for: more of them do not change the cause.
+MAX_CONFIGURATIONS = 300
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
 # the images show.
 MIN_ROTATION = np.deg2rad(8.0)
@@ -303,8 +308,15 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     """Search the causes in some of the samples of a fit; None if they have too few configurations."""
     # The scatter within an image is the noise, whatever is stated.
     data = tuple(item.replace(has_stated_sigma=False) for item in data if len(item.rows))
-    if int(configuration_groups(data).max(initial=-1)) + 1 < MIN_CONFIGURATIONS:
+    label = configuration_groups(data)
+    count = int(label.max(initial=-1)) + 1
+    if count < MIN_CONFIGURATIONS:
         return None
+    if count > MAX_CONFIGURATIONS:
+        is_used = np.isin(label, evenly_spaced_indices(count, MAX_CONFIGURATIONS))
+        ends = np.cumsum([len(item.rows) for item in data])[:-1]
+        parts = zip(data, np.split(is_used, ends), strict=True)
+        data = tuple(item.take(used) for item, used in parts if used.any())
     sequence = file_sequence([*fit.data, *holdout])
     hand_eye = HandEyeData(fit.problem.errors, data, fit.problem.known, sequence)
     base = _State.of(hand_eye, Causes(), fit.problem.instruments(fit.solution.x))

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..._typing import Progress
 from ...estimation.priors import PriorGroups
+from ...estimation.robust import KEPT
 from ...exceptions import InvalidArgumentError, NotObservableError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
@@ -27,8 +28,9 @@ from ..result import Result, make_result
 from ..reweighting import Fit, reweight
 from .axis_order import Exchange, axis_stages
 from .board_size import find_board_size
-from .diagnosis import LARGE_ERROR, HandEyeFit
-from .gate import apply_gate, judge_stages, judge_target_points
+from .diagnosis import LARGE_ERROR, MAX_PLAY_ERROR, HandEyeFit
+from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
+from .jitter import with_jitter
 from .lens_priors import lens_prior_groups, with_lens_priors
 from .seen_ranges import seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
@@ -69,6 +71,8 @@ class ImageFitting:
     stages: tuple[str, ...]  # Stages of the robust loss
     max_iterations: int  # Largest number of iterations of one solution
     progress: Progress | None  # Function that is called with the progress, if any
+    # Whether the arm has play and sag, which displace all corners of an image by far more than their noise
+    has_play: bool = False
 
     def reweight(self, fit: Fit) -> Fit:
         """Estimate noise, weights and widths of priors, those of lenses included."""
@@ -84,6 +88,12 @@ class ImageFitting:
         return fit
 
 
+def _with_displacement(fit: Fit) -> Fit:
+    """Return a fit whose images have a displacement each, so that only those beyond it are outliers."""
+    data = with_jitter(fit.problem, fit.solution.x, fit.data, residual_jitter(fit))
+    return replace(fit.solved_with(data, 0), data=data, start=fit.solution.x)
+
+
 def calibrate_images(
     fitting: ImageFitting,
     fit: Fit,
@@ -93,12 +103,15 @@ def calibrate_images(
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     has_arm = fit.problem.errors.has_arm
+    if fitting.has_play:
+        fit = replace(fit, weights=fitting.reweight(_with_displacement(fit)).weights)
+        fitting = replace(fitting, stages=(KEPT,))
     fit = fitting.reweight(fit)
     points = judge_target_points(fit, fitting.max_iterations)
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
     ungated = with_lens_priors(fit)
-    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations)
+    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.has_play)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
@@ -111,7 +124,9 @@ def calibrate_images(
         input_warnings=tuple(warnings),
         camera_stages=(*axis_stages(exchanges), *stages),
     )
-    if gate.is_open and fitted_error(gated.fit).pixels < LARGE_ERROR:
+    if gate.is_open and fitted_error(gated.fit).pixels < (
+        MAX_PLAY_ERROR if fitting.has_play else LARGE_ERROR
+    ):
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import SUPPRESS, ArgumentParser, Namespace
 
-from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER
+from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, add_open_option
 
 EXAMPLE = "dhcal app"
 _MEGABYTE = 10**6
@@ -26,9 +26,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=100,
         help="largest size of all files that are dropped together, in MB (default: %(default)s)",
     )
-    parser.add_argument(
-        "--no-browser", action="store_true", help="print the address only, and open no browser"
-    )
+    add_open_option(parser, "the page", default=True)
+    parser.add_argument("--no-browser", dest="open", action="store_false", help=SUPPRESS)
 
 
 def run(args: Namespace) -> int:
@@ -40,7 +39,7 @@ def run(args: Namespace) -> int:
 
     def show_address(url: str) -> None:
         console.print_lines(url, "end with Ctrl-C")
-        if not args.no_browser:
+        if args.open:
             console.open_url(url)
 
     asyncio.run(serve(show_address, port=args.port, limit=args.max_size * _MEGABYTE))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from ...exceptions import InvalidArgumentError
-from ..options import RIG
+from ..options import JSON, RIG
 
-EXAMPLE = "dhcal board rig.toml -o board.pdf"
+EXAMPLE = "dhcal board rig.toml --paper a4 -o board.pdf"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -16,25 +16,39 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
     )
+    parser.add_argument(
+        "--paper",
+        metavar="SIZE",
+        choices=("a4", "letter"),
+        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig file, "
+        "corrects the scale of the printer (default: a page of the size of the board)",
+    )
     parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
     """Draw a board."""
     from ...detection import board_pdf  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block
     from ..screens.screen import Screen
 
-    require_writable_outputs([args.output], [args.rig])
+    require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
         raise InvalidArgumentError(f"{args.output}: unknown ending; write the board as .pdf")
     rig = read_rig(args.rig)
     board = only_entry(rig.boards, args.board, "board", args.rig)
-    write_outputs({args.output: board_pdf(board)})
+    page = board_pdf(board, args.paper)
+    write_with_json({args.output: page}, args.json, {"output": args.output}, [args.rig], board=board.name)
     advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
+    if args.paper:
+        advice = (
+            "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length to "
+            f"[board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a flat plate."
+        )
     console.show(Screen([files_block([args.output])]), args.verbosity)
     console.print_lines(advice)
     return 0

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
-from ..options import ROBOT, add_motion_options, add_urdf_options
+from ..options import JSON, ROBOT, add_motion_options, add_urdf_options
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -59,6 +59,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
     )
     add_motion_options(parser, "rad")
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
@@ -66,15 +67,15 @@ def run(args: Namespace) -> int:
     from ...compensation import compensate  # lazy import, as the following: they load Pinocchio
     from ...io import read_targets
     from ...programs import program_text, require_program_ending
-    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..output_table import numbered
+    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import compensation_screen
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
-    require_writable_outputs(
-        [args.output, *args.export], [*robots, *existing_sidecars(robots), args.targets, *tcp_file]
-    )
+    inputs = [*robots, *existing_sidecars(robots), args.targets, *tcp_file]
+    require_writable_outputs([args.output, *args.export, args.json], inputs)
     for path in args.export:
         require_program_ending(path)
     nominal, calibrated = read_robots(args)
@@ -84,9 +85,18 @@ def run(args: Namespace) -> int:
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
     for path in args.export:
         contents[path] = program_text(_program(result, nominal), path)
-    write_outputs(contents)
     frame = f"the root link {calibrated.urdf.root}" if args.frame == BASE else "the measuring frame"
     warning = exchange_warning(args.nominal, args.calibrated, nominal, calibrated)
+    write_with_json(
+        contents,
+        args.json,
+        {"output": args.output, **numbered("export", args.export)},
+        inputs,
+        targets=len(result.status),
+        reached=int(result.reached.sum()),
+        status=list(result.status),
+        warnings=[f"{args.nominal}: {warning}"] if warning else [],
+    )
     screen = compensation_screen(
         f"targets: {_tool_text(args, calibrated)} in {frame}",
         result,

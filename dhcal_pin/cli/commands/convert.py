@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 
 from ...exceptions import InvalidArgumentError
-from ..options import ROBOT, add_urdf_options
+from ..options import JSON, ROBOT, add_urdf_options
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -62,20 +62,22 @@ def add_arguments(parser: ArgumentParser) -> None:
             "help": "write the joints of this robot only; needed for prismatic joints of a recording",
         },
     )
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
     """Convert a robot file to the format that the ending of the output selects, or a recording."""
     from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block, notes_block
     from ..screens.screen import Screen
 
     others = [path for path in (args.robot, args.template) if path]
-    require_writable_outputs([args.output], [args.input, *others])
+    inputs = [args.input, *others]
+    require_writable_outputs([args.output, args.json], inputs)
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
-    write_outputs({args.output: text})
+    write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=list(notes))
     console.show(Screen([notes_block(notes), files_block([args.output])]), args.verbosity)
     return 0
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import JSON
+from ..options import JSON, add_open_option
 from ..screens.screen import Block, Screen, Verbosity
 
 if TYPE_CHECKING:
@@ -26,9 +26,13 @@ EXAMPLE = "dhcal demo --out demo"
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal demo`."""
     parser.add_argument(
-        "--out", default="demo", metavar="DIR", help="folder for the results (default: %(default)s)"
+        *("-o", "--output", "--out"),
+        dest="out",
+        default="demo",
+        metavar="DIR",
+        help="folder for the results (default: %(default)s)",
     )
-    parser.add_argument("--open", action="store_true", help="open the report in the browser")
+    add_open_option(parser, "the report")
     parser.add_argument("--json", **JSON)
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
-from ..options import POSITIVE_INTEGER, RIG
+from ..options import JSON, POSITIVE_INTEGER, RIG
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
@@ -20,7 +22,18 @@ EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal detect`."""
-    parser.add_argument("images", metavar="IMAGES", nargs="+", help="image files, or folders of images")
+    parser.add_argument(
+        "images",
+        metavar="IMAGES",
+        nargs="+",
+        help="image files, folders of images, or videos, of which one still is taken in each pause of the arm",
+    )
+    parser.add_argument(
+        "--stills",
+        metavar="DIR",
+        help="folder for the stills of videos, VIDEO-001.png, VIDEO-002.png and so on in the order of the "
+        "pauses; --joints has these names in the column `image` (default: they are not kept)",
+    )
     parser.add_argument(
         "--rig", **{**RIG, "required": True, "help": "rig file with the camera and the boards"}
     )
@@ -56,24 +69,57 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="corners.csv", required=True, help="image coordinates to write"
     )
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
     """Find the corners and write them."""
+    with ExitStack() as kept:
+        return _run(args, *_with_stills(args, kept))
+
+
+def _with_stills(args: Namespace, kept: ExitStack) -> tuple[list[str], list[str]]:
+    """Return images with the stills of videos in their place, and a note on each video."""
+    from ...detection import is_video, save_stills  # lazy import: slow to load
+
+    paths, notes = [], []
+    videos = [path for path in args.images if is_video(path)]
+    if args.stills and not videos:
+        raise InvalidArgumentError("--stills: needs a video among the images; omit it")
+    folder = args.stills or kept.enter_context(TemporaryDirectory()) if videos else ""
+    if args.stills:
+        os.makedirs(args.stills, exist_ok=True)
+    for path in args.images:
+        if path not in videos:
+            paths.append(path)
+            continue
+        if not os.path.isfile(path):
+            raise InvalidArgumentError(f"{path}: no such file; expected a video")
+        stills = save_stills(path, folder)
+        paths += [file for file, _ in stills]
+        times = ", ".join(f"{time:.1f}" for _, time in stills)
+        notes.append(f"{path}: {len(stills)} pauses, with stills at {times} s")
+    return paths, notes
+
+
+def _run(args: Namespace, images: Sequence[str], video_notes: Sequence[str]) -> int:
+    """Find the corners in images and write them."""
     from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
     from ...io.tabular import csv_text
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
-    paths = image_files(args.images)
-    require_writable_outputs([args.output], [args.rig, *files, *paths])
+    paths = image_files(images)
+    inputs = [args.rig, *files, *paths]
+    require_writable_outputs([args.output, args.json], inputs)
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
     joints, notes = _joints(args, paths)
+    notes = [*video_notes, *notes]
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = corner_columns(rig, camera, detections, joints)
@@ -83,7 +129,19 @@ def run(args: Namespace) -> int:
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
         contents |= pictures
         notes += remarks
-    write_outputs(contents)
+    boards = [
+        {
+            "board": each.board.name,
+            "images": len(each.images),
+            "used": len(each.used),
+            "problems": {
+                os.path.basename(image.path): image.problem for image in each.images if image.problem
+            },
+        }
+        for each in detections
+    ]
+    named = {"output": args.output} | ({"overlay": args.overlay} if args.overlay else {})
+    write_with_json(contents, args.json, named, inputs, boards=boards, notes=notes)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
     console.show(detection_screen(rig, detections, notes, written), args.verbosity)
     return 0

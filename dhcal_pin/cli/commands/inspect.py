@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, SERVOS, add_urdf_options
+from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, SERVOS, SHEET, add_urdf_options
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 
@@ -19,6 +19,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
     )
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--sheet", **SHEET)
     parser.add_argument("--servos", **SERVOS)
     parser.add_argument("--rig", **RIG)
     add_urdf_options(parser)
@@ -58,7 +59,7 @@ def run(args: Namespace) -> int:
     )
     rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
     servos = read_servos(args.servos) if args.servos else None
-    inspections = [inspect_file(path, chain, args.columns, rig, servos) for path in args.data]
+    inspections = [inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data]
     robot = None
     if chain is not None:
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, ROBOT, add_urdf_options
+from ..options import COLUMNS, DATA, JSON, ROBOT, SHEET, add_urdf_options
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--sheet", **SHEET)
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
@@ -104,7 +105,7 @@ def run(args: Namespace) -> int:
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
             "NAME.calibration.toml"
         )
-    files = [read_measurement_file(path, chain, args.columns) for path in args.data]
+    files = [read_measurement_file(path, chain, args.columns, sheet=args.sheet) for path in args.data]
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
     data, known = [file.data for file in files], read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}

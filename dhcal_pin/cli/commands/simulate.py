@@ -8,23 +8,29 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError, UnknownNameError
-from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
+from ..options import JSON, NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
     from ...robot import Chain, Conditions
 
-EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -m 50 --noise 0.1mm,0.01deg -o data.csv"
+EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the arguments of `dhcal simulate`."""
     parser.add_argument("robot", metavar="ROBOT", type=ROBOT["type"], help=f"nominal {ROBOT['help']}")
     parser.add_argument(
-        "-m", "--samples", type=POSITIVE_INTEGER, required=True, metavar="M", help="number of samples"
+        *("-n", "--count", "-m", "--samples"),
+        dest="samples",
+        type=POSITIVE_INTEGER,
+        required=True,
+        metavar="N",
+        help="number of samples",
     )
     parser.add_argument(
-        "--noise",
+        *("--sigma", "--noise"),
+        dest="noise",
         default="0mm",
         metavar="LENGTH[,ANGLE]",
         help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind camera "
@@ -62,6 +68,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         default=0,
         help="random seed of joint values and noise (default: %(default)s)",
     )
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
@@ -74,14 +81,16 @@ def run(args: Namespace) -> int:
     from ...measurements import KINDS, Noise
     from ...robot.sampling import joint_range
     from ...units import parse_noise
-    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block
     from ..screens.screen import Screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
-    require_writable_outputs([args.output], [*robots, *existing_sidecars(robots)])
-    noise = Noise(*parse_noise(_length_of_pixels(args.noise) if args.kind == "camera" else args.noise))
+    inputs = [*robots, *existing_sidecars(robots)]
+    require_writable_outputs([args.output, args.json], inputs)
+    sigma = _length_of_pixels(args.noise) if args.kind == "camera" else args.noise
+    noise = Noise(*parse_noise(sigma, "--sigma"))
     if args.truth and args.errors:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
@@ -109,7 +118,9 @@ def run(args: Namespace) -> int:
         rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
         require_writable_outputs([rig_path], [*robots, args.output])
         contents[rig_path] = rig_text(data.rig.cameras, data.rig.boards)
-    write_outputs(contents)
+    facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
+    files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
+    write_with_json(contents, args.json, files, inputs, **facts)
     console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
     return 0
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ..options import add_execution_options
+from ..options import JSON, add_execution_options
 
 if TYPE_CHECKING:
     from ...studies import StudyGrid, StudyJournal
@@ -29,6 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "-o", "--output", metavar="results.csv", required=True, help="table to write, one row per setting"
     )
     add_execution_options(parser, "processes on this computer (default: %(default)s)", jobs=1)
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
@@ -45,7 +47,7 @@ def run(args: Namespace) -> int:
     journal_path = f"{args.output}.part"
     study = studies.read_study(path)
     inputs = [os.fspath(path), *study.robots, *existing_sidecars(study.robots)]
-    require_writable_outputs([args.output, journal_path, _figure_path(args.output)], inputs)
+    require_writable_outputs([args.output, journal_path, _figure_path(args.output), args.json], inputs)
     complete_interrupted_save(journal_path)
     total = len(study.tasks())
     n_done = 0
@@ -61,7 +63,7 @@ def run(args: Namespace) -> int:
                     journal.append(block)
                     n_done = len(journal.blocks)
                     progress(n_done)
-            _write_results(study, journal, args)
+            _write_results(study, journal, args, inputs)
     except KeyboardInterrupt:
         if written_files():
             raise
@@ -77,14 +79,14 @@ def _figure_path(output: str) -> str:
     return f"{os.path.splitext(output)[0]}.svg"
 
 
-def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace) -> None:
+def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace, inputs: Sequence[str]) -> None:
     """Write table and plot of a finished study, remove its journal, and show the table."""
     from dataclasses import fields  # lazy import, as the following: they load Pinocchio
 
     from ... import studies
     from ...io.tabular import csv_text
     from ...plots import study_svg
-    from ..outputs import write_outputs
+    from ..outputs import write_with_json
     from ..screens import console
     from ..screens.result_screens import study_screen
 
@@ -92,5 +94,8 @@ def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace) -> 
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
     contents = {args.output: csv_text(columns)} | ({_figure_path(args.output): drawing} if drawing else {})
-    write_outputs({**contents, journal.path: None})
+    named: dict[str, str] = dict(zip(("output", "figure"), contents, strict=False))
+    settings = [dict(zip(header, row, strict=True)) for row in rows]
+    facts = {"title": study.title, "settings": settings}
+    write_with_json({**contents, journal.path: None}, args.json, named, inputs, **facts)
     console.show(study_screen(study, header, rows, contents), args.verbosity)

@@ -7,7 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, FIT_FRAMES, JSON, RIG, ROBOT, SERVOS, SKIP_BAD_ROWS, add_urdf_options
+from ..options import (
+    COLUMNS,
+    DATA,
+    FIT_FRAMES,
+    JSON,
+    RIG,
+    ROBOT,
+    SERVOS,
+    SHEET,
+    SKIP_BAD_ROWS,
+    add_urdf_options,
+)
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -30,6 +41,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--sheet", **SHEET)
     parser.add_argument("--servos", **SERVOS)
     parser.add_argument(
         "--rig",
@@ -204,7 +216,13 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     servos = read_servos(args.servos) if args.servos else None
     files = [
         read_measurement_file(
-            path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, rig=rig, servos=servos
+            path,
+            chain,
+            args.columns,
+            skip_bad_rows=args.skip_bad_rows,
+            rig=rig,
+            servos=servos,
+            sheet=args.sheet,
         )
         for path in args.data
     ]
@@ -285,7 +303,9 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
         rig = read_rig(args.rig)
     else:
         is_usable = calibrated is not None and calibrated.is_complete
-        has_images = is_usable and any(has_image_coordinates(path, chain, args.columns) for path in args.data)
+        has_images = is_usable and any(
+            has_image_coordinates(path, chain, args.columns, args.sheet) for path in args.data
+        )
         rig = calibrated if has_images else None
     if rig is None or calibrated is None:
         return rig and mount_rig(rig, chain), []

@@ -9,7 +9,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
-from ..options import FIT_FRAMES, POSITIVE_INTEGER, RIG, ROBOT, add_urdf_options
+from ..options import (
+    FIT_FRAMES,
+    JSON,
+    POSITIVE_INTEGER,
+    RIG,
+    ROBOT,
+    add_open_option,
+    add_urdf_options,
+)
 
 if TYPE_CHECKING:
     from ...measurements import Measurement, MountedRig
@@ -34,7 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"
     )
-    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    add_open_option(parser, "the page", default=None)
     parser.add_argument(
         "--magnification",
         metavar="S",
@@ -57,6 +65,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
     add_urdf_options(parser)
+    parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
@@ -66,13 +75,13 @@ def run(args: Namespace) -> int:
     from ...io.robot import has_dh_table, robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
-    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block, warnings_block
     from ..screens.screen import Screen
 
-    if args.live and (args.html or args.open):
-        raise InvalidArgumentError("--live writes no page; omit --html and --open")
+    if args.live and (args.html or args.open or args.json):
+        raise InvalidArgumentError("--live writes no page; omit --html, --open and --json")
     if args.fit_frames and not args.data:
         raise InvalidArgumentError(
             "--fit-frames: needs --data, the measurements to which base and tool are fitted"
@@ -80,7 +89,8 @@ def run(args: Namespace) -> int:
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    require_writable_outputs([page], [*robots, *sidecars, *args.data, *([args.rig] if args.rig else [])])
+    inputs = [*robots, *sidecars, *args.data, *([args.rig] if args.rig else [])]
+    require_writable_outputs([page, args.json], inputs)
     chains = [
         read_robot(
             path,
@@ -114,9 +124,10 @@ def run(args: Namespace) -> int:
         magnification=args.magnification,
         triangles=args.simplify,
     )
-    write_outputs({page: text})
+    findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
+    write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
     console.show(Screen([warnings_block(warnings), files_block([page])]), args.verbosity)
-    if args.open or not args.html:
+    if args.open if args.open is not None else not args.html:
         console.open_page(page)
     return 0
 
@@ -143,7 +154,8 @@ def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Name
     q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
     with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:
         console.print_lines(server.url, "end with Ctrl-C")
-        console.open_url(server.url)
+        if args.open is not False:
+            console.open_url(server.url)
         try:
             while True:
                 server.play(q)

@@ -14,7 +14,7 @@ from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError
 from ...units import ANGLES
-from ..tables import DataTable, read_table
+from ..tables import DataTable, TextLayout, read_table
 from ..tables.data_frame import is_data_frame
 from .column_map import PATH_PARTS, ColumnMap, ColumnRule, Rotation
 from .columns import ROTVEC
@@ -72,13 +72,17 @@ class _VendorTable:
         return self.table.values(self.index(name))
 
 
-def read_mapped_table(source: PathLike | Any, column_map: ColumnMap, known: Set[str]) -> DataTable:
+def read_mapped_table(
+    source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str = ""
+) -> DataTable:
     """Read a file of another maker as a table with the project's own columns.
 
     A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
     """
-    if _is_native(source, known) and not _matches(source, column_map):
-        return read_table(source)
+    column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet))
+    native = TextLayout(sheet=sheet)
+    if _is_native(source, native, known) and not _matches(source, column_map):
+        return read_table(source, native)
     vendor = _VendorTable(read_table(source, column_map.layout), column_map)
     table = vendor.table
     if missing := vendor.missing_columns():
@@ -119,10 +123,10 @@ def _fill_placeholders(text: str, source: PathLike | Any) -> str:
     return re.sub(pattern, lambda match: parts[match[0][1:-1]], text)
 
 
-def _is_native(source: PathLike | Any, known: Set[str]) -> bool:
+def _is_native(source: PathLike | Any, layout: TextLayout, known: Set[str]) -> bool:
     """Return whether the header of a file is the project's own."""
     try:
-        return set(read_table(source).columns) <= known
+        return set(read_table(source, layout).columns) <= known
     except DhcalError:
         return False
 

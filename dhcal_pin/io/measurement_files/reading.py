@@ -32,7 +32,7 @@ from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS, Condition
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
 from ..servo_file import ServoFile
-from ..tables import Column, DataTable, format_lines, read_table
+from ..tables import Column, DataTable, TextLayout, format_lines, read_table
 from .columns import (
     AFTER,
     COMMANDED,
@@ -96,6 +96,7 @@ def read_measurements(
     skip_bad_rows: bool = False,
     rig: MountedRig | None = None,
     servos: ServoFile | None = None,
+    sheet: str = "",
 ) -> Measurement:
     """Read all samples of a measurement file.
 
@@ -107,12 +108,13 @@ def read_measurements(
             error.
         rig: Cameras and boards of image coordinates, on the chain.
         servos: Servos whose counts are in columns `NAME[ticks]`, see `dhcal_pin.io.read_servos`.
+        sheet: Sheet of an Excel workbook; the first one with numbers by default.
 
     Returns:
         Samples of the kind that the columns select.
     """
     return read_measurement_file(
-        source, chain, columns, skip_bad_rows=skip_bad_rows, rig=rig, servos=servos
+        source, chain, columns, skip_bad_rows=skip_bad_rows, rig=rig, servos=servos, sheet=sheet
     ).data
 
 
@@ -124,29 +126,36 @@ def read_measurement_file(
     skip_bad_rows: bool = False,
     rig: MountedRig | None = None,
     servos: ServoFile | None = None,
+    sheet: str = "",
 ) -> MeasurementFile:
     """Read a measurement file with its division into fitted and held-out samples."""
     check_joint_names(chain)
-    table = open_measurement_table(source, chain, columns, servos)
+    table = open_measurement_table(source, chain, columns, servos, sheet)
     return parse_measurements(table, chain, skip_bad_rows, rig)
 
 
 def open_measurement_table(
-    source: PathLike | Any, chain: Chain, columns: PathLike | None, servos: ServoFile | None = None
+    source: PathLike | Any,
+    chain: Chain,
+    columns: PathLike | None,
+    servos: ServoFile | None = None,
+    sheet: str = "",
 ) -> DataTable:
     """Read the table of a measurement file, through a column map and a servo file if they are given."""
     if columns is None:
-        return with_joint_values(read_table(source), chain, servos)
+        return with_joint_values(read_table(source, TextLayout(sheet=sheet)), chain, servos)
     from .column_map import read_map  # lazy import, as the following: only for files of other makers
     from .mapped_table import read_mapped_table
 
-    table = read_mapped_table(source, read_map(columns, chain), known_columns(chain))
+    table = read_mapped_table(source, read_map(columns, chain), known_columns(chain), sheet)
     return with_joint_values(table, chain, servos)
 
 
-def has_image_coordinates(source: PathLike | Any, chain: Chain, columns: PathLike | None = None) -> bool:
+def has_image_coordinates(
+    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, sheet: str = ""
+) -> bool:
     """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
-    table = open_measurement_table(source, chain, columns)
+    table = open_measurement_table(source, chain, columns, sheet=sheet)
     return not needs_column_map(table, chain) and find_kind(value_table(table, chain)).kind == "camera"
 
 

@@ -1,8 +1,8 @@
 """Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
 
-The first sheet with a row of several numbers is read, else the first one with content. Its rows are numbered
-as in Excel. Rows whose only cell starts with `#` are comments, as in a text file. Of a formula the value is
-read that Excel saved with it.
+The sheet that the layout names is read, else the first one with a row of several numbers, else the first one
+with content. Its rows are numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a
+text file. Of a formula the value is read that Excel saved with it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 from ..._typing import PathLike
-from ...exceptions import FileFormatError
-from .table import DataTable
+from ...exceptions import FileFormatError, UnknownNameError
+from .table import DataTable, units_under_header
 from .text import TextLayout, detect_decimal
 
 # Largest size of all sheets and texts of a workbook [byte]; openpyxl reads 4 MiB per second.
@@ -56,7 +56,13 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
     filled = {title: rows for title, rows in sheets.items() if rows}
     if not filled:
         raise FileFormatError(f"{source}: is empty; the first row must be a header such as joint_1[deg]")
-    title = next((each for each, rows in filled.items() if any(map(_has_numbers, rows))), next(iter(filled)))
+    if layout.sheet and layout.sheet not in filled:
+        raise UnknownNameError(
+            f"{source}: no sheet {layout.sheet!r} with content; choose from {', '.join(map(repr, filled))}"
+        )
+    title = layout.sheet or next(
+        (each for each, rows in filled.items() if any(map(_has_numbers, rows))), next(iter(filled))
+    )
     rows = filled[title]
     others = [other for other in filled if other != title]
     notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
@@ -120,6 +126,8 @@ def _build_table(
     texts = [(number, [_cell_text(cell, decimal) for cell in cells]) for number, cells in content]
     header_line, headers = texts[0]
     data = texts[layout.has_header :]
+    units = units_under_header(headers, data[0][1]) if layout.has_header and data[1:] else ()
+    data = data[bool(units) :]
     while headers and not headers[-1] and not any("".join(cells[len(headers) - 1 :]) for _, cells in data):
         headers.pop()
     width = len(headers)
@@ -133,4 +141,5 @@ def _build_table(
         decimal=decimal,
         description=description,
         notes=notes,
+        units=units[:width],
     )

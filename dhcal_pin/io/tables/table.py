@@ -25,11 +25,13 @@ import numpy as np
 from ..._typing import Array
 from ...exceptions import FileFormatError, UnknownNameError
 from ...messages import quote
-from ...units import MAX_SI_VALUE
+from ...units import MAX_SI_VALUE, UNITS
 from ..tabular import parse_number
 
 # Largest number of rows of a table. With more of them a calibration takes more than 20 s and 1 GB.
 MAX_ROWS = 200_000
+# Units that a row under the header may have.
+_KNOWN_UNITS = frozenset(unit for units in UNITS.values() for unit in units)
 # Largest number of lines, or of runs of lines, that a message lists.
 MAX_LISTED_RUNS = 100
 
@@ -70,6 +72,7 @@ class DataTable:
     bad_rows: Mapping[int, str] = field(default_factory=dict)  # Reason why a row was left out, by line
     description: str = ""  # How the file is written, such as "semicolons, decimal commas"
     notes: tuple[str, ...] = ()  # Sentences on what was not read, such as further sheets
+    units: tuple[str, ...] = ()  # Cells of the row of units under the header; empty if there is none
 
     @classmethod
     def from_columns(
@@ -111,6 +114,13 @@ class DataTable:
                     "between them"
                 )
             name, unit = match[1], match[2] or ""
+            if below := self.units[index] if self.units else "":
+                if unit not in ("", below):
+                    raise FileFormatError(
+                        f"{self.header_location}: column {quote(name)} has unit {unit!r} in the header and "
+                        f"{below!r} in the row under it; correct one"
+                    )
+                unit = below
             if name in columns:
                 raise FileFormatError(
                     f"{self.header_location}: column {quote(name)} appears twice; remove one"
@@ -221,6 +231,26 @@ class DataTable:
         raise FileFormatError(
             f"{self.source}:{line}: {reason}{others}; correct or remove {what}{alternative}"
         )
+
+
+def units_under_header(headers: Sequence[str], cells: Sequence[str]) -> tuple[str, ...]:
+    """Return the unit of each column if a row has units and no numbers, and nothing if it is another row.
+
+    >>> units_under_header(["joint_1", "x", "set"], ["[deg]", "mm", "-"])
+    ('deg', 'mm', '')
+    """
+    units = ["" if cell.strip() == "-" else cell.strip(" []()") for cell in cells]
+    if not _KNOWN_UNITS.intersection(units) or any(map(_is_number, units)):
+        return ()
+    return (*units, *[""] * len(headers))[: len(headers)]
+
+
+def _is_number(cell: str) -> bool:
+    """Return whether a cell is a number with either decimal sign."""
+    with suppress(ValueError):
+        parse_number(cell.replace(",", "."))
+        return True
+    return False
 
 
 def require_few_rows(source: str, count: int) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import parse_number, read_text
-from .table import DataTable, require_few_rows
+from .table import DataTable, require_few_rows, units_under_header
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
 BLANK_CHARACTERS = " \t,;"
@@ -45,10 +45,11 @@ _DECIMALS = {sign: re.compile(rf"[+-]?(?:\d+\{sign}\d*|\{sign}\d+)(?:[eE][+-]?\d
 
 @dataclass(frozen=True)
 class TextLayout:
-    """How a text file is divided into cells."""
+    """How a file is divided into cells."""
 
     separator: str = ""  # Key of `SEPARATORS`; empty if it is to be detected
     decimal: str = ""  # Decimal sign; empty if it is to be detected
+    sheet: str = ""  # Sheet of a workbook; empty for the first one with numbers
     skip: int = 0  # Number of lines before the header
     has_header: bool = True  # Whether the first row is a header
     # Start of a comment line; empty if there are none.
@@ -103,6 +104,9 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
     while headers and not headers[-1]:
         headers.pop()
     rows = content[layout.has_header :]
+    has_two = layout.has_header and len(rows) > 1
+    units = units_under_header(headers, _split_stripped(rows[0][1], separator)) if has_two else ()
+    rows = rows[bool(units) :]
     if not rows:
         raise FileFormatError(
             f"{source}: no rows under the header in line {header_line}; add at least one row"
@@ -122,6 +126,7 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
         decimal,
         bad,
         f"{name}, decimal commas" if decimal == "," else name,
+        units=units,
     )
 
 

@@ -144,6 +144,32 @@ def first_values(
     return values
 
 
+def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
+    """Return joint values (k, n) and poses (k, 4, 4) of the moving one of camera and board in the other one.
+
+    They are those of the pair with the most views, without badly fitting ones: poses of the tool for some
+    base and some tool. Both are empty if no camera and board move against each other.
+    """
+    pairs = np.stack([item.camera, item.board], 1)[views.sample]
+    camera_moves, board_moves = (
+        np.array([mount.moves for mount in mounts], bool)[pairs[:, i]]
+        for i, mounts in enumerate((item.rig.camera_mounts, item.rig.board_mounts))
+    )
+    is_usable = camera_moves != board_moves
+    labels, counts = np.unique(pairs[is_usable], axis=0, return_counts=True)
+    if not len(labels):
+        return np.empty((0, item.q.shape[1])), np.empty((0, 4, 4))
+    of_pair = np.flatnonzero(np.all(pairs == labels[np.argmax(counts)], 1))
+    good = _well_fitting(views.rms, of_pair)
+    poses = views.poses[good, 0]
+    return item.q[views.sample[good]], se3.inverse(poses) if camera_moves[good[0]] else poses
+
+
+def _well_fitting(rms: Array, of_pair: Array) -> Array:
+    """Return the views of a pair of camera and board, by number, without badly fitting ones."""
+    return of_pair[rms[of_pair] <= max(_MAX_RATIO * float(np.median(rms[of_pair])), _GOOD_RMS)]
+
+
 def _stated_poses(entries: Sequence[Camera] | Sequence[Board], mounts: Sequence[Mount]) -> dict[int, Array]:
     """Return the poses in the frames of the ends that the rig states, by number."""
     pairs = enumerate(zip(entries, mounts, strict=True))
@@ -179,7 +205,7 @@ def _board_poses(item: Corners, views: BoardViews, chain: Chain, used: Array) ->
     pairs = np.stack([item.camera[samples], item.board[samples]], 1)
     for camera, board in dict.fromkeys(map(tuple, pairs.tolist())):
         of_pair = np.flatnonzero(np.all(pairs == [camera, board], 1))
-        good = of_pair[rms[of_pair] <= max(_MAX_RATIO * float(np.median(rms[of_pair])), _GOOD_RMS)]
+        good = _well_fitting(rms, of_pair)
         moves = item.rig.camera_mounts[camera].moves
         out[camera, board] = (se3.inverse(tools[good]) if moves else tools[good]), poses[good]
     return out

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import write
 
-from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.exceptions import DhcalError, UnknownNameError
 from dhcal_pin.io import read_toml
-from dhcal_pin.io.tables import format_lines, read_table
+from dhcal_pin.io.tables import TextLayout, format_lines, read_table
 from dhcal_pin.io.tabular import csv_text, require_usable_names
 
 
@@ -58,6 +58,33 @@ def test_the_sheet_with_numbers_is_read(tmp_path):
     table = read_table(tmp_path / "a.xlsx")
     assert table.headers == ("a", "b", "c")
     assert table.notes == ("read sheet 'Data', not 'Info', 'Other'",)
+    other = read_table(tmp_path / "a.xlsx", TextLayout(sheet="Other"))
+    assert other.values(1).tolist() == [5]
+    with pytest.raises(UnknownNameError, match=r"a\.xlsx: no sheet 'data' .*'Info', 'Data', 'Other'"):
+        read_table(tmp_path / "a.xlsx", TextLayout(sheet="data"))
+
+
+@pytest.mark.parametrize("units", ["deg,mm,-", "[deg],(mm),", "deg,mm"])
+def test_a_row_of_units_is_understood_as_in_the_header(tmp_path, units):
+    table = read_table(write(tmp_path, "a.csv", f"q,x,n\n{units}\n1,2,3\n4,5,6\n"))
+    assert {name: column.unit for name, column in table.columns.items()} == {"q": "deg", "x": "mm", "n": ""}
+    assert (table.values(1).tolist(), table.lines) == ([2, 5], [3, 4])
+
+
+def test_units_of_two_places_must_agree(tmp_path):
+    table = read_table(write(tmp_path, "a.csv", "q[deg],x[mm]\ndeg,mm\n1,2\n"))
+    assert [column.unit for column in table.columns.values()] == ["deg", "mm"]
+    with pytest.raises(
+        DhcalError, match=r"a\.csv:1: column 'x' has unit 'mm' in the header and 'm' in the row"
+    ):
+        _ = read_table(write(tmp_path, "a.csv", "q[deg],x[mm]\ndeg,m\n1,2\n")).columns
+
+
+@pytest.mark.parametrize("row", ["deg,1", "furlong,fathom", "deg,mm\ndeg,mm"])
+def test_other_rows_are_not_units(tmp_path, row):
+    table = read_table(write(tmp_path, "a.csv", f"q,x\n{row}\n1,2\n"))
+    with pytest.raises(DhcalError, match=r"a\.csv:[23]: column 'q': '(deg|furlong)' is not a finite number"):
+        table.without_bad_rows([0]).require_good_rows()
 
 
 @pytest.mark.parametrize("name", ["=1", "+a", "@b", "-c"])

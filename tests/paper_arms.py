@@ -1,0 +1,145 @@
+"""Simulated servo arms that are photographed: a printed board and a camera of unknown lens.
+
+The camera stands on the table and the board is on the gripper, or the reverse. The joints have play, zero
+errors and wrong signs, links and axes are displaced, and gravity bends the joints. Kinematics and gravity
+torques are those of Pinocchio.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+from camera_setups import look_at
+from servo_arms import JOINTS, RANGES, SO101, TIP, ServoArm
+
+from dhcal_pin import Chain, read_robot
+from dhcal_pin.cameras import LENSES, Board, Camera, Rig
+from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.measurements.mounting import mount_rig
+from dhcal_pin.plausibility.signs import with_wide_limits
+from dhcal_pin.se3 import inverse, transform
+
+WIDTH, HEIGHT = 1280, 720
+# Compliance of each joint [rad/(N·m)]: the stretched arm sags by some millimetres.
+COMPLIANCE = 0.012
+# Corners of the board on the table and of that on the gripper: columns, rows and size of a square [m].
+ON_TABLE, ON_GRIPPER = (10, 7, 0.025), (7, 5, 0.012)
+
+
+@dataclass(frozen=True, eq=False)
+class PaperArm:
+    """Photographs of a board with counts of the servos, and the truth."""
+
+    arm: ServoArm
+    nominal: Chain
+    images: CameraCorners
+    held_out: tuple[
+        np.ndarray, np.ndarray
+    ]  # Joint values as read (k, 5), true poses of the board in the camera
+
+    def held_out_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
+        """Return the distances of the middle of the board in the camera from the truth, (k,) [m]."""
+        q, truth = self.held_out
+        rig, tools = self.images.rig, chain.poses(q)
+        (camera, board), mount = (_pose(instruments, name) for name in ("camera_cam", "board_paper")), rig
+        if mount.camera_mounts[0].moves:
+            found = inverse(tools @ camera) @ board
+        else:
+            found = inverse(camera) @ tools @ board
+        middle = np.append(rig.boards[0].points.mean(0), 1.0)
+        return np.linalg.norm((found @ middle - truth @ middle)[:, :3], axis=1)
+
+
+def _pose(values: dict[str, float], name: str) -> np.ndarray:
+    """Return the pose of a camera or a board of instrument parameters."""
+    x = np.array([values[f"{name}.{axis}"] for axis in ("x", "y", "z", "rx", "ry", "rz")])
+    return transform(pin.exp3(x[3:]), x[:3])
+
+
+def nominal_arm() -> Chain:
+    """Return the nominal arm with the errors of a low-cost arm."""
+    return replace(with_wide_limits(read_robot(SO101, tip=TIP)), parameters="low-cost")
+
+
+def photograph(
+    seed: int, n_images: int = 25, *, is_on_wrist: bool | None = None, wrong: int | None = None
+) -> PaperArm:
+    """Simulate the photographs of an arm; a seed gives another arm, camera and board."""
+    rng = np.random.default_rng(seed)
+    arm = ServoArm.random(rng, wrong=wrong)
+    arm = replace(arm, base=pin.SE3.Identity(), tool=pin.SE3.Identity())
+    is_on_wrist = bool(rng.integers(2)) if is_on_wrist is None else is_on_wrist
+    columns, rows, square = ON_TABLE if is_on_wrist else ON_GRIPPER
+    board = Board("paper", "world" if is_on_wrist else "tip", "checkerboard", columns=columns, rows=rows,
+                  square=square)  # fmt: skip
+    focal = rng.uniform(850, 1150)
+    lens = np.array([focal, focal * rng.uniform(0.995, 1.005), 639.5 + rng.normal(0, 12),
+                     359.5 + rng.normal(0, 12), rng.uniform(-0.2, 0.1), rng.normal(0, 0.03),
+                     *rng.normal(0, 5e-4, 2), 0.0])  # fmt: skip
+    camera = Camera("cam", "tip" if is_on_wrist else "world", WIDTH, HEIGHT, np.full(9, np.nan),
+                    LENSES["pinhole"], "free")  # fmt: skip
+    q = arm.configurations(rng, 4000, 0.8)
+    play = np.deg2rad(0.5) / 2 * rng.choice([-1.0, 1.0], q.shape)
+    tools = arm.poses(_sagged(arm.model, q + play))
+    camera_pose, board_pose = _places(rng, tools, board, is_on_wrist)
+    if is_on_wrist:
+        local = inverse(tools @ camera_pose) @ board_pose
+    else:
+        local = inverse(camera_pose) @ tools @ board_pose
+    points = np.einsum("kij,cj->kci", local[:, :3, :3], board.points) + local[:, None, :3, 3]
+    pixels = LENSES["pinhole"].project(points.reshape(-1, 3).T, lens)[0].T.reshape(*points.shape[:2], 2)
+    is_seen = np.all((pixels > 5) & (pixels < [WIDTH - 6, HEIGHT - 6]), 2)
+    is_seen &= (points[..., 2] > 0.08) & (points[..., 2] < 0.7)
+    is_seen &= np.linalg.norm(points[..., :2], axis=2) < 0.8 * points[..., 2]
+    # The printed side faces the camera, less than 60 degrees aside.
+    facing = np.sum(local[:, :3, 2] * local[:, :3, 3], 1) / np.linalg.norm(local[:, :3, 3], axis=1)
+    is_seen &= (np.abs(facing) > 0.5)[:, None]
+    good = np.flatnonzero(is_seen.sum(1) >= 12)
+    if len(good) < 2 * n_images:
+        return photograph(seed + 10_000, n_images, is_on_wrist=is_on_wrist, wrong=wrong)
+    counts = arm.counts(q)
+    middles = np.array([sum(RANGES[name]) / 2 for name in JOINTS])
+    read = np.deg2rad(360.0 * (counts - middles) / 4095.0)
+    chosen, nominal = good[:n_images], nominal_arm()
+    image, corner = np.nonzero(is_seen[chosen])
+    values = pixels[chosen][image, corner] + rng.normal(0, 0.3, (len(image), 2))
+    rig = mount_rig(Rig({"cam": camera}, {"paper": board}), nominal)
+    images = CameraCorners(read[chosen][image], values, corner, rig)
+    others = good[n_images:]
+    return PaperArm(arm, nominal, images, (read[others], local[others]))
+
+
+def _sagged(model: pin.Model, q: np.ndarray) -> np.ndarray:
+    """Return joint values (m, 5) with the deflection by gravity."""
+    indices = [model.joints[model.getJointId(name)] for name in JOINTS]
+    data, out = model.createData(), q.copy()
+    for row, bent in zip(q, out, strict=True):
+        values = pin.neutral(model)
+        values[[j.idx_q for j in indices]] = row
+        torque = pin.computeGeneralizedGravity(model, data, values)
+        bent -= COMPLIANCE * torque[[j.idx_v for j in indices]]
+    return out
+
+
+def _places(
+    rng: np.random.Generator, tools: np.ndarray, board: Board, is_on_wrist: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses of camera and board in their links."""
+    centre = transform(np.eye(3), -board.points.mean(0))
+    small = transform(pin.exp3(rng.normal(0, 0.1, 3)), rng.uniform(-0.01, 0.01, 3))
+    if is_on_wrist:
+        # Board on the table in front of the arm; camera above the gripper, tilted towards its tip.
+        turned = transform(pin.exp3(np.array([np.pi, 0, 0]) * rng.integers(2)), np.zeros(3))
+        place = transform(pin.exp3(np.array([0, 0, rng.uniform(-3, 3)])), [rng.uniform(0.18, 0.28), 0.0, 0.0])
+        pose = look_at(np.array([-0.06, 0.0, 0.06]), np.array([0.08, 0.0, 0.0]), rng.uniform(-0.2, 0.2))
+        return small @ pose, place @ turned @ centre
+    # Board on the side or the top of the gripper; camera on the table beside the arm or in front of it.
+    side = rng.choice([-1.0, 1.0])
+    angle = side * rng.uniform(0.3, 1.2)
+    position = np.array([0.15 + 0.4 * np.cos(angle), 0.4 * np.sin(angle), rng.uniform(0.15, 0.35)])
+    pose = look_at(position, np.array([0.18, 0.0, 0.15]), rng.uniform(-0.2, 0.2))
+    # A board whose normal points forward and up, as on a clip in the gripper.
+    normal = pin.exp3(np.array([0, -rng.uniform(0.2, 1.0), 0])) @ pin.exp3(np.array([0, np.pi / 2, 0]))
+    return pose, transform(normal, [0.01, 0.0, 0.02]) @ small @ centre
