@@ -393,7 +393,7 @@ class FittedModel:
         has_chi_square = is_stated and np.isfinite(chi_square)
         is_tested = self.degrees_of_freedom > 0 and len(self.x) <= MAX_TESTED
         gains = family_gains(self.problem, self.x, self.weights) if is_tested else {}
-        return ModelFit(chi_square if has_chi_square else None, self.degrees_of_freedom, gains)
+        return ModelFit(float(chi_square) if has_chi_square else None, float(self.degrees_of_freedom), gains)
 
     def _information(self, scale: float, root: Array) -> Information | None:
         """Return what the covariance scale²·root·rootᵀ of the parameters follows from."""

@@ -727,8 +727,9 @@ def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[st
         added, remaining = int(np.sum(family == name)), n_rows - int(np.sum(columns))
         after = solve_columns(system, problem.weights, x, columns)[1]
         if remaining > 0 and after > 0:
-            gain = max((before - after) / (after / remaining), 0.0)
-            gains[name] = FamilyGain(float(gain), added, remaining)
+            gain = float(max((before - after) / (after / remaining), 0.0))
+            if np.isfinite(gain):
+                gains[name] = FamilyGain(gain, added, remaining)
     return gains
 
 

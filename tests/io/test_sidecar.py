@@ -12,6 +12,7 @@ from robots import write
 
 from dhcal_pin import se3
 from dhcal_pin.estimation import Uncertainty
+from dhcal_pin.estimation.uncertainty import FamilyGain, ModelFit
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import (
     read_instrument,
@@ -76,7 +77,8 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     }
     n_rows = 6 * (len(scara.moving_joints) + 1)
     rows = np.random.default_rng(0).normal(size=(2, n_rows, 3))
-    known = Uncertainty(scara, np.array([], int), rows[0], rows[1])
+    stated = ModelFit(12.3, 45.6, {"harmonics": FamilyGain(31.2, 4, 40)})
+    known = Uncertainty(scara, np.array([], int), rows[0], rows[1], fit=stated)
     q = np.random.default_rng(1).normal(size=(9, scara.n_joints))
     region = MeasuredRegion.from_configurations(q, scara.is_prismatic).with_reach(q, q.T > 0)
     for path, content in urdf_files(scara, tmp_path / "out.urdf", values, known, region).items():
@@ -89,6 +91,7 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     assert again is not None
     np.testing.assert_array_equal(again.sqrt_covariance, rows[0])
     np.testing.assert_array_equal(again.unbounded_directions, rows[1])
+    assert again.fit == stated
     region_again = read_measured_region(side, scara)
     assert region_again is not None
     for name in ("lower", "upper", "spread", "configurations", "radius", "reach", "is_prismatic"):
@@ -96,6 +99,16 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     assert side.read_text().startswith("# ")
     # Texts without escapes are read faster.
     assert "sqrt_covariance = '''\n" in side.read_text()
+
+
+@pytest.mark.parametrize(
+    "left_out", ['[["waves", 1.0, 4, 40]]', '[["gain", 1.0, 4]]', '[["gain", -1.0, 4, 40]]']
+)
+def test_an_invalid_family_of_an_uncertainty_is_an_error(tmp_path, scara, left_out):
+    text = f'[uncertainty]\njoints = ["shoulder", "lift"]\nterms = []\nleft_out = {left_out}\n'
+    path = write(tmp_path, "arm.calibration.toml", text)
+    with pytest.raises(DhcalError, match=r"left_out.*such as"):
+        read_uncertainty(path, scara)
 
 
 REGION = """[measured]
