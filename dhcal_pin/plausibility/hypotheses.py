@@ -33,6 +33,8 @@ QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
 JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
+# Sign between the keys of two mistakes.
+_AND = "+"
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Largest lag [rows or s] and change of a scale that can be undone.
@@ -284,6 +286,9 @@ class Hypothesis:
 
     def log_jacobian(self, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""
+        if isinstance(self.change, BothChanges):
+            first, second = self.change.first, self.change.second
+            return first.log_jacobian(data) + second.log_jacobian(first.apply(data) or data)
         if not isinstance(self.change, LengthChange):
             return 0.0
         n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
@@ -296,6 +301,29 @@ def _count_lengths(item: Measurement) -> int:
     if item.is_contact:
         return 0
     return 3 * len(item.rows) if isinstance(item, PoseMeasurement) else item.residual_dim * len(item.rows)
+
+
+@dataclass(frozen=True)
+class BothChanges:
+    """Two changes, one after the other."""
+
+    first: Hypothesis
+    second: Hypothesis
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements after both changes; None if neither applies."""
+        changed = self.first.change.apply(item)
+        both = self.second.change.apply(item if changed is None else changed)
+        return changed if both is None else both
+
+
+def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
+    """Return the hypothesis that two mistakes were made; the changes are undone in this order."""
+    return Hypothesis(
+        f"{first.key}{_AND}{second.key}",
+        f"{first.description}, and {second.description}",
+        BothChanges(first, second),
+    )
 
 
 def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
@@ -319,11 +347,14 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
-    """Undo a mistake in measurements, such as the wrong sign of a joint."""
+    """Undo a mistake in measurements, such as the wrong sign of a joint, or several with + between them."""
     change = _change_of_size(key)
     if change is None:
         by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
         if key not in by_key:
+            ends = [at.start() for at in re.finditer(re.escape(_AND), key) if key[: at.start()] in by_key]
+            if ends:
+                return mend(chain, mend(chain, data, key[: ends[0]]), key[ends[0] + len(_AND) :])
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
             raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
         change = by_key[key].change

@@ -15,6 +15,8 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 from dhcal_pin.measurements.pose import PoseMeasurement
+from dhcal_pin.plausibility.hypotheses import mend
+from dhcal_pin.plausibility.mixups import diagnose_mixups
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.chain import joint_frame
 from dhcal_pin.robot.sampling import limits_with_margin
@@ -264,3 +266,34 @@ def test_honest_measurements_are_accepted():
 @pytest.mark.slow
 def test_many_honest_measurements_are_accepted():
     check_honest(range(424), 0.03)
+
+
+def judge_pair(seed: int) -> str:
+    """Return "named" if both of two random mistakes are named, one after the other; else what happens."""
+    rng = np.random.default_rng([seed, 77])
+    chain = arm(ARMS[seed % len(ARMS)])
+    names = rng.choice([name for name, mistake in MISTAKES.items() if mistake.key], 2, replace=False)
+    made = [MISTAKES[name] for name in names]
+    kind = Pose if Pose in [mistake.kind for mistake in made] else Position
+    true = with_errors(chain, 2e-3, np.deg2rad(0.3), rng)
+    data = kind.simulate(true, configurations(chain, int(rng.integers(40, 100)), rng), NOISE, rng)
+    for mistake in made:
+        data = mistake.apply(data)
+    for _ in range(2):
+        found = diagnose_mixups(chain, [data])
+        if not found.hypotheses:
+            break
+        data = mend(chain, data, found.hypotheses[0].key)
+        if not diagnose_mixups(chain, [data]).is_suspicious:
+            return "named"
+        if not (found.after and found.after.length_scale < 2e-3):
+            return f"{seed}: {', '.join(names)}: false: {found.hypotheses[0].key}"
+    return f"{seed}: {', '.join(names)}: not named"
+
+
+@pytest.mark.parametrize("seed", some_slow([4, 5, *range(100, 130)], 2))
+def test_two_mistakes_are_named_or_none_is(seed):
+    outcome = judge_pair(seed)
+    assert "false" not in outcome
+    if seed < 100:
+        assert outcome == "named"
