@@ -269,7 +269,7 @@ def test_many_honest_measurements_are_accepted():
 
 
 def judge_pair(seed: int) -> str:
-    """Return "named" if both of two random mistakes are named, one after the other; else what happens."""
+    """Return "named" if undoing what is named, at most twice, mends two random mistakes."""
     rng = np.random.default_rng([seed, 77])
     chain = arm(ARMS[seed % len(ARMS)])
     names = rng.choice([name for name, mistake in MISTAKES.items() if mistake.key], 2, replace=False)
@@ -279,21 +279,22 @@ def judge_pair(seed: int) -> str:
     data = kind.simulate(true, configurations(chain, int(rng.integers(40, 100)), rng), NOISE, rng)
     for mistake in made:
         data = mistake.apply(data)
-    for _ in range(2):
+    found, keys = diagnose_mixups(chain, [data]), []
+    while found.hypotheses and len(keys) < 2:
+        keys.append(found.hypotheses[0].key)
+        data = mend(chain, data, keys[-1])
         found = diagnose_mixups(chain, [data])
-        if not found.hypotheses:
-            break
-        data = mend(chain, data, found.hypotheses[0].key)
-        if not diagnose_mixups(chain, [data]).is_suspicious:
-            return "named"
-        if not (found.after and found.after.length_scale < 2e-3):
-            return f"{seed}: {', '.join(names)}: false: {found.hypotheses[0].key}"
-    return f"{seed}: {', '.join(names)}: not named"
+    outcome = "false" if keys else "not named"
+    return "named" if keys and not found.is_suspicious else f"{outcome}: {seed}: {', '.join(names)}: {keys}"
 
 
-@pytest.mark.parametrize("seed", some_slow([4, 5, *range(100, 130)], 2))
-def test_two_mistakes_are_named_or_none_is(seed):
-    outcome = judge_pair(seed)
-    assert "false" not in outcome
-    if seed < 100:
-        assert outcome == "named"
+@pytest.mark.parametrize("seed", [4, 5])
+def test_two_mistakes_are_named(seed):
+    assert judge_pair(seed) == "named"
+
+
+@pytest.mark.slow
+def test_two_random_mistakes_are_named_or_none_is():
+    outcomes = [judge_pair(seed) for seed in range(200, 300)]
+    assert not [outcome for outcome in outcomes if outcome.startswith("false")]
+    assert outcomes.count("named") >= 0.8 * len(outcomes), outcomes
