@@ -236,6 +236,55 @@ class RotationUnit:
         return _with_rotations(item, lambda _: se3.exp3(ANGLES["deg"] * vectors))
 
 
+# Notations of a rotation by three numbers a, b, c.
+NOTATIONS: dict[str, str] = {
+    "rotvec": "rotation vectors",
+    "xyz": "Euler angles X, Y', Z''",
+    "zyx": "Euler angles Z, Y', X''",
+    "rpy": "roll, pitch and yaw about fixed axes",
+}
+
+
+@dataclass(frozen=True)
+class OtherNotation:
+    """Rotations by three numbers of one notation that were read in another one."""
+
+    read: str  # Keys of `NOTATIONS`
+    true: str
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with the rotations of the true notation."""
+        return _with_rotations(
+            item, lambda rotations: _numbers_to_matrix(_matrix_to_numbers(rotations, self.read), self.true)
+        )
+
+
+def _numbers_to_matrix(numbers: Array, notation: str) -> Array:
+    """Convert three numbers of a notation, (m, 3), to rotations (m, 3, 3)."""
+    if notation == "rotvec":
+        return se3.exp3(numbers)
+    x, y, z = (se3.exp3(numbers[:, [i]] * np.eye(3)["xyz".index(axis)]) for i, axis in _columns(notation))
+    return x @ y @ z if notation == "xyz" else z @ y @ x
+
+
+def _matrix_to_numbers(rotations: Array, notation: str) -> Array:
+    """Convert rotations (m, 3, 3) to three numbers of a notation, (m, 3)."""
+    if notation == "rotvec":
+        return se3.log3(rotations)
+    r = np.swapaxes(rotations, 1, 2) if notation == "xyz" else rotations
+    # Angles of r = Rz·Ry·Rx; the transposed matrix has the other order and the other signs.
+    y = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 0, 0], r[:, 1, 0]))
+    angles = {"x": np.arctan2(r[:, 2, 1], r[:, 2, 2]), "y": y, "z": np.arctan2(r[:, 1, 0], r[:, 0, 0])}
+    sign = -1 if notation == "xyz" else 1
+    return sign * np.stack([angles[axis] for axis in ("zyx" if notation == "zyx" else "xyz")], -1)
+
+
+def _columns(notation: str) -> list[tuple[int, str]]:
+    """Return the column of the angle about each axis, in the order x, y, z."""
+    order = "zyx" if notation == "zyx" else "xyz"
+    return [(order.index(axis), axis) for axis in "xyz"]
+
+
 def _with_positions(item: Measurement, positions: Array) -> Measurement:
     """Return measurements with other positions, (m, 3) [m]."""
     if isinstance(item, PoseMeasurement):
@@ -459,6 +508,9 @@ def _pose_hypotheses() -> Iterator[Hypothesis]:
     for order in QUATERNION_ORDERS:
         text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
         yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
+    for read, true in permutations(NOTATIONS, 2):
+        text = f"the rotations are {NOTATIONS[true]}, but were read as {NOTATIONS[read]}"
+        yield Hypothesis(f"rotations:{true}-not-{read}", text, OtherNotation(read, true))
 
 
 def _axis_hypothesis(
