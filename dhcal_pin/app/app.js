@@ -40,6 +40,18 @@ function showError(id, text) {
   $(id).hidden = !text;
 }
 
+// Controls of the page by the options of the command line.
+const CONTROLS = {
+  "--skip-bad-rows": "“Skip rows that lack a number or a name”", "--tip": "“Tip link”", "--columns": "a column map among the files",
+  "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
+};
+
+// A message of the command, in the words of the page.
+function spoken(text) {
+  return text.replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
+    .replace(/--[a-z][a-z-]*/g, option => CONTROLS[option] ?? `${option} of the command line`);
+}
+
 const megabytes = bytes => bytes < 1e5 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
 const named = role => [...files].filter(([, entry]) => entry.role === role).map(([name]) => name);
 
@@ -184,7 +196,7 @@ async function inspect() {
   $("check").replaceChildren(element("p", { className: "hint" }, "Reading the files …"));
   const show = message => {
     if (controller.signal.aborted) return;
-    const cards = message.error ? [element("p", { className: "error" }, message.error)] : message.result.files.map(fileCard);
+    const cards = message.error ? [element("p", { className: "error" }, spoken(message.error))] : message.result.files.map(fileCard);
     $("check").replaceChildren(...cards);
   };
   try {
@@ -203,7 +215,7 @@ function fileCard(file) {
   const facts = [file.kind, count(file.rows, "row"), file.configurations ? count(file.configurations, "configuration") : "", file.form];
   const out = element("div", { className: `card ${state}` },
     element("h3", {}, file.path), element("p", {}, facts.filter(Boolean).join(", ")),
-    file.problem ? element("p", {}, file.problem) : null, list(warnings), list(file.notes),
+    file.problem ? element("p", {}, spoken(file.problem)) : null, list(warnings.map(spoken)), list(file.notes.map(spoken)),
     state === "ok" ? element("p", {}, "No problems found.") : null);
   if (file.column_map.length) out.append(...proposedMap(file.column_map));
   const rows = file.columns.map(column => [column.name, column.unit, column.role, short(column.minimum), short(column.maximum),
@@ -252,7 +264,7 @@ async function calibrate(force = false) {
   try {
     await send("calibrate", form(request), running.signal, message => {
       if (message.phase) showProgress(message);
-      else if (message.error) throw new Error(message.error);
+      else if (message.error) throw new Error(spoken(message.error));
       else showResult(message);
     });
     $("status").textContent = "";
@@ -310,7 +322,7 @@ function showResult({ result, status, screen, files: outputs }) {
   const isRefused = status === "refused";
   const key = verdict.status === "refused" && !isRefused ? "forced" : verdict.status;
   parts.push(element("div", { className: `card ${verdict.status}` }, element("p", { className: "verdict" }, VERDICTS[key]),
-    list(verdict.reasons), isRefused ? remedies(verdict.reasons) : null));
+    list(verdict.reasons.map(spoken)), isRefused ? remedies(verdict.reasons) : null));
   if (!isRefused && rows.length) {
     const [quantity, judged, before, after] = rows[0];
     const value = (name, text) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
@@ -321,7 +333,7 @@ function showResult({ result, status, screen, files: outputs }) {
     const shown = rows.filter(([name]) => name === quantity).map(([, ...row]) => row);
     parts.push(table(`RMS ${quantity} error`, ["judged on", "before", "after"], shown));
   }
-  if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings)));
+  if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings.map(spoken))));
   parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem)));
   parts.push(element("details", {}, element("summary", {}, "The same on the command line"),
     element("pre", { tabIndex: 0 }, `${result.command} -o ${outputName(outputs)}`), element("pre", { tabIndex: 0 }, screen)));
@@ -335,9 +347,11 @@ const outputName = outputs => outputs.find(({ name }) => name.endsWith(".urdf"))
 function remedies(reasons) {
   const keys = [...reasons.join(" ").matchAll(/--mend (\S+?)[.,;)]?(?=\s|$)/g)].map(match => match[1]).filter(key => !mends.includes(key));
   const out = element("div", { className: "buttons" });
-  if (keys.length) {
-    const apply = element("button", { type: "button", className: "primary" }, "Apply the change and calibrate again");
-    apply.onclick = () => { mends.push(...keys); showMends(); calibrate(); };
+  // Several keys are alternatives.
+  for (const key of keys) {
+    const text = keys.length > 1 ? `Apply ${key} and calibrate again` : "Apply the change and calibrate again";
+    const apply = element("button", { type: "button", className: "primary" }, text);
+    apply.onclick = () => { mends.push(key); showMends(); calibrate(); };
     out.append(apply);
   }
   const force = element("button", { type: "button" }, "Write the robot all the same");

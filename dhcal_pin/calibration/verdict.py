@@ -309,9 +309,10 @@ def _plausible_cause(fit: Evidence) -> str:
         return "Each file fits this robot by itself: base or tool differ between the files."
     if fit.input_warnings:
         return f"{fit.input_warnings[0]}."
+    tried = "No single mistake that is tried explains it, and no pair. " * fit.diagnosis.is_suspicious
     return (
-        "Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation of "
-        "rotations."
+        f"{tried}Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation "
+        "of rotations."
     )
 
 

@@ -132,6 +132,7 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
 
     from ..io.camera_files import camera_files
     from ..io.robot import urdf_files
+    from ..report.provenance import file_digests
     from ..robot import urdf_edit
 
     chain, has_world, camera_frame = fit.chain, options["world_joint"], options["camera_frame"]
@@ -163,6 +164,7 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
         fit.measured_region,
         edit,
         fit.rig,
+        list(file_digests(options["data"]).values()),
     )
     if options["camera_files"]:
         data = contents[output]

@@ -78,6 +78,10 @@ NO_CORRECTIONS = (
     "--extend"
 )
 
+# Largest number of rows of a file that are used. The standard deviations of parameters are then far below all
+# other errors; a calibration takes about 15 s and 0.6 GB.
+MAX_FILE_ROWS = 200_000
+
 # More parameters are suggested if they reduce the error at least to this fraction.
 MAX_ERROR_RATIO = 0.8
 
@@ -258,6 +262,7 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
             rig=rig,
             servos=servos,
             sheet=job.sheet,
+            max_rows=MAX_FILE_ROWS,
         )
         if not job.mend:
             require_joint_units(chain, read)

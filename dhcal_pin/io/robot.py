@@ -321,6 +321,7 @@ def urdf_files(
     measured_region: MeasuredRegion | None = None,
     edit: Callable[[bytes], bytes] = lambda data: data,
     rig: MountedRig | None = None,
+    fitted: Sequence[str] = (),
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
@@ -369,7 +370,16 @@ def urdf_files(
     # The sidecar of an MJCF belongs to its translation.
     hashed = urdf.data if isinstance(urdf, Mjcf) else data
     sidecar = sidecar_text(
-        chain, tool, hashed, instrument, uncertainty, measured_region, rig, additions, required=is_replaced
+        chain,
+        tool,
+        hashed,
+        instrument,
+        uncertainty,
+        measured_region,
+        rig,
+        additions,
+        fitted,
+        required=is_replaced,
     )
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar

@@ -63,6 +63,7 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     [manifest]
     urdf_sha256 = "..."                # hash of the URDF that this file was written with
     joints_sha256 = "..."              # hash of its joints from the root to the tip
+    fitted_sha256 = ["..."]            # hashes of the measurement files that were fitted
 
     [measured]                         # `measurements.MeasuredRegion`
     joints = ["elbow_joint"]
@@ -123,7 +124,7 @@ from ..robot.urdf import Urdf, parse_urdf, suggest_names
 from ..saving import complete_interrupted_save
 from . import toml_table as toml
 from .rig_file import rig_content
-from .tabular import MAX_SIDECAR_BYTES
+from .tabular import MAX_SIDECAR_BYTES, read_toml
 from .toml_table import Key, TomlTable
 
 # Heaviest payload [kg] and farthest centre [m]; beyond them the unit is wrong.
@@ -160,7 +161,11 @@ _PAYLOAD_KEYS = {
     "mass_kg": toml.number(above=0, at_most=MAX_PAYLOAD_KG),
     "centre_m": toml.vector(3, MAX_PAYLOAD_DISTANCE_M, default=(0.0, 0.0, 0.0)),
 }
-_MANIFEST_KEYS = {"urdf_sha256": toml.text(), "joints_sha256": toml.text(default="")}
+_MANIFEST_KEYS = {
+    "urdf_sha256": toml.text(),
+    "joints_sha256": toml.text(default=""),
+    "fitted_sha256": replace(_NAMES, default=()),
+}
 # Keys of the families of joint errors.
 _GAIN, _HARMONICS, _COUPLING = (FAMILIES[name].sidecar_key for name in (GAIN, HARMONICS, COUPLING))
 _JOINT_TERM_KEYS = [FAMILIES[name].sidecar_key for name in JOINT_TERMS]
@@ -351,6 +356,12 @@ def _with_additions(chain: Chain, additions: Mapping[str, Array], where: str) ->
     return chain.with_added_origins(additions)
 
 
+def read_fitted_digests(path: PathLike) -> frozenset[str]:
+    """Read the SHA-256 of the measurement files that the calibration of a sidecar fitted."""
+    manifest = read_toml(path, MAX_SIDECAR_BYTES).get("manifest", {})
+    return frozenset(manifest.get("fitted_sha256", ()))
+
+
 def read_tool(path: PathLike) -> Array:
     """Read the pose of a tool."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)
@@ -375,10 +386,11 @@ def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str
         )
 
 
-def _manifest_content(data: bytes, tip: str) -> dict[str, str]:
+def _manifest_content(data: bytes, tip: str, fitted: Sequence[str]) -> dict[str, Any]:
     """Return the table [manifest] for a URDF that is written with the sidecar."""
     urdf = parse_urdf(data, "")
-    return {"urdf_sha256": hashlib.sha256(data).hexdigest(), "joints_sha256": _joints_digest(urdf, tip)}
+    content = {"urdf_sha256": hashlib.sha256(data).hexdigest(), "joints_sha256": _joints_digest(urdf, tip)}
+    return content | ({"fitted_sha256": list(fitted)} if fitted else {})
 
 
 def _joints_digest(urdf: Urdf, tip: str) -> str:
@@ -665,6 +677,7 @@ def sidecar_text(
     measured_region: MeasuredRegion | None = None,
     rig: MountedRig | None = None,
     additions: Mapping[str, Array] | None = None,
+    fitted: Sequence[str] = (),
     *,
     required: bool = False,
 ) -> str | None:
@@ -690,7 +703,7 @@ def sidecar_text(
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
     header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
-    content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip), **tables}
+    content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip, fitted), **tables}
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
     return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", _toml_text(content))
 

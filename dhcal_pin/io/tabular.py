@@ -20,7 +20,9 @@ from ..messages import escape_control_characters, quote
 _RESERVED_CHARACTERS = frozenset(",;[]#\"'")
 # First characters of a cell that spreadsheets execute as a formula.
 _FORMULA_STARTS = ("=", "+", "-", "@")
-# Largest text file, largest TOML file that a user writes, and largest sidecar [byte]. The uncertainty of the
+# Largest table; a million rows have about 200 MiB.
+MAX_TABLE_BYTES = 256 << 20
+# Largest other text file, TOML file that a user writes, and sidecar [byte]. The uncertainty of the
 # correction curves of 11 joints takes 21 MiB, that of the geometry of 64 joints 8 MiB.
 MAX_TEXT_BYTES, MAX_TOML_BYTES, MAX_SIDECAR_BYTES = 64 << 20, 1 << 20, 24 << 20
 # Text that encodes an array in base64, which is read fast; the parser takes 20 s for 24 MiB of other content.

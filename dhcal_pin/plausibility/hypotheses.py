@@ -33,6 +33,8 @@ QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
 JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
+# Sign between the keys of two mistakes.
+_AND = "+"
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Largest lag [rows or s] and change of a scale that can be undone.
@@ -234,6 +236,55 @@ class RotationUnit:
         return _with_rotations(item, lambda _: se3.exp3(ANGLES["deg"] * vectors))
 
 
+# Notations of a rotation by three numbers a, b, c.
+NOTATIONS: dict[str, str] = {
+    "rotvec": "rotation vectors",
+    "xyz": "Euler angles X, Y', Z''",
+    "zyx": "Euler angles Z, Y', X''",
+    "rpy": "roll, pitch and yaw about fixed axes",
+}
+
+
+@dataclass(frozen=True)
+class OtherNotation:
+    """Rotations by three numbers of one notation that were read in another one."""
+
+    read: str  # Keys of `NOTATIONS`
+    true: str
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the poses with the rotations of the true notation."""
+        return _with_rotations(
+            item, lambda rotations: _numbers_to_matrix(_matrix_to_numbers(rotations, self.read), self.true)
+        )
+
+
+def _numbers_to_matrix(numbers: Array, notation: str) -> Array:
+    """Convert three numbers of a notation, (m, 3), to rotations (m, 3, 3)."""
+    if notation == "rotvec":
+        return se3.exp3(numbers)
+    x, y, z = (se3.exp3(numbers[:, [i]] * np.eye(3)["xyz".index(axis)]) for i, axis in _columns(notation))
+    return x @ y @ z if notation == "xyz" else z @ y @ x
+
+
+def _matrix_to_numbers(rotations: Array, notation: str) -> Array:
+    """Convert rotations (m, 3, 3) to three numbers of a notation, (m, 3)."""
+    if notation == "rotvec":
+        return se3.log3(rotations)
+    r = np.swapaxes(rotations, 1, 2) if notation == "xyz" else rotations
+    # Angles of r = Rz·Ry·Rx; the transposed matrix has the other order and the other signs.
+    y = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 0, 0], r[:, 1, 0]))
+    angles = {"x": np.arctan2(r[:, 2, 1], r[:, 2, 2]), "y": y, "z": np.arctan2(r[:, 1, 0], r[:, 0, 0])}
+    sign = -1 if notation == "xyz" else 1
+    return sign * np.stack([angles[axis] for axis in ("zyx" if notation == "zyx" else "xyz")], -1)
+
+
+def _columns(notation: str) -> list[tuple[int, str]]:
+    """Return the column of the angle about each axis, in the order x, y, z."""
+    order = "zyx" if notation == "zyx" else "xyz"
+    return [(order.index(axis), axis) for axis in "xyz"]
+
+
 def _with_positions(item: Measurement, positions: Array) -> Measurement:
     """Return measurements with other positions, (m, 3) [m]."""
     if isinstance(item, PoseMeasurement):
@@ -284,6 +335,9 @@ class Hypothesis:
 
     def log_jacobian(self, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""
+        if isinstance(self.change, BothChanges):
+            first, second = self.change.first, self.change.second
+            return first.log_jacobian(data) + second.log_jacobian(first.apply(data) or data)
         if not isinstance(self.change, LengthChange):
             return 0.0
         n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
@@ -296,6 +350,29 @@ def _count_lengths(item: Measurement) -> int:
     if item.is_contact:
         return 0
     return 3 * len(item.rows) if isinstance(item, PoseMeasurement) else item.residual_dim * len(item.rows)
+
+
+@dataclass(frozen=True)
+class BothChanges:
+    """Two changes, one after the other."""
+
+    first: Hypothesis
+    second: Hypothesis
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements after both changes; None if neither applies."""
+        changed = self.first.change.apply(item)
+        both = self.second.change.apply(item if changed is None else changed)
+        return changed if both is None else both
+
+
+def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
+    """Return the hypothesis that two mistakes were made; the changes are undone in this order."""
+    return Hypothesis(
+        f"{first.key}{_AND}{second.key}",
+        f"{first.description}, and {second.description}",
+        BothChanges(first, second),
+    )
 
 
 def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
@@ -319,11 +396,14 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
-    """Undo a mistake in measurements, such as the wrong sign of a joint."""
+    """Undo a mistake in measurements, such as the wrong sign of a joint, or several with + between them."""
     change = _change_of_size(key)
     if change is None:
         by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
         if key not in by_key:
+            ends = [at.start() for at in re.finditer(re.escape(_AND), key) if key[: at.start()] in by_key]
+            if ends:
+                return mend(chain, mend(chain, data, key[: ends[0]]), key[ends[0] + len(_AND) :])
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
             raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
         change = by_key[key].change
@@ -428,6 +508,9 @@ def _pose_hypotheses() -> Iterator[Hypothesis]:
     for order in QUATERNION_ORDERS:
         text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
         yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
+    for read, true in permutations(NOTATIONS, 2):
+        text = f"the rotations are {NOTATIONS[true]}, but were read as {NOTATIONS[read]}"
+        yield Hypothesis(f"rotations:{true}-not-{read}", text, OtherNotation(read, true))
 
 
 def _axis_hypothesis(

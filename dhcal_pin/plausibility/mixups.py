@@ -4,14 +4,18 @@ First, the evidence of the measurements as they were read is computed. If they f
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
 the same way. A hypothesis is left out if it moves the nominal robot much farther from the measured positions
 than it is from them as they were read: undoing a mistake takes its error away and adds none. A hypothesis is
-decisive if its evidence exceeds that of the file by the factor exp(15). Several hypotheses can describe the
-same change of the data, such as the sign of a joint and the zeros of two others; all of them are reported.
+decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed
+samples as it fits ordinary measurements. If none does, and no robot fits the file, each of the best ones is
+combined with a second one. Several hypotheses can describe the same change of the data, such as the sign of
+a joint and the zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations, starmap
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +24,7 @@ from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .evidence import MANUFACTURED, Evidence, fit_evidence
-from .hypotheses import Hypothesis, RowShift, list_hypotheses
+from .hypotheses import BothChanges, Hypothesis, JointChange, RowShift, both, list_hypotheses
 
 # Evidence of too few measurements: nothing is known about them.
 NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
@@ -33,6 +37,8 @@ _MIN_LOG_RATIO = 15.0
 _MIN_NAMED_RATIO = 2.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
+# Number of hypotheses that are tried as the first of two mistakes, and of pairs in joint columns.
+_N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
 # Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
@@ -144,19 +150,74 @@ def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis
     before = fit_evidence(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before)
-    scored: list[tuple[Hypothesis, Evidence, float]] = []
+    listed = list(list_hypotheses(chain, samples))
+    scored = _score(chain, samples, neighbourhood, listed, sets)
+    if found := _decisive(before, scored):
+        return found
+    if leaves_residuals(before):
+        first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
+        trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
+        for each in first[:_N_FIRST_OF_PAIR]:
+            trials.append([both(each.hypothesis, second) for second in listed if second != each.hypothesis])
+        for pairs in trials:
+            if found := _decisive(before, _score(chain, samples, neighbourhood, pairs, sets)):
+                return found
+    return Diagnosis(before)
+
+
+def _closest_pairs(
+    chain: Chain,
+    samples: Sequence[Measurement],
+    neighbourhood: Sequence[Measurement],
+    hypotheses: Sequence[Hypothesis],
+) -> list[Hypothesis]:
+    """Return the pairs of mistakes in joint columns that move the nominal robot nearest to the positions."""
+    if not nominal_distance(chain, samples):
+        return []  # there are no positions, or too few
+    of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
+    found = []
+    for pair in starmap(both, permutations(of_joints, 2)):
+        changed = _apply(pair, samples, neighbourhood)
+        if changed is not None:
+            found.append((nominal_distance(chain, changed), pair))
+    return [pair for _, pair in sorted(found, key=lambda each: each[0])[:_N_CLOSEST_PAIRS]]
+
+
+class _Scored(NamedTuple):
+    """Evidence of samples after the change of a hypothesis."""
+
+    hypothesis: Hypothesis
+    after: Evidence
+    log: float  # Logarithm of the evidence, comparable with that of the samples as they were read
+
+
+def _score(
+    chain: Chain,
+    samples: Sequence[Measurement],
+    neighbourhood: Sequence[Measurement],
+    hypotheses: Sequence[Hypothesis],
+    sets: str,
+) -> list[_Scored]:
+    """Compute the evidence of the hypotheses that apply and add no error to the nominal robot."""
+    scored = []
     largest = _MAX_DISTANCE_GROWTH * nominal_distance(chain, samples)
-    for hypothesis in list_hypotheses(chain, samples):
+    for hypothesis in hypotheses:
         changed = _apply(hypothesis, samples, neighbourhood)
         if changed is not None and nominal_distance(chain, changed) <= largest:
             after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
-            scored.append((hypothesis, after, log))
-    best = max((log for _, _, log in scored), default=-np.inf)
-    if best - before.log < _MIN_LOG_RATIO:
-        return Diagnosis(before)
-    ties = [(hypothesis, after) for hypothesis, after, log in scored if log >= best - _MAX_LOG_TIE]
-    return Diagnosis(before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
+            scored.append(_Scored(hypothesis, after, log))
+    return scored
+
+
+def _decisive(before: Evidence, scored: Sequence[_Scored]) -> Diagnosis | None:
+    """Return the diagnosis of the best hypotheses if a robot fits the samples after their change."""
+    best = max((each.log for each in scored), default=-np.inf)
+    ties = [each for each in scored if each.log >= best - _MAX_LOG_TIE]
+    ties = [each for each in ties if not leaves_residuals(each.after)]
+    if best - before.log < _MIN_LOG_RATIO or not ties:
+        return None
+    return Diagnosis(before, tuple(each.hypothesis for each in ties), ties[0].after)
 
 
 def is_suspicious(evidence: Evidence) -> bool:
@@ -208,7 +269,9 @@ def _apply(
     hypothesis: Hypothesis, samples: Sequence[Measurement], neighbourhood: Sequence[Measurement]
 ) -> list[Measurement] | None:
     """Apply a hypothesis to the samples; None if it does not apply to most of them."""
-    if not isinstance(hypothesis.change, RowShift):
+    changes = hypothesis.change
+    steps = (changes.first, changes.second) if isinstance(changes, BothChanges) else (hypothesis,)
+    if not any(isinstance(step.change, RowShift) for step in steps):
         return hypothesis.apply(samples)
     shifted = hypothesis.apply(neighbourhood)
     if shifted is None:

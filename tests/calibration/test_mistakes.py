@@ -15,6 +15,8 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 from dhcal_pin.measurements.pose import PoseMeasurement
+from dhcal_pin.plausibility.hypotheses import mend
+from dhcal_pin.plausibility.mixups import diagnose_mixups
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.chain import joint_frame
 from dhcal_pin.robot.sampling import limits_with_margin
@@ -264,3 +266,35 @@ def test_honest_measurements_are_accepted():
 @pytest.mark.slow
 def test_many_honest_measurements_are_accepted():
     check_honest(range(424), 0.03)
+
+
+def judge_pair(seed: int) -> str:
+    """Return "named" if undoing what is named, at most twice, mends two random mistakes."""
+    rng = np.random.default_rng([seed, 77])
+    chain = arm(ARMS[seed % len(ARMS)])
+    names = rng.choice([name for name, mistake in MISTAKES.items() if mistake.key], 2, replace=False)
+    made = [MISTAKES[name] for name in names]
+    kind = Pose if Pose in [mistake.kind for mistake in made] else Position
+    true = with_errors(chain, 2e-3, np.deg2rad(0.3), rng)
+    data = kind.simulate(true, configurations(chain, int(rng.integers(40, 100)), rng), NOISE, rng)
+    for mistake in made:
+        data = mistake.apply(data)
+    found, keys = diagnose_mixups(chain, [data]), []
+    while found.hypotheses and len(keys) < 2:
+        keys.append(found.hypotheses[0].key)
+        data = mend(chain, data, keys[-1])
+        found = diagnose_mixups(chain, [data])
+    outcome = "false" if keys else "not named"
+    return "named" if keys and not found.is_suspicious else f"{outcome}: {seed}: {', '.join(names)}: {keys}"
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_two_mistakes_are_named(seed):
+    assert judge_pair(seed) == "named"
+
+
+@pytest.mark.slow
+def test_two_random_mistakes_are_named_or_none_is():
+    outcomes = [judge_pair(seed) for seed in range(200, 300)]
+    assert not [outcome for outcome in outcomes if outcome.startswith("false")]
+    assert outcomes.count("named") >= 0.8 * len(outcomes), outcomes

@@ -62,7 +62,8 @@ VALUES = {
 ARGUMENTS = (
     "calibrate arm.urdf a.csv b.csv -o out.urdf --tip tool0 --root link0 --package-dir meshes "
     "--package-dir more --columns map.toml --sheet Data --rig rig.toml --servos servos.toml "
-    "--skip-bad-rows --mend sign:a --mend rows:above --parameters dh --arm low-cost --turned none --extend gain --fix d2 --free "
+    "--skip-bad-rows --mend sign:a --mend rows:above --parameters dh --arm low-cost --turned none "
+    "--extend gain --fix d2 --free "
     "d3 --holdout 0.3 --session off --unordered --method gn "
     "--loss tukey "
     "--priors none --bounds bounds.toml --instrument known.toml --payload 5kg --max-iterations 7 --seed 3 "

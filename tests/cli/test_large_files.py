@@ -23,7 +23,7 @@ def repeated(path: str, begin: str, line: str, end: str = "") -> None:
     Path(path).write_text(begin + line * count + end)
 
 
-def assert_small(*words: str) -> str:
+def assert_small(*words: str, seconds: float = MAX_SECONDS, size: int = MAX_BYTES) -> str:
     """Assert that a command is quick and needs little memory; return what it says."""
     with open("said", "w") as said:
         process = subprocess.Popen(
@@ -35,9 +35,9 @@ def assert_small(*words: str) -> str:
     assert process.returncode in (0, 2), text
     assert process.returncode == 0 or text.count("\n") == 1, text
     assert "Traceback" not in text
-    assert usage.ru_utime + usage.ru_stime < MAX_SECONDS
+    assert usage.ru_utime + usage.ru_stime < seconds
     # Linux counts KiB, macOS bytes.
-    assert usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) < MAX_BYTES
+    assert usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) < size
     return text
 
 
@@ -71,6 +71,21 @@ def test_large_files_are_refused(robot_folder, name):
     Path("arm.study.toml").write_text('seeds = 2\n[settings]\nrobot = "arm.dh.toml"\nposes = 8\n')
     repeated(name, begin, line)
     assert name in assert_small(*words)
+
+
+@pytest.mark.slow
+def test_a_million_rows_are_calibrated(run, robot_folder):
+    """In the working folder of `robot_folder`, whose arm is `arm.urdf`."""
+    assert (
+        run("simulate", "arm.urdf", "-n", "1000", "--kind", "position", "--sigma", "0.1mm", "-o", "few.csv")[
+            0
+        ]
+        == 0
+    )
+    comment, header, *rows = Path("few.csv").read_text().splitlines()
+    Path("data.csv").write_text("\n".join([comment, header, *rows * 1000]))
+    text = assert_small(*CALIBRATE, "--extend", "none", seconds=30, size=1_500_000_000)
+    assert "row 1 of every 5 is used" in text
 
 
 def test_touched_points_with_a_robust_loss_take_seconds(robot_folder):

@@ -150,3 +150,17 @@ def test_a_robot_without_a_measured_region_has_none(run, robot_folder):
     assert document["measured_region"] is None
     assert document["holdout_region_after"] is None
     assert document["cross_validated_after"] is None
+
+
+def test_a_file_that_was_fitted_is_named(run, robot_folder):
+    assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf")[0] in (0, 3)
+    assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", "--force")[0] == 0
+    Path("other.csv").write_text(Path("data.csv").read_text() + "\n")
+    warned = {
+        name: any(
+            "was fitted" in text
+            for text in parse_json(run("validate", "out.urdf", name, "--json", "-")[1])["warnings"]
+        )
+        for name in ("data.csv", "other.csv")
+    }
+    assert warned == {"data.csv": True, "other.csv": False}

@@ -330,6 +330,25 @@ def test_the_page_is_accessible_and_fits(browser, path, checked):
     page.close()
 
 
+def test_sections_are_folded_on_a_small_screen(open_page):
+    page = open_page(viewport={"width": 390, "height": 800})
+    sections = page.locator("main > section[id]:not(#samples)")
+    assert sections.count() > 5
+    assert all("folded" in (section.get_attribute("class") or "") for section in sections.all())
+    height = page.evaluate("document.documentElement.scrollHeight")
+    button = page.locator("#parameters h2 button")
+    assert button.get_attribute("aria-expanded") == "false"
+    button.click()
+    assert page.locator("#parameters table").first.is_visible()
+    assert button.get_attribute("aria-expanded") == "true"
+    assert page.evaluate("document.documentElement.scrollHeight") > height
+    page.locator(".contents a").last.click()
+    assert page.locator("main > section.folded").count() <= sections.count() - 1
+    page.emulate_media(media="print")
+    assert all(heading.is_visible() for heading in page.locator("main table").all()[:3])
+    page.close()
+
+
 def test_every_section_is_printed(open_page):
     page = open_page(viewport={"width": 700, "height": 900})
     headings = page.locator("main h2").all_inner_texts()

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from ...report.validation import Validation
     from ...robot import Chain
 
+# Warning about a file that the calibration fitted.
+FITTED_WARNING = (
+    "was fitted, all of it or a part, by the calibration of this robot; other measurements have larger errors"
+)
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
 
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
@@ -158,7 +162,7 @@ def run(args: Namespace) -> int:
     if args.iso9283:
         points = [file.iso_points for file in given.files]
         characteristics = pose_characteristics(judged.chain, data, points, judged.known)
-    warnings = _input_warnings(args, given, judged)
+    warnings = _input_warnings(args, given, judged, sidecar)
     notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
     extrapolation = given.region and find_extrapolation(given.region, judged.chain, data, judged.known)
     report = Validation(
@@ -352,18 +356,25 @@ def _nominal_accuracy(
     return fit.comparisons[-1].after, (fit.chain, {**known, **fit.instruments}), [note]
 
 
-def _input_warnings(args: Namespace, given: Given, judged: Judged) -> dict[str, list[str]]:
+def _input_warnings(
+    args: Namespace, given: Given, judged: Judged, sidecar: str | None
+) -> dict[str, list[str]]:
     """List the warnings about each file, rows that the robot cannot reach included; no row is excluded."""
     from ...diagnostics import FRAMES_WARNING, frames_differ  # lazy import, as the following
     from ...diagnostics.input_checks import find_input_warnings
     from ...diagnostics.reachability import find_unreachable_rows
+    from ...io.sidecar import read_fitted_digests
+    from ...report.provenance import file_digests
 
+    fitted = read_fitted_digests(sidecar) if sidecar else ()
+    digests = file_digests(args.data)
     warnings = {}
     for file in given.files:
         unreachable = [] if args.fit_frames else find_unreachable_rows(judged.chain, file)
         warnings[file.source] = [
             *find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
+            *([FITTED_WARNING] if digests.get(file.source) in fitted else []),
         ]
     if not args.fit_frames and frames_differ(judged.chain, given.data, judged.known):
         warnings[args.robot] = [FRAMES_WARNING]

@@ -101,6 +101,10 @@ def _is_axis(header: str, axis: str) -> bool:
     return bool(re.search(rf"(?<![a-z]){axis}(?![a-z])", header)) and not re.search(_NOT_MEASURED, header)
 
 
+# Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes.
+_EULER_NOTATIONS = {("a", "b", "c"): ("ZYX", "intrinsic"), ("roll", "pitch", "yaw"): ("XYZ", "extrinsic")}
+
+
 def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int, Array]) -> list[str]:
     """Return the line of the rotation, if columns for one follow the position."""
     if table.has_numbers_as_header:
@@ -119,8 +123,10 @@ def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int,
     names = _names(table, candidates[:3])
     if unit == "rad":
         return [f'rotation = {{convention = "rotvec", columns = {names}, unit = "rad"}}']
+    headers = tuple(re.split(r"[\s\[(]", table.headers[i].strip().lower())[0] for i in candidates[:3])
+    axes, frame = _EULER_NOTATIONS.get(headers, ("XYZ", "intrinsic"))
     return [
-        f'rotation = {{convention = "euler", axes = "XYZ", frame = "intrinsic", columns = {names}, '
+        f'rotation = {{convention = "euler", axes = "{axes}", frame = "{frame}", columns = {names}, '
         f'unit = "deg"}}'
     ]
 

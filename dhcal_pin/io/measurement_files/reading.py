@@ -127,10 +127,15 @@ def read_measurement_file(
     rig: MountedRig | None = None,
     servos: ServoFile | None = None,
     sheet: str = "",
+    max_rows: int | None = None,
 ) -> MeasurementFile:
-    """Read a measurement file with its division into fitted and held-out samples."""
+    """Read a measurement file with its division into fitted and held-out samples.
+
+    Of a file with more than `max_rows` rows, every second, third, ... row is used.
+    """
     check_joint_names(chain)
     table = open_measurement_table(source, chain, columns, servos, sheet)
+    table = table.thinned(max_rows) if max_rows else table
     return parse_measurements(table, chain, skip_bad_rows, rig)
 
 

@@ -28,8 +28,8 @@ from ...messages import quote
 from ...units import MAX_SI_VALUE, UNITS
 from ..tabular import parse_number
 
-# Largest number of rows of a table. With more of them a calibration takes more than 20 s and 1 GB.
-MAX_ROWS = 200_000
+# Largest number of rows of a table; reading them takes about 10 s and 1 GB.
+MAX_ROWS = 1_000_000
 # Units that a row under the header may have.
 _KNOWN_UNITS = frozenset(unit for units in UNITS.values() for unit in units)
 # Largest number of lines, or of runs of lines, that a message lists.
@@ -194,6 +194,20 @@ class DataTable:
         problem = f"{quote(text)} is not a finite number{signs}" if text else "is empty"
         return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
 
+    def thinned(self, max_rows: int) -> DataTable:
+        """Return a table with at most a number of rows, evenly spaced, and a note if some are left out."""
+        step = -(-len(self.lines) // max_rows)
+        if step < 2:
+            return self
+        note = f"row 1 of every {step} is used, as more than {max_rows} rows do not improve a calibration"
+        return replace(
+            self,
+            cells=self.cells[::step],
+            lines=self.lines[::step],
+            numbers={index: column[::step] for index, column in self.numbers.items()},
+            notes=(*self.notes, note),
+        )
+
     # --------------------------------------------------------------------------------------- bad rows
     def without_bad_rows(self, numbers: Iterable[int], texts: Iterable[int] = ()) -> DataTable:
         """Move the rows with a missing value to `bad_rows`."""
@@ -272,6 +286,9 @@ class _ColumnRows(Sequence[list[str]]):
         return self._count
 
     def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            columns = [column[index] for column in self._columns]
+            return _ColumnRows(columns, len(range(self._count)[index]))
         if not -self._count <= index < self._count:
             raise IndexError(index)
         return [

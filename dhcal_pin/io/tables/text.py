@@ -25,7 +25,7 @@ import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
-from ..tabular import parse_number, read_text
+from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
 from .table import DataTable, require_few_rows, units_under_header
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
@@ -63,7 +63,7 @@ DETECTED = TextLayout()
 
 def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
     """Read a table from a text file."""
-    source, text = os.fspath(path), read_text(path, layout.encoding)
+    source, text = os.fspath(path), read_text(path, layout.encoding, MAX_TABLE_BYTES)
     # One of the lines is the header.
     require_few_rows(source, text.count("\n") - 1)
     lines = text.splitlines()
@@ -140,6 +140,8 @@ class _TextRows(Sequence[list[str]]):
         return len(self._rows)
 
     def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return _TextRows(self._rows[index], self._split)
         return self._split(self._rows[int(index)])
 
 

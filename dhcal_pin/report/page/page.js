@@ -14,6 +14,23 @@ function followContents() {
   for (const id of links.keys()) observer.observe(document.getElementById(id));
 }
 
+/** On a small screen, hides the content of all sections until their heading is pressed or a link leads there. */
+function foldSections() {
+  if (!matchMedia("(max-width: 640px)").matches) return;
+  for (const section of document.querySelectorAll("main > section[id]:not(#samples)")) {
+    const title = section.querySelector("h2"), button = element("button", { type: "button", className: "fold" }, ...title.childNodes);
+    const fold = isFolded => {
+      section.classList.toggle("folded", isFolded);
+      button.setAttribute("aria-expanded", String(!isFolded));
+      if (!isFolded) dispatchEvent(new Event("resize")); // plots of hidden sections have no width
+    };
+    title.append(button);
+    button.addEventListener("click", () => fold(!section.classList.contains("folded")));
+    document.querySelector(`.contents a[href="#${section.id}"]`)?.addEventListener("click", () => fold(false));
+    fold(location.hash.slice(1) !== section.id);
+  }
+}
+
 function choice(type, name, text, isChecked, change, color) {
   const input = element("input", { type, name, checked: isChecked });
   input.addEventListener("change", () => change(input.checked));
@@ -119,6 +136,7 @@ function showSelection(selection, table, scene) {
 }
 
 followContents();
+foldSections();
 for (const table of document.querySelectorAll(".scroll > table")) if (!table.closest("#samples")) enhanceTable(table);
 const source = document.getElementById("samples-data");
 if (source) {

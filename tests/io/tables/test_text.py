@@ -80,6 +80,16 @@ def test_units_of_two_places_must_agree(tmp_path):
         _ = read_table(write(tmp_path, "a.csv", "q[deg],x[mm]\ndeg,m\n1,2\n")).columns
 
 
+def test_a_thinned_table_has_every_second_row(tmp_path):
+    text = "a,b,c\n" + "".join(f"{i},{2 * i},w{i}\n" for i in range(7))
+    table = read_table(write(tmp_path, "a.csv", text))
+    assert table.thinned(7) is table
+    few = table.thinned(4)
+    assert (few.values(1).tolist(), few.lines) == ([0, 4, 8, 12], [2, 4, 6, 8])
+    assert few.text(few.columns["c"]) == ["w0", "w2", "w4", "w6"]
+    assert few.notes == ("row 1 of every 2 is used, as more than 4 rows do not improve a calibration",)
+
+
 @pytest.mark.parametrize("row", ["deg,1", "furlong,fathom", "deg,mm\ndeg,mm"])
 def test_other_rows_are_not_units(tmp_path, row):
     table = read_table(write(tmp_path, "a.csv", f"q,x\n{row}\n1,2\n"))
