@@ -205,6 +205,17 @@ def check_05_21(n: Any) -> None:
     assert np.allclose(n.again.poses(n.q_other), n.fit.chain.poses(n.q_other), atol=1e-9)
 
 
+def check_06_13(n: Any) -> None:
+    assert n.fit.signs.turned == ("elbow_flex",)
+    assert n.fit.verdict.status == "ok"
+
+
+def check_06_17(n: Any) -> None:
+    nominal, calibrated = (np.sqrt(np.mean(each**2)) for each in (n.nominal, n.calibrated))
+    assert calibrated < 0.2 * nominal
+    assert calibrated < 6
+
+
 CHECKS: dict[str, Callable[[Any], None]] = {
     name.removeprefix("check_").replace("_", "-"): value
     for name, value in list(globals().items())

@@ -156,7 +156,9 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, has_play: boo
     share = 1.0 if is_complete else rows_per_displacement(fit.without_rejected().data)
     models = [(fit, share)]
     if not is_complete:
-        models = [(fit_with_corner_noise(fit, max_iterations), share), (shared, 1.0)]
+        models = [(shared, 1.0)]
+        if not has_play:
+            models.insert(0, (fit_with_corner_noise(fit, max_iterations), share))
     trials = [
         _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
         for model, factor in models

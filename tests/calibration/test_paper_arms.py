@@ -1,0 +1,75 @@
+"""Servo arms that are calibrated from photographs of a printed board: signs, accuracy, and its prediction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from paper_arms import PaperArm, photograph
+
+from dhcal_pin.calibration import Result, calibrate
+from dhcal_pin.calibration.cameras.gate import fit_with_jitter
+from dhcal_pin.calibration.reweighting import Fit
+from dhcal_pin.estimation.solver import minimize
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def informed_error(shot: PaperArm) -> float:
+    """Held-out error [m] of a fit that knows the signs and the sizes of all errors."""
+    known = calibrate(shot.nominal, shot.images, turned=",".join(shot.arm.wrong) or "none")
+    problem = known.problem
+    std = [
+        1.5e-3 if p.unit == "m" else np.deg2rad(15 if p.name.endswith("offset") else 1)
+        for p in problem.errors.parameters
+    ]
+    weights = np.concatenate([1 / np.array(std), [1 / p.prior for p in problem.instrument_parameters]])
+    data = tuple(item.with_jitter(np.zeros_like(item.jitter)) for item in known.data)
+    exact = replace(problem.with_data(data).with_prior_weights(weights), temperature=1.0)
+    fit = Fit(data, exact, known.solution, tuple(np.ones(len(item.rows)) for item in data))
+    fit = fit_with_jitter(fit, 30)[0]
+    x = minimize(fit.problem, x=fit.solution.x).x
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    return rms(shot.held_out_errors(chain, fit.problem.instruments(x)))
+
+
+def errors_of(shot: PaperArm, fit: Result) -> tuple[float, float]:
+    """Held-out errors before and after a calibration [m]."""
+    states = (fit.nominal_refitted, fit.nominal_instruments), (fit.chain, fit.instruments)
+    before, after = (rms(shot.held_out_errors(*state)) for state in states)
+    return before, after
+
+
+# Number of images, seeds, and largest geometric mean of the error relative to that of the informed fit.
+SERIES = [
+    (25, [2], 1.3),
+    pytest.param(25, range(50), 1.3, marks=pytest.mark.slow),
+    pytest.param(12, range(30), np.inf, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("n_images", "seeds", "max_ratio"), SERIES)
+def test_signs_are_right_and_the_arm_is_as_good_as_if_its_errors_were_known(n_images, seeds, max_ratio):
+    ratios, predictions = [], []
+    for seed in seeds:
+        shot = photograph(seed, n_images)
+        fit = calibrate(shot.nominal, shot.images)
+        assert fit.signs is not None
+        if set(fit.signs.turned) != set(shot.arm.wrong):
+            assert fit.verdict.status != "ok", seed
+            assert n_images < 25 or fit.signs.questions, seed
+            continue
+        before, after = errors_of(shot, fit)
+        assert after < before or fit.verdict.status != "ok", seed
+        if np.isfinite(max_ratio):
+            ratios.append(after / informed_error(shot))
+            inside = fit.generalization.cross_validated
+            assert inside is not None
+            # The prediction contains play and sag: they are in the left-out images, too.
+            predictions.append(inside.after.groups["board"].rms / after)
+    if ratios:
+        assert np.exp(np.mean(np.log(ratios))) < max_ratio
+        assert 0.5 < np.exp(np.mean(np.log(predictions))) < 2
