@@ -81,8 +81,8 @@ def _sheet(board: Board, size: tuple[float, float], paper: str) -> tuple[float, 
             return sheet
     room = (long - 2 * MARGIN, short - 2 * MARGIN - _STRIP)
     raise InvalidArgumentError(
-        f"{board.where}: {1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm does not fit on {paper}; expected up to "
-        f"{1e3 * room[0]:.0f} x {1e3 * room[1]:.0f} mm or {1e3 * (short - 2 * MARGIN):.0f} x "
+        f"{board.where}: {1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm does not fit on {paper}; expected up "
+        f"to {1e3 * room[0]:.0f} x {1e3 * room[1]:.0f} mm or {1e3 * (short - 2 * MARGIN):.0f} x "
         f"{1e3 * (long - 2 * MARGIN - _STRIP):.0f} mm"
     )
 

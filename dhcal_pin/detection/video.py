@@ -1,8 +1,8 @@
 """Stills of a video: one frame of each pause in which nothing moves.
 
 The change of a frame is the mean difference of the grey values of small pictures of it and of the frame
-before. Changes have two levels, noise and motion. A pause is a time of at least `MIN_PAUSE` without motion. Its
-still is the frame in the middle. A still that shows the same as the one before belongs to the same pause.
+before. Changes have two levels, noise and motion. A pause is a time of at least `MIN_PAUSE` without motion.
+Its still is the frame in the middle. A still that shows the same as the one before belongs to the same pause.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from .opencv import require_opencv, silent_opencv_log
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 # Width of the small pictures [px], and shortest pause [s].
 _WIDTH, MIN_PAUSE = 160, 0.4
-# A frame moves if its change exceeds this multiple of the noise, the 10 % quantile, but at least the first and
-# at most the second grey value.
+# A frame moves if its change exceeds this multiple of the noise, the 10 % quantile, but at least the first
+# and at most the second grey value.
 _NOISE_RATIO, _MIN_CHANGE, _MAX_CHANGE = 3.0, 0.3, 3.0
 # Stills that differ by less than this multiple of the limit show the same.
 _SAME_RATIO = 2.0

@@ -288,6 +288,10 @@ class Measurement(ABC):
         """Return the name of the photograph of each sample, (m,); empty texts without photographs."""
         return np.full(len(self.rows), "", object)
 
+    def tool_poses(self) -> Measurement:
+        """Return images as poses of the tool for some base and some tool; other kinds as they are."""
+        return self
+
     def solved_rig(self, values: Mapping[str, float]) -> MountedRig | None:
         """Return the rig with estimated poses, lenses and corners; None for kinds without a rig."""
         return None

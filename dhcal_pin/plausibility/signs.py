@@ -22,7 +22,6 @@ from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
-from ..measurements.camera import CameraCorners
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 from ..robot.urdf_edit import with_turned_joints
@@ -168,7 +167,7 @@ def first_errors(chain: Chain, data: Sequence[Measurement]) -> Mapping[str, floa
 
     A fit that starts at the nominal arm often ends in another minimum where zeros are wrong by 15°.
     """
-    samples = _samples(data) if all(isinstance(item, CameraCorners) for item in data) else []
+    samples = _samples(data) if all(item.rig is not None for item in data) else []
     return fit_evidence(chain, samples, HAND_BUILT).errors if samples else {}
 
 
@@ -177,9 +176,8 @@ def _samples(data: Sequence[Measurement]) -> list[Measurement]:
 
     Images show poses of the tool, one by one. Those of another camera have a base and a tool of their own.
     """
-    images = [item for item in data if isinstance(item, CameraCorners)]
-    if images and len(images) == len(data):
-        data = [max((item.tool_poses() for item in images), key=lambda item: len(item.rows))]
+    if data and all(item.rig is not None for item in data):
+        data = [max((item.tool_poses() for item in data), key=lambda item: len(item.rows))]
     samples = draw_samples(comparable_items(data))[0]
     return samples if has_enough_rows(samples) else []
 

@@ -20,8 +20,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--paper",
         metavar="SIZE",
         choices=("a4", "letter"),
-        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig file, "
-        "corrects the scale of the printer (default: a page of the size of the board)",
+        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig "
+        "file, corrects the scale of the printer (default: a page of the size of the board)",
     )
     parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
     parser.add_argument("--json", **JSON)
@@ -46,8 +46,8 @@ def run(args: Namespace) -> int:
     advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
     if args.paper:
         advice = (
-            "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length to "
-            f"[board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a flat plate."
+            "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length "
+            f"to [board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a plate."
         )
     console.show(Screen([files_block([args.output])]), args.verbosity)
     console.print_lines(advice)

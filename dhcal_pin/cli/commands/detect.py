@@ -26,7 +26,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "images",
         metavar="IMAGES",
         nargs="+",
-        help="image files, folders of images, or videos, of which one still is taken in each pause of the arm",
+        help="image files, folders of images, or videos: one still of each pause of the arm is used",
     )
     parser.add_argument(
         "--stills",
