@@ -28,6 +28,7 @@ extensions = [
     "sphinx_copybutton",
     "api_pages",
     "cli_pages",
+    "evidence_pages",
     "mathml",
     "plot_pictures",
     "schema_files",

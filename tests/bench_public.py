@@ -1,179 +1,155 @@
-"""Accuracy on public measurements of real robots: the table of the README and of the documentation.
+"""Leaderboard: accuracy of calibration programs on public measurements of real robots.
 
-    python tests/bench_public.py [--data DIR] [--alone]
+    python tests/bench_public.py [--data DIR] [--programs NAME,...] [--series TEXT] [--splits NAME,...]
 
-Each series is calibrated by `dhcal calibrate` with its defaults, once with a random half held out and once
-with the regions of joint space left out (`--holdout region`). "Nominal" is the error of the robot as
-designed, with base and tool fitted to the same samples. The folder DIR has the layout of shared/data beside
-the project. A series that is absent is left out.
+Each program calibrates the same rows of each series and is judged by the same other rows, see
+`public_series.py` for series and splits, `public_programs.py` for the programs. One JSON file per program is
+written into docs/evidence/leaderboard (`-o FOLDER`: elsewhere), after each split; the documentation makes its
+tables and figures from them. Two runs give equal files except for `seconds`. The folder DIR has the layout of
+shared/data beside the project. Series and splits that are absent or not chosen keep the entries that the JSON
+file has.
 
-figaroh and pybotics calibrate the same half and are judged by the same other half, where they can: both need
-poses or positions of a robot with revolute joints, figaroh also a URDF. `--alone` leaves them out. pybotics
-starts from the base and the tool that fit the nominal robot, because it does not find them.
+The error of a judged row is the distance of the measured position from that of the program, and the angle
+between their orientations; all rows count, outliers too. For contacts it is the distance from the mean of the
+positions that touch the same socket.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
-import tempfile
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import bench_rivals
-from robots import DATA, MAPS
+import numpy as np
+from public_programs import PROGRAMS, Answer, Program, Task, frames_between
+from public_series import SERIES, SPLITS, Series, cases
+from robots import DATA, ROOT
 
-from dhcal_pin.calibration import split
-from dhcal_pin.calibration.procedure import calibrate
-from dhcal_pin.io import read_robot
-from dhcal_pin.io.measurement_files import read_measurement_file
-from dhcal_pin.measurements.pose import Pose
-from dhcal_pin.robot.chain import extract_dh_table
+from dhcal_pin import se3
+from dhcal_pin._typing import Array
+from dhcal_pin.measurements import PointContact, Pose
 
-
-@dataclass(frozen=True)
-class Series:
-    """Public measurements of one robot.
-
-    Attributes:
-        arm: Name of the robot and of the series.
-        instrument: What measured it.
-        robot: Robot, relative to the folder of the data if it is a file.
-        files: Pattern of the measurement files.
-        options: Further options of `dhcal calibrate`.
-    """
-
-    arm: str
-    instrument: str
-    robot: str
-    files: str
-    options: tuple[str, ...] = ()
+FOLDER = ROOT / "docs" / "evidence" / "leaderboard"
 
 
-SERIES = (
-    Series(
-        "UR10, series B",
-        "laser tracker, pose",
-        "example:ur10",
-        "ipa_ur10/Series_B/measurements_joint_configurations.csv",
-        ("--tip", "tool0", "--columns", str(MAPS / "ipa_ur10.toml")),
-    ),
-    Series(
-        "UR10, series D",
-        "laser tracker, pose",
-        "example:ur10",
-        "ipa_ur10/Series_D/measurements_iso_cubes.csv",
-        ("--tip", "tool0", "--columns", str(MAPS / "ipa_ur10.toml")),
-    ),
-    Series(
-        "Franka Research 3",
-        "camera on the wrist, pose of the board",
-        "example:panda",
-        "fr3_d405/camera_in_board.csv",
-        ("--tip", "panda_link8"),
-    ),
-    Series(
-        "two-axis positioner",
-        "metrology camera, pose",
-        "positioner_2axis/positioner.dh.toml",
-        "positioner_2axis/measurements.csv",
-        ("--parameters", "minimal,base,tool"),
-    ),
-    Series(
-        "Franka Panda",
-        "sockets touched with a ball",
-        "mukca_panda/panda_with_ball.urdf",
-        "mukca_panda/panda_2_clean/*/hole_[01].csv",
-        ("--tip", "ball_link", "--columns", str(MAPS / "mukca_panda.toml"), "--parameters", "placement,tool"),
-    ),
-)
+def errors(
+    data: Pose | PointContact, poses: Array, *, fits_frames: bool = False
+) -> tuple[Array, Array | None]:
+    """Return the position errors [m] and the orientation errors [rad] of modelled poses, shape (k,) each."""
+    if not isinstance(data, Pose):
+        touched = data.label
+        counts = np.bincount(touched, minlength=len(data.names))
+        mean = np.zeros((len(counts), 3))
+        np.add.at(mean, touched, poses[:, :3, 3] / counts[touched, None])
+        return np.linalg.norm(poses[:, :3, 3] - mean[touched], axis=1)[counts[touched] > 1], None
+    if fits_frames:
+        base, tool = frames_between(poses, data.poses)
+        poses = base @ poses @ tool
+    position = np.linalg.norm(data.poses[:, :3, 3] - poses[:, :3, 3], axis=1)
+    turned = np.swapaxes(poses[:, :3, :3], 1, 2) @ data.poses[:, :3, :3]
+    return position, np.linalg.norm(se3.log3(turned), axis=1)
 
 
-def run_command(series: Series, data: Path, holdout: str) -> dict:
-    """Calibrate a robot by the command line.
-
-    Args:
-        series: Measurements of the robot.
-        data: Folder of all series.
-        holdout: Option `--holdout`.
-
-    Returns:
-        JSON document of the calibration.
-    """
-    robot = series.robot if series.robot.startswith("example:") else str(data / series.robot)
-    files = sorted(map(str, data.glob(series.files)))
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["calibrate", robot, *files, *series.options, "--holdout", holdout, "--force"]
-        words += ["-o", f"{folder}/out.urdf", "--json", f"{folder}/out.json"]
-        run = subprocess.run([sys.executable, "-m", "dhcal_pin.cli", *words], capture_output=True, text=True)
-        if run.returncode:
-            raise SystemExit(f"{series.arm}: {run.stderr}")
-        return json.loads(Path(folder, "out.json").read_text(encoding="utf-8"))
+def statistics(data: Pose | PointContact, poses: Array, has_orientation: bool, *, fits_frames: bool) -> dict:
+    """Return RMS and 95th percentile of the errors of modelled poses."""
+    position, orientation = errors(data, poses, fits_frames=fits_frames)
+    groups = {"position": (position, "m"), "orientation": (orientation if has_orientation else None, "rad")}
+    found = {}
+    for name, (values, unit) in groups.items():
+        if values is not None:
+            found[f"{name}_rms_{unit}"] = _rounded(np.sqrt(np.mean(values**2)))
+            found[f"{name}_p95_{unit}"] = _rounded(np.quantile(values, 0.95))
+    return found
 
 
-def rivals(series: Series, data: Path) -> list[float | None]:
-    """Return the RMS position errors [m] of figaroh and pybotics on the half that is held out.
-
-    Args:
-        series: Measurements of the robot.
-        data: Folder of all series.
-
-    Returns:
-        Errors; None where a program cannot calibrate the series.
-    """
-    options = dict(zip(series.options[::2], series.options[1::2], strict=True))
-    is_example = series.robot.startswith("example:")
-    chain = read_robot(series.robot if is_example else data / series.robot, options.get("--tip"))
-    if chain.prismatic.any():
-        return [None, None]
-    files = sorted(data.glob(series.files))
-    measured = [read_measurement_file(path, chain, options.get("--columns")).fit for path in files]
-    if len(measured) != 1 or not isinstance(measured[0], Pose):
-        return [None, None]
-    (fit,), (held,) = split(measured, 0.5)
-    assert isinstance(fit, Pose)
-    assert isinstance(held, Pose)
-    is_urdf = is_example or series.robot.endswith(".urdf")
-    by_figaroh = bench_rivals.figaroh(chain, fit, held) if is_urdf else None
-    started = calibrate(chain, fit, "base,tool", extend="none").chain
-    table = extract_dh_table(chain, "modified").table
-    halves = [(part.q, part.poses[:, :3, 3]) for part in (fit, held)]
-    frames = (started.base @ table.base, table.tool @ started.tool)
-    by_pybotics = bench_rivals.pybotics(table, halves[0], halves[1], frames)
-    return [found["holdout"] if found else None for found in (by_figaroh, by_pybotics)]
+def _rounded(value: float) -> float | None:
+    """Round to four digits, so that linear algebra of other processors gives the same file."""
+    return float(f"{value:.4g}") if np.isfinite(value) else None
 
 
-def millimetres(accuracy: dict | None) -> str:
-    """Format the RMS error of an accuracy; a dash if it is unknown."""
-    value = (accuracy or {}).get("position_rms_m", (accuracy or {}).get("residual_rms"))
-    return f"{1e3 * value:.2f}" if value is not None else "–"
+def judge(
+    program: Program, task: Task, judged: Pose | PointContact, *, fits_frames: bool = False
+) -> dict | None:
+    """Calibrate by a program and return its errors on the judged rows; None if it cannot."""
+    q = np.concatenate([judged.q, task.fit.q])
+    answer: Answer | None = program.calibrate(Task(task.chain, task.fit, task.sets, q, task.split))
+    if answer is None:
+        return None
+    count = len(judged.q)
+    stated = answer.stated
+    if stated is None:
+        stated = float(np.sqrt(np.mean(errors(task.fit, answer.poses[count:])[0] ** 2)))
+    found = {
+        "fitted": len(task.fit.q),
+        "judged": count,
+        **statistics(judged, answer.poses[:count], answer.has_orientation, fits_frames=fits_frames),
+        "stated_position_rms_m": _rounded(stated),
+    }
+    if answer.alone is not None:
+        alone = statistics(judged, answer.alone[:count], answer.has_orientation, fits_frames=fits_frames)
+        found["urdf_alone"] = alone
+    return found | {"seconds": round(answer.seconds, 2)}
+
+
+def run_series(
+    program: Program, series: Series, data: Path, splits: Sequence[str]
+) -> Iterator[tuple[str, list[dict]]]:
+    """Yield each split of a series and the results of its cases; no split that the program cannot do."""
+    read = series.read(data)
+    if read is None:
+        return
+    chain, measured = read
+    for split in splits:
+        found: list[dict | None] = []
+        if split == "other":
+            others = [each.read(data) for each in SERIES if each.arm == series.other]
+            for other in filter(None, others):
+                task = Task(chain, measured, series.sets, measured.q, split)
+                found.append(judge(program, task, other[1], fits_frames=True))
+        else:
+            for fit, judged in cases(measured, split):
+                task = Task(chain, measured.take(fit), series.sets, measured.q, split)
+                found.append(judge(program, task, measured.take(judged)))
+        if done := [case for case in found if case]:
+            yield split, done
 
 
 def main() -> None:
-    """Print one row per series as Markdown."""
+    """Run the chosen programs on the chosen series and write one JSON file per program."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=DATA, metavar="DIR", help="folder of the measurements")
-    parser.add_argument("--alone", action="store_true", help="without figaroh and pybotics")
+    parser.add_argument("--programs", default=",".join(PROGRAMS), help="default: all")
+    parser.add_argument("--series", default="", metavar="TEXT", help="series whose name contains TEXT")
+    parser.add_argument("--splits", default=",".join(SPLITS), help="default: all")
+    parser.add_argument("-o", "--out", type=Path, default=FOLDER, metavar="FOLDER")
     args = parser.parse_args()
-    data = args.data
-    header = "arm, instrument, samples, nominal, calibrated, held out, regions left out".split(", ")
-    header += [] if args.alone else ["figaroh, held out", "pybotics, held out"]
-    print(f"| {' | '.join(header)} |")
-    print(f"| {' | '.join('---' for _ in header)} |")
-    for series in SERIES:
-        if not list(data.glob(series.files)):
-            continue
-        half, regions = (run_command(series, data, holdout) for holdout in ("0.5", "region"))
-        cells = [series.arm, series.instrument, str(half["samples"] + half["samples_holdout"])]
-        cells += map(millimetres, (half["holdout_before"], half["after"], half["holdout_after"]))
-        cells.append(millimetres(regions["holdout_region_after"]))
-        if not args.alone:
-            cells += [f"{1e3 * error:.2f}" if error is not None else "–" for error in rivals(series, data)]
-        print(f"| {' | '.join(cells)} |", flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in args.programs.split(","):
+        program, path = PROGRAMS[name], args.out / f"{name}.json"
+        document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"series": {}}
+        for series in SERIES:
+            if args.series not in series.arm:
+                continue
+            for split, found in run_series(program, series, args.data, args.splits.split(",")):
+                document["series"].setdefault(series.arm, {})[split] = found
+                errors_mm = ", ".join(f"{1e3 * case['position_rms_m']:.3f}" for case in found)
+                print(f"{name}: {series.arm}, {split}: {errors_mm} mm", file=sys.stderr, flush=True)
+                write(program, document["series"], path)
+
+
+def write(program: Program, series: dict[str, dict], path: Path) -> None:
+    """Write the results of a program; series and splits are in a fixed order."""
+    ordered = {
+        each.arm: {split: series[each.arm][split] for split in SPLITS if split in series[each.arm]}
+        for each in SERIES
+        if each.arm in series
+    }
+    document = {"program": program.title, "version": program.version(), "series": ordered}
+    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """A whole calibration by pybotics, in the environment where it is installed.
 
-Run by `bench_rivals.py` in a folder that holds arm.csv, fit.csv and holdout.csv; prints JSON with CPU seconds
-and the RMS distance in metres on the held-out positions. With a file frames.csv, the initial poses (4, 4) of
-base and tool, both are unknown, too.
+Run by `bench_rivals.py` in a folder that holds arm.csv, fit.csv and holdout.csv; prints JSON with CPU
+seconds, the RMS distance in metres on the held-out positions, and the modelled positions there. With a file
+frames.csv, the initial poses (4, 4) of base and tool, both are unknown, too.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ def main() -> None:
     spent = time.process_time() - start
     handler.apply_optimization_vector(found)
     errors = compute_absolute_errors(held[:, :joints], held[:, joints:], handler.robot)
-    print(json.dumps({"seconds": spent, "holdout": float(np.sqrt(np.mean(errors**2)))}))
+    poses = [handler.robot.fk(q)[:3, 3].tolist() for q in held[:, :joints]]
+    print(json.dumps({"seconds": spent, "holdout": float(np.sqrt(np.mean(errors**2))), "poses": poses}))
 
 
 if __name__ == "__main__":

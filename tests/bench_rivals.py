@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from dhcal_pin import se3
 from dhcal_pin._typing import Array
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.robot.chain import Chain
@@ -36,6 +37,19 @@ def environment(package: str) -> Path | None:
     return python
 
 
+def installed_version(package: str) -> str:
+    """Return the version of a package in its environment."""
+    code = f"import json, importlib.metadata as m; print(json.dumps(m.version({package!r})))"
+    return str(spoken([environment(package), "-c", code], HERE, PYTHONPATH=""))
+
+
+def read_poses(found: dict) -> Array:
+    """Return the poses (k, 4, 4) of an answer [m]; identity rotations if it has positions only."""
+    columns = np.array(found["poses"])
+    turned = [pin.rpy.rpyToMatrix(row) for row in columns[:, 3:]] if columns.shape[1] > 3 else np.eye(3)
+    return se3.transform(turned, columns[:, :3])
+
+
 def spoken(command: list, folder: Path, **environ: str) -> object:
     """Return the JSON in the last line that a command prints."""
     done = subprocess.run(
@@ -44,7 +58,7 @@ def spoken(command: list, folder: Path, **environ: str) -> object:
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
-def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict[str, float] | None:
+def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict | None:
     """Calibrate an arm by figaroh; base and tool are unknown.
 
     Args:
@@ -53,8 +67,8 @@ def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict[str, float] | None:
         held: Poses to judge by.
 
     Returns:
-        CPU seconds under "seconds" and the RMS position error on `held` [m] under "holdout"; None if figaroh
-        does not install.
+        CPU seconds under "seconds", the RMS position error on `held` [m] under "holdout", and its positions
+        and roll, pitch and yaw there under "poses"; None if figaroh does not install.
     """
     if (python := environment("figaroh")) is None:
         return None
@@ -74,7 +88,7 @@ def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict[str, float] | None:
 
 def pybotics(
     table: DHTable, fit: tuple[Array, Array], held: tuple[Array, Array], frames: tuple[Array, Array] | None
-) -> dict[str, float] | None:
+) -> dict | None:
     """Calibrate an arm by pybotics.
 
     Args:
@@ -85,8 +99,8 @@ def pybotics(
             those of the table.
 
     Returns:
-        CPU seconds under "seconds" and the RMS position error on `held` [m] under "holdout"; None if pybotics
-        does not install.
+        CPU seconds under "seconds", the RMS position error on `held` [m] under "holdout", and its positions
+        there under "poses"; None if pybotics does not install.
     """
     if (python := environment("pybotics")) is None:
         return None

@@ -100,6 +100,8 @@ def examples(tmp_path_factory):
         run("simulate arm.dh.toml --truth arm_actual.dh.toml -m 30 --noise 0.1mm,0.01deg -o arm.csv")
         run("calibrate ur10.urdf laser.csv --tip tool0 --extend none -o ur10_calibrated.urdf")
         run(f"{_SIMULATE} 60 --truth ur10_calibrated.urdf --noise 0.05mm,0.01deg --seed 1 -o pose.csv")
+        for name in ("Series_D/measurements_iso_cubes.csv", "columns.toml"):
+            shutil.copy(ROOT / "notebooks" / "data" / "ipa_ur10" / name, ".")
         Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n600,200,500\n500,-300,400\n")
         lines = [line for line in Path("laser.csv").read_text().splitlines() if not line.startswith("#")]
         header = lines[0].split(",")

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from ..calibration.cross_validation import Generalization
 from ..calibration.evaluation import Accuracy, Comparison, accuracy
+from ..calibration.presentation.budget import UncertaintyBudget
 from ..calibration.result import Result
 from ..calibration.verdict import Verdict
 from ..estimation import qr
@@ -49,6 +50,7 @@ def result_to_dict(
     """Collect the JSON document of a calibration, or of a validation that fits base and tool."""
     comparisons = {comparison.title: comparison for comparison in fit.comparisons}
     fitted, holdout = comparisons["fitted"], comparisons.get("hold-out")
+    budget = UncertaintyBudget.from_fit(fit, fit.comparisons[0])
     return {
         "verdict": fit.verdict.to_dict(),
         "converged": fit.converged,
@@ -58,6 +60,7 @@ def result_to_dict(
         "samples_holdout": holdout.n_samples + holdout.n_outliers if holdout else 0,
         "rank": fit.rank,
         "parameters_total": len(fit.parameters),
+        "uncertainty_budget": budget.to_dict() if budget else None,
         "condition": fit.condition,
         "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
         **_accuracies(fitted, holdout, "after"),
@@ -149,6 +152,7 @@ def validation_to_dict(
         "samples_holdout": 0,
         "rank": 0,
         "parameters_total": 0,
+        "uncertainty_budget": None,
         "condition": 0.0,
         "before": statistics,
         "after": statistics,

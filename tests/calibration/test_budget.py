@@ -57,3 +57,14 @@ def test_contributions_that_are_not_known_apart_are_named():
     assert rows[3][0] == "model error, with repeatability and instrument"
     total = np.sqrt(3 * (INSTRUMENT**2 + ARM**2 + MODEL**2))
     assert found.combined == pytest.approx(total, rel=0.25)
+
+
+def test_json_has_the_contributions_in_metres():
+    found, _ = budget(INSTRUMENT)
+    assert found.to_dict() == {
+        "instrument_m": found.instrument,
+        "repeatability_m": found.repeatability,
+        "parameters_m": found.parameters,
+        "model_m": found.model,
+        "combined_m": found.combined,
+    }

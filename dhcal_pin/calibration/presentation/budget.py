@@ -13,7 +13,7 @@ A negative difference counts as zero. The combination, the root of the sum of sq
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -21,8 +21,12 @@ from ...formatting import Quantity, Table
 from ...measurements.base import label_stops
 from ...measurements.pose import Pose
 from ...measurements.position import Position
+from ...subsampling import evenly_spaced_indices
 from ..evaluation import Comparison, compute_errors
 from ..fitted import FittedModel
+
+# Largest number of samples whose predicted uncertainties are averaged; they are thinned evenly.
+_MAX_PREDICTED = 2000
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,7 @@ class UncertaintyBudget:
         if not data or errors is None:
             return None
         q = np.concatenate([item.q for item in data])
+        q = q[evenly_spaced_indices(len(q), _MAX_PREDICTED)]
         spread = replace(fit.relative, model_std=(0.0, 0.0)).predict(q).position_std
         parameters = float(np.sqrt(np.mean(spread**2)))
         if not np.isfinite(parameters):
@@ -58,6 +63,10 @@ class UncertaintyBudget:
         known = [value for value in (instrument, repeatability, parameters) if value is not None]
         model = _root(errors.rms**2 - sum(value**2 for value in known))
         return cls(instrument, repeatability, parameters, model, float(np.linalg.norm([*known, model])))
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Return the contributions for JSON [m]."""
+        return {f"{name}_m": value for name, value in asdict(self).items()}
 
     def table(self, title: str) -> Table:
         """Return one line per contribution, in mm, for k = 1 and k = 2."""
