@@ -28,6 +28,8 @@ PRIOR_FACTOR = 10.0
 MIN_OBSERVED = 1e-9
 # Largest share of a constant error that the unknowns of the calibration may leave.
 MAX_UNEXPLAINED = 1e-3
+# Added to the unit diagonal of information for directions that nothing determines.
+MIN_INFORMATION = 1e-12
 # Axes of a scale; empty for all axes.
 SCALE_AXES = ("", "x", "y", "z")
 
@@ -201,3 +203,12 @@ def _scale_motions(points: Array) -> Array:
     for axis in range(3):
         out[1 + axis, axis] = centred[axis]
     return out
+
+
+def inverse(information: Array) -> Array:
+    """Return the inverse of a matrix of information, some directions of which may be undetermined."""
+    scale = np.sqrt(np.diag(information))
+    scale[scale == 0] = 1.0
+    unit = information / scale / scale[:, None]
+    unit.flat[:: len(unit) + 1] += MIN_INFORMATION
+    return np.linalg.inv(unit) / scale / scale[:, None]

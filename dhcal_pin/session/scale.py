@@ -6,12 +6,12 @@ arm are therefore
 
     x = k·s + M·e + n,
 
-with the relative error k of the scale, the corrections s that a unit of it causes, errors e of all joint
-origins, which the fit carries into its own parameters by M, and the noise n of the fit. The errors of the
-lengths and of the angles are normal with their prior standard deviations times two unknown factors, whose
-logarithms are normal. The posterior distribution of k is a mixture of normal distributions over both
-factors, similar to Student's t distribution. The factor 1 + k is reported if the probability
-of the other sign of k is negligible.
+with the relative error k of the scale, the corrections s that a unit of it causes, errors e of base, tool and
+all joint origins, which the fit carries into its own parameters by M, and the noise n of the fit. The errors
+of the lengths and of the angles are normal with their prior standard deviations times two unknown factors,
+whose logarithms have a uniform prior. The posterior distribution of k is a mixture of normal distributions
+over both factors. With one factor it is Student's t distribution. The factor 1 + k is reported if the
+probability of the other sign of k is negligible.
 
 Reference: A. Gelman et al., Bayesian Data Analysis, 3rd edition 2013, section 14.2.
 """
@@ -23,14 +23,16 @@ from dataclasses import replace
 import numpy as np
 
 from .._typing import Array
-from ..estimation.parameters import placement
+from ..estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, base, placement, tool
 from ..estimation.problem import Problem
 from ..robot.chain import BASE_FRAME
 from .facts import Scale
-from .linear_model import Layout, measures_positions, whitened_rows
+from .linear_model import Layout, inverse, measures_positions, whitened_rows
 
 # Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
+# Smallest norm of the corrections by a scale of 1, in standard deviations.
+MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
 MAX_CHANCE = 1e-3
 # Factors of the prior standard deviations of lengths and of angles.
@@ -39,8 +41,6 @@ LENGTH_FACTORS, ANGLE_FACTORS = np.geomspace(0.1, 10, 12), np.geomspace(0.1, 10,
 WIDE = 10.0
 # Smallest relative variance of a correction: redundant parameters have none in some directions.
 MIN_VARIANCE = 1e-6
-# Standard deviation of both factors, as a factor.
-FACTOR = 3.0
 # Largest number of samples that are examined.
 MAX_SAMPLES = 200
 
@@ -57,6 +57,8 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     (arm,) = np.nonzero(is_arm)
     noise, by_scale, by_lengths, by_angles = _responses(problem, x, arm)
     unit = 1 / np.sqrt(np.diag(by_lengths + by_angles + noise))
+    if np.linalg.norm(by_scale * unit) < MIN_PATTERN:
+        return None
     by_both = unit * unit[:, None]
     lengths, angles = (
         each[:, None, None] ** 2 * matrix * by_both
@@ -70,8 +72,6 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     changes = np.sum(column * z, -1) / np.maximum(information, 1e-300)
     likelihood = np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.sum(z**2, -1)
     likelihood += 0.5 * (changes**2 * information - np.log(information))
-    spread = np.log(LENGTH_FACTORS[:, None]) ** 2 + np.log(ANGLE_FACTORS) ** 2
-    likelihood -= 0.5 * spread / np.log(FACTOR) ** 2
     weights = np.exp(likelihood - likelihood.max())
     weights /= weights.sum()
     change = float(np.sum(weights * changes))
@@ -90,10 +90,15 @@ def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Ar
     """Return what moves the estimates of the parameters `arm`.
 
     That are the covariance of the noise, the change by a scale of 1, and the covariances by errors of the
-    lengths and of the angles of all joint origins.
+    lengths and of the angles of all joint origins, of the base and of the tool.
     """
     names = [parameter.name for parameter in problem.errors.parameters]
-    origins = placement(problem.errors.chain)
+    chain = problem.errors.chain
+    # A calibration without base or tool carries their errors into the arm.
+    origins = [
+        replace(p, prior=LENGTH_PRIOR if p.unit == "m" else ANGLE_PRIOR)
+        for p in (*placement(chain), *base(chain), *tool(chain))
+    ]
     extended = problem.errors.with_parameters(p for p in origins if p.name not in names)
     all_names = [parameter.name for parameter in extended.parameters]
     n_instrument = len(x) - len(names)
@@ -108,11 +113,12 @@ def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Ar
     rows = whitened_rows(layout, values, data, rates).reshape(-1, layout.n_columns)
     model = rows[:, layout.model]
     information = model[:, own].T @ model[:, own] + np.diag(weights**2)
-    half = np.linalg.inv(np.linalg.cholesky(information))
-    covariance = half.T @ half
+    covariance = inverse(information)
     gain = (covariance @ model[:, own].T)[arm]
     carried = gain @ model[:, [all_names.index(p.name) for p in origins]] * [p.prior for p in origins]
     is_length = np.array([p.unit == "m" for p in origins], bool)
     lengths, angles = carried[:, is_length], carried[:, ~is_length]
-    noise = covariance[np.ix_(arm, arm)]
+    # Without loss of definiteness: gain · gainᵀ and the prior, in place of the covariance.
+    priors = covariance[arm] * weights
+    noise = gain @ gain.T + priors @ priors.T
     return noise, gain @ rows[:, layout.scale], lengths @ lengths.T, angles @ angles.T

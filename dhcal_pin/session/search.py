@@ -34,7 +34,7 @@ from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
-from .linear_model import Layout, whitened_rows
+from .linear_model import Layout, inverse, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
@@ -80,8 +80,6 @@ MAX_MOVES = 4
 MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
 # Smallest noise in standard deviations of the measurements: a micrometre if they state none.
 MIN_NOISE = 1e-3
-# Added to the unit diagonal of information for directions that nothing determines.
-MIN_INFORMATION = 1e-12
 # Passes end when no weight and no noise changes by more than this.
 PASS_TOL = 0.01
 # Share of the information about a cause that the fit leaves even if it can explain all of it.
@@ -213,7 +211,7 @@ class _Search:
             right = (residual * scaled).ravel()
             information = flat.T @ flat
             information.flat[:: len(information) + 1] += prior**2
-            covariance = _inverse(information)
+            covariance = inverse(information)
             step = covariance @ (flat.T @ right - prior**2 * value)
             after = residual - columns @ step
             freedom = max(1 - float(np.sum(covariance * (flat.T @ flat))) / is_row.sum(), 0.05)
@@ -234,7 +232,7 @@ class _Search:
         out[..., -1] = after / noise
         columns = columns / noise[..., None]
         equal, weighted = (
-            _inverse(_information(columns, root) + np.diag(prior**2))
+            inverse(_information(columns, root) + np.diag(prior**2))
             for root in (np.ones((len(rows), 1)), np.sqrt(weights)[:, None])
         )
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
@@ -574,7 +572,7 @@ class _Search:
         ]
         start = len(self.x) + sum(len(c.values) for c in self.causes[:i])
         own, sizes = slice(start, start + len(cause.values)), cause.sizes
-        information = _inverse(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
+        information = inverse(full.covariance[own, own] / sizes / sizes[:, None]) - np.eye(len(sizes))
         values = np.maximum(np.linalg.eigvalsh(information), 0.0)
         square = WIDTHS[:, None] ** 2
         width = np.sum(np.log1p(square * values) + (cause.values / sizes) ** 2 / square, 1)
@@ -664,15 +662,6 @@ def _information(columns: Array, root: Array) -> Array:
     return flat.T @ flat
 
 
-def _inverse(information: Array) -> Array:
-    """Return the inverse of a matrix of information, some directions of which may be undetermined."""
-    scale = np.sqrt(np.diag(information))
-    scale[scale == 0] = 1.0
-    unit = information / scale / scale[:, None]
-    unit.flat[:: len(unit) + 1] += MIN_INFORMATION
-    return np.linalg.inv(unit) / scale / scale[:, None]
-
-
 def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[float, float]:
     """Return how much the columns from p on reduce the cost: of all samples, and of left-out blocks."""
     count = int(np.clip(len(stack) / max(length, 1.0), 2, MAX_BLOCKS))
@@ -692,7 +681,7 @@ def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[
 def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
     """Return the squared residuals with products `out`, for the fit of some columns to products `kept`."""
     matrix = kept[np.ix_(used, used)] + np.diag(prior[used] ** 2)
-    x = np.append(-_inverse(matrix) @ kept[used, -1], 1.0)
+    x = np.append(-inverse(matrix) @ kept[used, -1], 1.0)
     chosen = np.append(used, len(kept) - 1)
     return float(x @ out[np.ix_(chosen, chosen)] @ x)
 
