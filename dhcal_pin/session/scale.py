@@ -31,12 +31,14 @@ from .linear_model import Layout, inverse, measures_positions, whitened_rows
 
 # Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
+# Smallest number of lengths that the measurements determine, and largest share of the largest factors.
+MIN_LENGTHS, EDGE = 3.0, 1e-2
 # Smallest norm of the corrections by a scale of 1, in standard deviations.
 MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
-MAX_CHANCE = 1e-3
+MAX_CHANCE = 5e-4
 # Factors of the prior standard deviations of lengths and of angles.
-LENGTH_FACTORS, ANGLE_FACTORS = np.geomspace(0.1, 10, 12), np.geomspace(0.1, 10, 6)
+LENGTH_FACTORS, ANGLE_FACTORS = np.geomspace(0.1, 30, 14), np.geomspace(0.1, 30, 8)
 # Prior standard deviations of unknowns without a prior, as a multiple of the expected ones.
 WIDE = 10.0
 # Smallest relative variance of a correction: redundant parameters have none in some directions.
@@ -75,7 +77,13 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     weights = np.exp(likelihood - likelihood.max())
     weights /= weights.sum()
     change = float(np.sum(weights * changes))
-    if abs(change) < MIN_CHANGE:
+    best = np.unravel_index(np.argmax(weights), weights.shape)
+    n_lengths = float(np.trace(np.linalg.solve(covariances[best], lengths[best[0]])))
+    if (
+        abs(change) < MIN_CHANGE
+        or n_lengths < MIN_LENGTHS
+        or max(weights[-1].sum(), weights[:, -1].sum()) > EDGE
+    ):
         return None
     from scipy.special import ndtr  # lazy import: slow
 

@@ -71,7 +71,7 @@ def test_euler_angles_read_as_rotation_vectors_give_a_warning(warnings_of, ur10)
         for line, row in zip(lines[1:], angles.tolist(), strict=True)
     ]
     (found,) = warnings_of(ur10, "\n".join([lines[0], *rows]))
-    assert "axes and frame of Euler angles" in found
+    assert "The rotations are Euler angles X, Y', Z''" in found
 
 
 def test_transposed_rotations_give_a_warning(warnings_of, ur10):

@@ -14,6 +14,7 @@ from robots import write
 from dhcal_pin.exceptions import DhcalError, UnknownNameError
 from dhcal_pin.io import read_toml
 from dhcal_pin.io.tables import TextLayout, format_lines, read_table
+from dhcal_pin.io.tables import table as tables
 from dhcal_pin.io.tabular import csv_text, require_usable_names
 
 
@@ -172,20 +173,22 @@ def test_a_list_of_many_lines_is_shortened():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("a,b\n" + "1,2\n" * 200_001, r"a\.csv: 200001 rows, more than 200000; keep one in 2 of them"),
+        ("a,b\n" + "1,2\n" * 201, r"a\.csv: 201 rows, more than 200; keep one in 2 of them"),
         ("a,b\n" + "1," * 10**6 + "\n", r"a\.csv:2: a line of 2000000 characters, more than 1048576"),
     ],
 )
-def test_tables_that_are_too_large(tmp_path, text, words):
+def test_tables_that_are_too_large(tmp_path, monkeypatch, text, words):
+    monkeypatch.setattr(tables, "MAX_ROWS", 200)
     with pytest.raises(DhcalError, match=words):
         read_table(write(tmp_path, "a.csv", text))
 
 
-def test_a_parquet_file_that_is_too_large(tmp_path):
+def test_a_parquet_file_that_is_too_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "MAX_ROWS", 200)
     pandas = pytest.importorskip("pandas")
     pytest.importorskip("pyarrow")
-    pandas.DataFrame({"a": np.zeros(200_001)}).to_parquet(tmp_path / "a.parquet")
-    with pytest.raises(DhcalError, match=r"a\.parquet: 200001 rows, more than 200000"):
+    pandas.DataFrame({"a": np.zeros(201)}).to_parquet(tmp_path / "a.parquet")
+    with pytest.raises(DhcalError, match=r"a\.parquet: 201 rows, more than 200"):
         read_table(tmp_path / "a.parquet")
 
 
