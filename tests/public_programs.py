@@ -15,7 +15,8 @@ from importlib import metadata
 
 import bench_rivals
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.linalg import lstsq
+from scipy.optimize import approx_fprime, least_squares
 
 from dhcal_pin import se3
 from dhcal_pin._typing import Array
@@ -23,6 +24,9 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.measurements import PointContact, Pose
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.chain import extract_dh_table
+
+# Method of the paper: most steps, step of differences, smallest relative singular value, and last step.
+MAX_STEPS, DIFFERENCE, RANK_CUT, STEP_TOL = 30, 1e-7, 1e-7, 1e-9
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ def by_dhcal(task: Task, extend: str = "auto") -> Answer:
 
 
 def by_scipy(task: Task) -> Answer | None:
-    """Calibrate by the method of Cho, Ha, Lee and Park with scipy's trust region.
+    """Calibrate by the method of Cho, Ha, Lee and Park, Gauss-Newton with the pseudo-inverse, from scipy.
 
     Unknown are all DH parameters, base and tool; the rows are the position [m] and the rotation vector [rad]
     of each pose, weighted equally. Base and tool start where they fit the nominal robot.
@@ -103,8 +107,14 @@ def by_scipy(task: Task) -> Answer | None:
         turned = se3.log3(np.swapaxes(found[:, :3, :3], 1, 2) @ seen[:, :3, :3])
         return np.concatenate([(seen[:, :3, 3] - found[:, :3, 3]).ravel(), turned.ravel()])
 
-    # The parameters are redundant: those of parallel axes drift for thousands of steps without an effect.
-    x = least_squares(rows, np.zeros(nominal.size + 12), ftol=1e-6, max_nfev=25).x
+    # The parameters are redundant; of all steps that fit equally well, the pseudo-inverse gives the shortest.
+    x = np.zeros(nominal.size + 12)
+    for _ in range(MAX_STEPS):
+        jacobian = approx_fprime(x, rows, DIFFERENCE)
+        step = lstsq(jacobian, -rows(x), cond=RANK_CUT)[0]
+        x = x + step
+        if np.linalg.norm(step) < STEP_TOL:
+            break
     return Answer(poses(x, task.q), time.process_time() - start)
 
 

@@ -46,7 +46,7 @@ from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from .causes import Block, Cause, Constant
 from .facts import cause_size
-from .linear_model import Layout, whitened_rows
+from .linear_model import Layout, measures_positions, whitened_rows
 from .robot_changes import RobotChanges
 from .search import can_have_session
 from .timeline import order_samples
@@ -193,7 +193,7 @@ def recheck(
     Raises:
         InvalidArgumentError: The measurements are not positions or poses, or too many.
     """
-    if not can_have_session(data):
+    if not can_have_session(data) or not measures_positions(data):
         kinds = ", ".join(dict.fromkeys(item.kind for item in data))
         raise InvalidArgumentError(
             f"recheck: the measurements are of the kind {kinds}; expected position or pose"

@@ -39,9 +39,9 @@ def growing_links(chain: Chain) -> Array:
     return np.linalg.norm(chain.link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
-def measures_positions(problem: Problem) -> bool:
+def measures_positions(data: Sequence[Measurement]) -> bool:
     """Return whether all samples are positions or poses, so that a scale of their axes can be wrong."""
-    return all(len(item.positions()) == len(item.rows) for item in problem.data)
+    return all(len(item.positions()) == len(item.rows) for item in data)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Layout:
         blocks += [
             Block("scale", axis, i, scales[i : i + 1], np.array([1 / size]), is_constant=True)
             for i, axis in enumerate(SCALE_AXES)
-            if axis and measures_positions(problem)  # the size of the robot imitates a scale of all axes
+            if axis and measures_positions(problem.data)  # the size of the robot imitates a scale of all axes
         ]
         blocks.append(Block("lag", "", 0, np.array([lag]), np.array([1.0]), is_constant=True))
         return cls(

@@ -54,7 +54,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     is_arm = np.array([p.error_frame not in outside for p in errors.parameters], bool)
     is_length = is_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
-    if not measures_positions(problem) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
+    if not measures_positions(problem.data) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
         return None
     (arm,) = np.nonzero(is_arm)
     noise, by_scale, by_lengths, by_angles = _responses(problem, x, arm)

@@ -182,3 +182,9 @@ def test_hidden_joints_are_named():
     result = recheck(chain, [data])
     assert result.verdict == "ok"
     assert "Zeros of wrist_3_joint do not move it" in result.reasons[1]
+
+
+def test_lengths_of_wires_are_refused():
+    simulation = Simulation("ur10", 10, 3)
+    with pytest.raises(InvalidArgumentError, match="of the kind wires; expected position or pose"):
+        recheck(simulation.chain, [simulation.measure_wires()])

@@ -102,7 +102,10 @@ def _is_axis(header: str, axis: str) -> bool:
 
 
 # Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes.
-_EULER_NOTATIONS = {("a", "b", "c"): ("ZYX", "intrinsic"), ("roll", "pitch", "yaw"): ("XYZ", "extrinsic")}
+_EULER_NOTATIONS: Mapping[tuple[str, ...], tuple[str, str]] = {
+    ("a", "b", "c"): ("ZYX", "intrinsic"),
+    ("roll", "pitch", "yaw"): ("XYZ", "extrinsic"),
+}
 
 
 def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int, Array]) -> list[str]:
@@ -123,7 +126,7 @@ def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int,
     names = _names(table, candidates[:3])
     if unit == "rad":
         return [f'rotation = {{convention = "rotvec", columns = {names}, unit = "rad"}}']
-    headers = tuple(re.split(r"[\s\[(]", table.headers[i].strip().lower())[0] for i in candidates[:3])
+    headers = tuple(str(re.split(r"[\s\[(]", table.headers[i].strip().lower())[0]) for i in candidates[:3])
     axes, frame = _EULER_NOTATIONS.get(headers, ("XYZ", "intrinsic"))
     return [
         f'rotation = {{convention = "euler", axes = "{axes}", frame = "{frame}", columns = {names}, '
