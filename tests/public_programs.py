@@ -15,7 +15,7 @@ from importlib import metadata
 
 import bench_rivals
 import numpy as np
-from scipy.linalg import lstsq
+from scipy.linalg import pinv
 from scipy.optimize import approx_fprime, least_squares
 
 from dhcal_pin import se3
@@ -110,8 +110,8 @@ def by_scipy(task: Task) -> Answer | None:
     # The parameters are redundant; of all steps that fit equally well, the pseudo-inverse gives the shortest.
     x = np.zeros(nominal.size + 12)
     for _ in range(MAX_STEPS):
-        jacobian = approx_fprime(x, rows, DIFFERENCE)
-        step = lstsq(jacobian, -rows(x), cond=RANK_CUT)[0]
+        inverse: Array = np.asarray(pinv(approx_fprime(x, rows, DIFFERENCE), rtol=RANK_CUT))
+        step = -inverse @ rows(x)
         x = x + step
         if np.linalg.norm(step) < STEP_TOL:
             break
