@@ -472,3 +472,14 @@ def test_a_class_of_noise_without_inliers_takes_the_scale_of_all_its_samples():
     every = rows.noise_scales(squares)
     assert some[0, 1] == every[0, 1]
     assert some[0, 0] < every[0, 0]
+
+
+def test_a_measurement_of_which_no_sample_was_drawn_has_no_blocks():
+    rng = np.random.default_rng(0)
+    items = (rng.normal(size=(3, 2, 4)), np.empty((3, 1, 0)))
+    groups = ((slice(0, 2),), (slice(0, 1),))
+    none = np.empty(0)
+    rows = LinearizedRows(items, (), none, none, groups, none, none, none, none, none, none, ())
+    y = rng.normal(size=(5, 2))
+    expected = np.sum((items[0][2] - np.einsum("au,ukm->akm", y, items[0][:2])) ** 2, 1)
+    np.testing.assert_allclose(rows.residual_squares(y), expected)

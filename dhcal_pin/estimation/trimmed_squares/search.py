@@ -102,7 +102,7 @@ class LinearizedRows:
         out = []
         for item, groups in zip(self.items, self.groups, strict=True):
             residual = item[-1].ravel() - y @ item[:-1].reshape(y.shape[1], -1)
-            squares = residual.reshape(-1, *item.shape[1:]) ** 2
+            squares = residual.reshape(len(y), *item.shape[1:]) ** 2
             out += [squares[:, group].sum(1) for group in groups]
         return np.concatenate(out, 1)
 
