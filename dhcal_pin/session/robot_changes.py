@@ -90,21 +90,6 @@ class RobotChanges:
         """Whether nothing changed."""
         return self.base.is_identity and self.tool.is_identity and not (self.zeros or self.growth or self.lag)
 
-    def with_drift(self, old: Drift, new: Drift) -> RobotChanges:
-        """Return the changes with another time constant of a drift."""
-
-        def of_motion(motion: Motion) -> Motion:
-            drifts = [(new if shape == old else shape, twist) for shape, twist in motion.drifts]
-            return replace(motion, drifts=tuple(drifts))
-
-        return replace(
-            self,
-            base=of_motion(self.base),
-            tool=of_motion(self.tool),
-            zeros=tuple((i, new if shape == old else shape, value) for i, shape, value in self.zeros),
-            growth=tuple((new if shape == old else shape, values) for shape, values in self.growth),
-        )
-
     def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:
         """Return the changes with a step of base, tool or a joint at another sample."""
         if kind == "joint":

@@ -71,7 +71,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     factors = np.linalg.inv(np.linalg.cholesky(covariances))
     z, column = factors @ (x[arm] * unit), factors @ (by_scale * unit)
     information = np.sum(column**2, -1)
-    changes = np.sum(column * z, -1) / np.maximum(information, 1e-300)
+    changes = np.sum(column * z, -1) / information
     likelihood = np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.sum(z**2, -1)
     likelihood += 0.5 * (changes**2 * information - np.log(information))
     weights = np.exp(likelihood - likelihood.max())

@@ -460,12 +460,8 @@ class _Search:
             best = tried[int(np.argmin(costs))]
             if best.shape == old:
                 continue
-            if isinstance(old, Drift) and isinstance(best.shape, Drift):
-                self.causes[i] = replace(cause, shape=best.shape)
-                self.changes = self.changes.with_drift(old, best.shape)
-            else:
-                self.causes[i] = best
-                self._drop_others()
+            self.causes[i] = best
+            self._drop_others()
             has_changed = True
         return has_changed
 
