@@ -118,6 +118,9 @@ def test_video_gives_one_still_per_pause(run, robot_folder):
         found = np.array([line[1:3] for line in rows], float)
         # A checkerboard of 6 x 5 squares has one orientation only.
         assert np.sqrt(np.mean((found - exact) ** 2)) < 0.3
+    # Nothing is kept if another input is wrong.
+    assert run("detect", "arm.avi", "--rig", "no.toml", "--stills", "other", "-o", "other.csv")[0] == 2
+    assert not Path("other").exists()
 
 
 def test_video_without_pauses_is_refused(assert_refused, robot_folder):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
@@ -74,21 +74,18 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Find the corners and write them."""
-    with ExitStack() as kept:
-        return _run(args, *_with_stills(args, kept))
+    with TemporaryDirectory() as folder:
+        return _run(args, folder, *_with_stills(args, folder))
 
 
-def _with_stills(args: Namespace, kept: ExitStack) -> tuple[list[str], list[str]]:
-    """Return images with the stills of videos in their place, and a note on each video."""
+def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
+    """Return images with the stills of videos, saved in `folder`, in their place, and notes on the videos."""
     from ...detection import is_video, save_stills  # lazy import: slow to load
 
     paths, notes = [], []
     videos = [path for path in args.images if is_video(path)]
     if args.stills and not videos:
         raise InvalidArgumentError("--stills: needs a video among the images; omit it")
-    folder = args.stills or kept.enter_context(TemporaryDirectory()) if videos else ""
-    if args.stills:
-        os.makedirs(args.stills, exist_ok=True)
     for path in args.images:
         if path not in videos:
             paths.append(path)
@@ -102,7 +99,7 @@ def _with_stills(args: Namespace, kept: ExitStack) -> tuple[list[str], list[str]
     return paths, notes
 
 
-def _run(args: Namespace, images: Sequence[str], video_notes: Sequence[str]) -> int:
+def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Sequence[str]) -> int:
     """Find the corners in images and write them."""
     from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
     from ...io.rig_file import only_entry, read_rig
@@ -114,7 +111,9 @@ def _run(args: Namespace, images: Sequence[str], video_notes: Sequence[str]) -> 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
     paths = image_files(images)
-    inputs = [args.rig, *files, *paths]
+    stills = [path for path in paths if os.path.dirname(path) == folder]
+    videos = [path for path in args.images if os.path.isfile(path) and path not in paths]
+    inputs = [args.rig, *files, *(path for path in paths if path not in stills), *videos]
     require_writable_outputs([args.output, args.json], inputs)
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
@@ -129,6 +128,11 @@ def _run(args: Namespace, images: Sequence[str], video_notes: Sequence[str]) -> 
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
         contents |= pictures
         notes += remarks
+    if args.stills:
+        kept = {os.path.join(args.stills, os.path.basename(path)): Path(path).read_bytes() for path in stills}
+        os.makedirs(args.stills, exist_ok=True)
+        require_writable_outputs(list(kept), [])
+        contents |= kept
     boards = [
         {
             "board": each.board.name,
