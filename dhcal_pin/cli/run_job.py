@@ -407,6 +407,9 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
     full = full_fit.comparisons[0]
     if not full_fit.converged or full.after.groups[group].rms > MAX_ERROR_RATIO * after.rms:
         return ""
+    fitted = {item.source: item for item in full_fit.data}
+    if any(poorly_fitted_files(full_fit.chain, fitted, full_fit.instruments).values()):
+        return ""  # More parameters do not explain the measurements either.
     with_full_set, with_this_set = summary.headline([full]).after, summary.headline([current]).after
     return (
         f"--parameters {FULL_SET} reduces the RMS {ERROR_GROUPS[group].label} on samples that are not "
