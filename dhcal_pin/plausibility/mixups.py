@@ -2,9 +2,8 @@
 
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
-the same way. A hypothesis is left out if it moves the nominal robot much farther from the measured positions
-than it is from them as they were read: undoing a mistake takes its error away and adds none. A hypothesis is
-decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed
+the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured positions
+than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed
 samples as it fits ordinary measurements. If none does, and no robot fits the file, each of the best ones is
 combined with a second one. Several hypotheses can describe the same change of the data, such as the sign of
 a joint and the zeros of two others; all of them are reported.
@@ -43,9 +42,10 @@ _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if it increases the distance of the nominal robot from the positions by more than
-# this factor. The distance is computed if there are at least this many rows per unknown of the frames.
-_MAX_DISTANCE_GROWTH, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 4
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, or if it
+# is larger than this share of the spread of the positions: no robot is so wrong. The misfit is computed if
+# there are at least this many rows per unknown of the frames.
+_MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 0.7, 4
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -172,14 +172,14 @@ def _closest_pairs(
     hypotheses: Sequence[Hypothesis],
 ) -> list[Hypothesis]:
     """Return the pairs of mistakes in joint columns that move the nominal robot nearest to the positions."""
-    if not nominal_distance(chain, samples):
+    if not nominal_misfit(chain, samples):
         return []  # there are no positions, or too few
     of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
     found = []
     for pair in starmap(both, permutations(of_joints, 2)):
         changed = _apply(pair, samples, neighbourhood)
         if changed is not None:
-            found.append((nominal_distance(chain, changed), pair))
+            found.append((nominal_misfit(chain, changed), pair))
     return [pair for _, pair in sorted(found, key=lambda each: each[0])[:_N_CLOSEST_PAIRS]]
 
 
@@ -198,12 +198,17 @@ def _score(
     hypotheses: Sequence[Hypothesis],
     sets: str,
 ) -> list[_Scored]:
-    """Compute the evidence of the hypotheses that apply and add no error to the nominal robot."""
+    """Compute the evidence of the hypotheses that apply and bring the nominal robot near the positions."""
+    changes = [(each, _apply(each, samples, neighbourhood)) for each in hypotheses]
+    candidates = [
+        (nominal_misfit(chain, changed), hypothesis, changed)
+        for hypothesis, changed in changes
+        if changed is not None
+    ]
+    smallest = min([nominal_misfit(chain, samples), *(misfit for misfit, _, _ in candidates)])
     scored = []
-    largest = _MAX_DISTANCE_GROWTH * nominal_distance(chain, samples)
-    for hypothesis in hypotheses:
-        changed = _apply(hypothesis, samples, neighbourhood)
-        if changed is not None and nominal_distance(chain, changed) <= largest:
+    for misfit, hypothesis, changed in candidates:
+        if misfit <= min(_MAX_MISFIT_RATIO * smallest, _MAX_MISFIT):
             after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append(_Scored(hypothesis, after, log))
@@ -230,20 +235,24 @@ def leaves_residuals(evidence: Evidence) -> bool:
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
 
 
-def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
-    """Compute how far the nominal robot is from measured positions, with any base, target and unit of length.
+def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
+    """Compute how far the nominal robot is from measured poses, with any base, tool and unit of length.
 
     A position p of a target at t in the tip frame, which has the rotation R and the position p_tip, fulfils
 
         A·p + b - R·t = p_tip
 
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
-    are free here, which makes the equation linear and the distance too small rather than too large.
+    are free here, which makes the equation linear and the error too small rather than too large. It counts
+    relative to the spread of p_tip. A measured rotation M fulfils Q·M = R·B with the rotation B of the tool.
+    With free matrices of unit norm, the mean square of the angles between both sides is 3·(1 - σ) for the
+    largest singular value σ of the mean of M⊗R. The two mean squares are added.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
-    squares, counts = [0.0], [0]
+    squares = spreads = turns = 0.0
+    count = 0
     for item in data:
-        p = positions_at_end(item)
+        p, measured = positions_at_end(item), item.rotations()
         if item.configurations_per_row != 1 or len(p) != len(item.rows):
             continue
         tip = arm.poses(item.conditions().of_arm)
@@ -255,9 +264,13 @@ def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
             continue
         target = tip[:, :3, 3].ravel()
         error = target - rows @ np.linalg.lstsq(rows, target, rcond=None)[0]
-        squares.append(float(error @ error))
-        counts.append(len(p))
-    return float(np.sqrt(sum(squares) / max(sum(counts), 1)))
+        squares += float(error @ error)
+        spreads += float(np.sum((tip[:, :3, 3] - tip[:, :3, 3].mean(0)) ** 2))
+        if len(measured) and item.conditions().base_motion is None:
+            products = np.einsum("mij,mkl->ikjl", measured, tip[:, :3, :3]).reshape(9, 9)
+            turns += 3 * max(0.0, len(p) - float(np.linalg.norm(products, 2)))
+        count += len(p)
+    return float(np.sqrt(squares / spreads + turns / count)) if spreads else 0.0
 
 
 def _count(data: Sequence[Measurement]) -> int:
