@@ -3,10 +3,11 @@
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
 the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured positions
-than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed
-samples as it fits ordinary measurements. If none does, and no robot fits the file, each of the best ones is
-combined with a second one. Several hypotheses can describe the same change of the data, such as the sign of
-a joint and the zeros of two others; all of them are reported.
+than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its
+evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed samples as it fits
+ordinary measurements. If none does, and no robot fits the file, each of the best ones is combined with a
+second one. Several hypotheses can describe the same change of the data, such as the sign of a joint and the
+zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, or if it
-# is larger than this share of the spread of the positions: no robot is so wrong. The misfit is computed if
-# there are at least this many rows per unknown of the frames.
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, or if
+# it exceeds this share of the spread of the positions: no robot is so wrong. The misfit is computed from at
+# least this many rows per unknown of the frames.
 _MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 0.7, 4
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
