@@ -39,14 +39,15 @@ _MIN_NAMED_RATIO = 2.0
 _MAX_LOG_TIE = 3.0
 # Number of hypotheses that are tried as the first of two mistakes, and of pairs in joint columns.
 _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
-# Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
-_MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
+# Fewer rows for each unknown of frames and instrument fit too many hypotheses, and too many pairs of them.
+# Base and tool have twelve.
+_MIN_ROWS_PER_UNKNOWN, _MIN_ROWS_OF_PAIRS, _N_FRAME_UNKNOWNS = 2, 4, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
 # A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, or if
 # it exceeds this share of the spread of the positions: no robot is so wrong. The misfit is computed from at
 # least this many rows per unknown of the frames.
-_MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 0.7, 4
+_MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 0.7, 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -136,11 +137,11 @@ def _is_surface_contact(item: Measurement) -> bool:
     return item.is_contact and item.residual_dim == 1
 
 
-def has_enough_rows(samples: Sequence[Measurement]) -> bool:
+def has_enough_rows(samples: Sequence[Measurement], per_unknown: float = _MIN_ROWS_PER_UNKNOWN) -> bool:
     """Return whether samples have enough rows for the unknowns of frames and instrument."""
     n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
     n_instrument = len({parameter.name for item in samples for parameter in item.instrument_parameters})
-    return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
+    return n_rows >= per_unknown * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
 def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis:
@@ -155,7 +156,7 @@ def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis
     scored = _score(chain, samples, neighbourhood, listed, sets)
     if found := _decisive(before, scored):
         return found
-    if leaves_residuals(before):
+    if leaves_residuals(before) and has_enough_rows(samples, _MIN_ROWS_OF_PAIRS):
         first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
@@ -244,10 +245,11 @@ def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
         A·p + b - R·t = p_tip
 
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
-    are free here, which makes the equation linear and the error too small rather than too large. It counts
-    relative to the spread of p_tip. A measured rotation M fulfils Q·M = R·B with the rotation B of the tool.
-    With free matrices of unit norm, the mean square of the angles between both sides is 3·(1 - σ) for the
-    largest singular value σ of the mean of M⊗R. The two mean squares are added.
+    are free here, which makes the equation linear and the error too small rather than too large. Its mean
+    square per degree of freedom counts relative to that of p_tip about its mean. A measured rotation M
+    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, the mean square of the
+    angles between both sides is 3·(1 - σ) for the largest singular value σ of the mean of M⊗R. The two mean
+    squares are added.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     squares = spreads = turns = 0.0
@@ -265,7 +267,7 @@ def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
             continue
         target = tip[:, :3, 3].ravel()
         error = target - rows @ np.linalg.lstsq(rows, target, rcond=None)[0]
-        squares += float(error @ error)
+        squares += float(error @ error) * len(rows) / (len(rows) - rows.shape[1])
         spreads += float(np.sum((tip[:, :3, 3] - tip[:, :3, 3].mean(0)) ** 2))
         if len(measured) and item.conditions().base_motion is None:
             products = np.einsum("mij,mkl->ikjl", measured, tip[:, :3, :3]).reshape(9, 9)

@@ -206,7 +206,7 @@ def test_misfit_of_the_nominal_robot_is_that_of_its_errors(ur10, kind):
     assert 0.5 * most < misfit < 1.1 * most
     assert nominal_misfit(ur10, [with_positions(data, lambda p: 1e3 * p)]) == pytest.approx(misfit)
     assert nominal_misfit(real_ur10(), [data]) < 5e-4
-    assert nominal_misfit(ur10, [data.take(np.s_[:12])]) == 0
+    assert nominal_misfit(ur10, [data.take(np.s_[:9])]) == 0
     assert nominal_misfit(ur10, [measured(Wires)]) == 0
 
 
