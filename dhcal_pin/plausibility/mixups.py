@@ -39,15 +39,14 @@ _MIN_NAMED_RATIO = 2.0
 _MAX_LOG_TIE = 3.0
 # Number of hypotheses that are tried as the first of two mistakes, and of pairs in joint columns.
 _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
-# Fewer rows for each unknown of frames and instrument fit too many hypotheses, and too many pairs of them.
-# Base and tool have twelve.
-_MIN_ROWS_PER_UNKNOWN, _MIN_ROWS_OF_PAIRS, _N_FRAME_UNKNOWNS = 2, 4, 12
+# Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
+_MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, or if
-# it exceeds this share of the spread of the positions: no robot is so wrong. The misfit is computed from at
-# least this many rows per unknown of the frames.
-_MAX_MISFIT_RATIO, _MAX_MISFIT, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 0.7, 2
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, but not
+# below the least limit, or if it exceeds the largest limit: no robot is so wrong. The misfit is computed from
+# at least this many rows per unknown of the frames.
+_MAX_MISFIT_RATIO, _MISFIT_LIMITS, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, (0.01, 0.7), 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -115,14 +114,17 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    diagnosis = _diagnose(chain, items, sets)
-    if diagnosis.hypotheses or not diagnosis.is_suspicious or len(items) < 2:
+    diagnosis, trial = _find_single(chain, items, sets)
+    if diagnosis.hypotheses or trial is None:
         return diagnosis
-    separate = [(item, _diagnose(chain, [item], sets)) for item in items]
-    for item, one in separate:
-        if one.hypotheses:
-            return replace(one, source=item.source)
-    return replace(diagnosis, fits_separately=not any(one.is_suspicious for _, one in separate))
+    if len(items) > 1:
+        separate = [(item, _find_one_or_two(chain, item, sets)) for item in items]
+        for item, one in separate:
+            if one.hypotheses:
+                return replace(one, source=item.source)
+        if not any(one.is_suspicious for _, one in separate):
+            return replace(diagnosis, fits_separately=True)
+    return _find_pair(trial)
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
@@ -137,26 +139,43 @@ def _is_surface_contact(item: Measurement) -> bool:
     return item.is_contact and item.residual_dim == 1
 
 
-def has_enough_rows(samples: Sequence[Measurement], per_unknown: float = _MIN_ROWS_PER_UNKNOWN) -> bool:
+def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     """Return whether samples have enough rows for the unknowns of frames and instrument."""
     n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
     n_instrument = len({parameter.name for item in samples for parameter in item.instrument_parameters})
-    return n_rows >= per_unknown * (_N_FRAME_UNKNOWNS + n_instrument)
+    return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
-def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis:
-    """Look for one mistake in all of the measurements."""
+class _Trial(NamedTuple):
+    """Suspicious samples for which no single hypothesis is decisive."""
+
+    chain: Chain
+    samples: Sequence[Measurement]
+    neighbourhood: Sequence[Measurement]
+    sets: str
+    before: Evidence
+    hypotheses: Sequence[Hypothesis]
+    scored: Sequence[_Scored]
+
+
+def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[Diagnosis, _Trial | None]:
+    """Look for one mistake in all of the measurements; return what was tried if they remain suspicious."""
     samples, neighbourhood = draw_samples(data)
     if not has_enough_rows(samples):
-        return Diagnosis(NO_EVIDENCE)
+        return Diagnosis(NO_EVIDENCE), None
     before = fit_evidence(chain, samples, sets)
     if not is_suspicious(before):
-        return Diagnosis(before)
+        return Diagnosis(before), None
     listed = list(list_hypotheses(chain, samples))
     scored = _score(chain, samples, neighbourhood, listed, sets)
-    if found := _decisive(before, scored):
-        return found
-    if leaves_residuals(before) and has_enough_rows(samples, _MIN_ROWS_OF_PAIRS):
+    trial = _Trial(chain, samples, neighbourhood, sets, before, listed, scored)
+    return _decisive(before, scored) or Diagnosis(before), trial
+
+
+def _find_pair(trial: _Trial) -> Diagnosis:
+    """Look for two mistakes in measurements with positions, by which pairs are compared."""
+    chain, samples, neighbourhood, sets, before, listed, scored = trial
+    if leaves_residuals(before) and nominal_misfit(chain, samples):
         first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
@@ -167,6 +186,12 @@ def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis
     return Diagnosis(before)
 
 
+def _find_one_or_two(chain: Chain, item: Measurement, sets: str) -> Diagnosis:
+    """Look for one mistake or two in one measurement."""
+    diagnosis, trial = _find_single(chain, [item], sets)
+    return diagnosis if diagnosis.hypotheses or trial is None else _find_pair(trial)
+
+
 def _closest_pairs(
     chain: Chain,
     samples: Sequence[Measurement],
@@ -174,8 +199,6 @@ def _closest_pairs(
     hypotheses: Sequence[Hypothesis],
 ) -> list[Hypothesis]:
     """Return the pairs of mistakes in joint columns that move the nominal robot nearest to the positions."""
-    if not nominal_misfit(chain, samples):
-        return []  # there are no positions, or too few
     of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
     found = []
     for pair in starmap(both, permutations(of_joints, 2)):
@@ -210,7 +233,7 @@ def _score(
     smallest = min([nominal_misfit(chain, samples), *(misfit for misfit, _, _ in candidates)])
     scored = []
     for misfit, hypothesis, changed in candidates:
-        if misfit <= min(_MAX_MISFIT_RATIO * smallest, _MAX_MISFIT):
+        if misfit <= np.clip(_MAX_MISFIT_RATIO * smallest, *_MISFIT_LIMITS):
             after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append(_Scored(hypothesis, after, log))
@@ -247,9 +270,9 @@ def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
     are free here, which makes the equation linear and the error too small rather than too large. Its mean
     square per degree of freedom counts relative to that of p_tip about its mean. A measured rotation M
-    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, the mean square of the
-    angles between both sides is 3·(1 - σ) for the largest singular value σ of the mean of M⊗R. The two mean
-    squares are added.
+    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, both sides differ by the
+    mean square 1 - σ for the largest singular value σ of the mean of M⊗R, a third of that of the angles. The
+    two mean squares are added.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     squares = spreads = turns = 0.0
@@ -271,7 +294,7 @@ def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
         spreads += float(np.sum((tip[:, :3, 3] - tip[:, :3, 3].mean(0)) ** 2))
         if len(measured) and item.conditions().base_motion is None:
             products = np.einsum("mij,mkl->ikjl", measured, tip[:, :3, :3]).reshape(9, 9)
-            turns += 3 * max(0.0, len(p) - float(np.linalg.norm(products, 2)))
+            turns += max(0.0, len(p) - float(np.linalg.norm(products, 2)))
         count += len(p)
     return float(np.sqrt(squares / spreads + turns / count)) if spreads else 0.0
 

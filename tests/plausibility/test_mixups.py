@@ -201,7 +201,7 @@ def test_misfit_of_the_nominal_robot_is_that_of_its_errors(ur10, kind):
     tips = poses[:, :3, 3]
     squares = np.sum((tips - data.positions()) ** 2) / np.sum((tips - tips.mean(0)) ** 2)
     for r, m in zip(poses[:, :3, :3], data.rotations(), strict=False):
-        squares += np.arccos(np.clip((np.trace(r.T @ m) - 1) / 2, -1, 1)) ** 2 / len(poses)
+        squares += np.arccos(np.clip((np.trace(r.T @ m) - 1) / 2, -1, 1)) ** 2 / 3 / len(poses)
     most = np.sqrt(squares)
     assert 0.5 * most < misfit < 1.1 * most
     assert nominal_misfit(ur10, [with_positions(data, lambda p: 1e3 * p)]) == pytest.approx(misfit)
