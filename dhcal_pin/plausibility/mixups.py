@@ -270,9 +270,9 @@ def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
     are free here, which makes the equation linear and the error too small rather than too large. Its mean
     square per degree of freedom counts relative to that of p_tip about its mean. A measured rotation M
-    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, both sides differ by the
-    mean square 1 - σ for the largest singular value σ of the mean of M⊗R, a third of that of the angles. The
-    two mean squares are added.
+    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, both sides differ by
+    the mean square 1 - σ for the largest singular value σ of the mean of M⊗R, a third of that of the angles.
+    The two mean squares are added.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     squares = spreads = turns = 0.0
