@@ -80,8 +80,9 @@ MAX_REJECTED_SHARE = 0.03
 MIN_WRONG_RATIO = 5.0
 # Number of folds, smallest number of configurations, and largest number of causes.
 N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
-# Largest number of configurations in which causes are looked for: more of them do not change the cause.
-MAX_CONFIGURATIONS = 300
+# Largest number of configurations in which causes are looked for, and of corners in them if they are more than
+# a third as many: more of them do not change the cause.
+MAX_CONFIGURATIONS, MAX_CORNERS = 300, 4000
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
 # the images show.
 MIN_ROTATION = np.deg2rad(8.0)
@@ -312,8 +313,9 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     count = int(label.max(initial=-1)) + 1
     if count < MIN_CONFIGURATIONS:
         return None
-    if count > MAX_CONFIGURATIONS:
-        is_used = np.isin(label, evenly_spaced_indices(count, MAX_CONFIGURATIONS))
+    n_used = min(MAX_CONFIGURATIONS, max(MAX_CORNERS * count // len(label), MAX_CONFIGURATIONS // 3))
+    if count > n_used:
+        is_used = np.isin(label, evenly_spaced_indices(count, n_used))
         ends = np.cumsum([len(item.rows) for item in data])[:-1]
         parts = zip(data, np.split(is_used, ends), strict=True)
         data = tuple(item.take(used) for item, used in parts if used.any())
