@@ -24,6 +24,7 @@ from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
+from .cameras.seen_ranges import small_ranges
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -118,7 +119,7 @@ class Verdict:
 
 def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
-    findings = _unmoved_joints(fit)
+    findings = _unmoved_joints(fit) or _few_images(fit)
     if not any(finding.status == "refused" for finding in findings):
         findings += [*_mixups(fit.diagnosis), *_signs(fit), *_board_size(fit), *_two_robots(fit)]
     if not any(finding.status == "refused" for finding in findings):
@@ -170,6 +171,21 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
     text += ": the calibration holds only where they stand."
     return [Finding("caution", f"{text} Move them, too.")]
+
+
+def _few_images(fit: Evidence) -> list[Finding]:
+    """Refuse images that are too few for the type of arm, and say what is missing."""
+    needed, advised = fit.arm_type.min_images, fit.arm_type.advised_images
+    count = fit.extension.n_configurations if fit.extension else needed
+    if count >= needed or (fit.hand_eye and fit.hand_eye.is_noise):
+        return []
+    text = (
+        f"{count} different images are too few for the zeros and signs of this arm. Take at least "
+        f"{needed - count} more, better {advised - count}."
+    )
+    if small := small_ranges(fit.chain, fit.data):
+        text += f" Turn the joints that moved less than half of their range: {', '.join(small)}."
+    return [Finding("refused", text)]
 
 
 def _mixups(diagnosis: Diagnosis) -> list[Finding]:

@@ -29,11 +29,14 @@ class ArmType:
     max_error: float
     # Models that are compared by left-out images; with the first one outliers are found.
     noise_models: tuple[str, ...]
+    # Number of different images below which the arm is not written, and number that is advised.
+    min_images: int = 0
+    advised_images: int = 0
 
 
 INDUSTRIAL = ArmType(0.5, 0.25, 10.0, (CORNERS, IMAGES))
 # Types of arms by the parameter set that is estimated. 40 px are 2° for a lens of 1150 px.
-ARM_TYPES = {LOW_COST: ArmType(0.8, 0.8, 40.0, (IMAGES,))}
+ARM_TYPES = {LOW_COST: ArmType(0.8, 0.8, 40.0, (IMAGES,), 10, 20)}
 
 
 def arm_type(sets: Iterable[str]) -> ArmType:
