@@ -55,7 +55,7 @@ from .solver import minimize, next_iterate
 
 # Spacing of the grid of tool offsets that are tried [m].
 _TOOL_OFFSET = 0.25
-# Largest number of samples of each measurement that candidates are computed from and compared with.
+# Largest number of samples, or of images, of each measurement that candidates are computed from.
 _MAX_SAMPLES = 100
 # Number of candidates that are refined by a fit.
 _MAX_CANDIDATES = 4
@@ -84,8 +84,10 @@ def align(source: Array, target: Array) -> tuple[Array, Array]:
 
 
 def subsample(item: Measurement) -> Measurement:
-    """Take at most 100 samples of a measurement, drawn at random as their order may be systematic."""
-    return item.take(np.sort(np.random.default_rng(0).permutation(len(item.rows))[:_MAX_SAMPLES]))
+    """Take at most 100 samples or whole images, drawn at random as their order may be systematic."""
+    labels = item.sample_groups if item.n_images else np.arange(len(item.rows))
+    drawn = np.random.default_rng(0).permutation(int(labels.max(initial=-1)) + 1)[:_MAX_SAMPLES]
+    return item.take(np.flatnonzero(np.isin(labels, drawn)))
 
 
 def positions_at_end(item: Measurement) -> Array:

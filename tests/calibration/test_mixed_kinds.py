@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from slow_cases import some_slow
 
+from dhcal_pin import read_robot
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.cameras import procedure
 from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.initialization import subsample
 from dhcal_pin.exceptions import InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
@@ -93,6 +95,44 @@ def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
     result = calibrate(sim_6dof, images, "camera,board")
     assert result.converged
     assert result.comparisons[-1].after["residual_rms"] < 0.3
+
+
+def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):
+    """Return images of a UR10 by two fixed cameras whose poses the rig states in the measuring frame."""
+    pan, lift, elbow = rng.uniform([-0.5, -1.8, 1.2], [0.5, -1.2, 2.2], (25, 3)).T
+    down = np.full(25, -np.pi / 2)
+    q = np.stack([pan, lift, elbow, down - lift - elbow, down, pan], 1)
+    images = KINDS["camera"].simulate(truth, q, noise, rng)
+    cameras = mount_rig(simulated_rig(truth, q), truth).cameras
+    boards = tuple(replace(board, pose=None) for board in images.rig.boards)
+    rig = replace(images.rig, cameras=cameras, boards=boards)
+    names = [cameras[i].name for i in images.camera]
+    return CameraCorners(images.q, images.values, images.corner, rig, names, None, images.sigma)
+
+
+@pytest.mark.parametrize("image_noise", [1e-4, 3e-3])
+def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_tool(image_noise):
+    """Images of this noise show nothing of the arm, or little; positions of a tracker show that it is wrong."""
+    rng = np.random.default_rng(9)
+    arm = read_robot("example:ur10", tip="tool0")
+    truth = placed(small_errors(arm, rng))
+    images = images_that_keep_the_orientation_of_the_tool(truth, Noise(image_noise), rng)
+    positions, left_out = (
+        KINDS["position"].simulate(truth, rng.uniform(-2, 2, (60, 6)), Noise(5e-5), rng) for _ in range(2)
+    )
+    result = calibrate(arm, [positions, images], extend="none", session="off")
+    assert result.verdict.status == "ok"
+    assert result.validate(left_out)["position_rms_m"] < 1.4 * np.sqrt(3) * 5e-5
+    assert result.validate(images)["residual_rms"] < 1.2 * np.sqrt(2) * 1e3 * image_noise
+
+
+def test_whole_images_are_drawn_for_the_start(sim_6dof):
+    """The frames are found from a part of the samples; single corners would not show where a board is."""
+    rng = np.random.default_rng(10)
+    images = KINDS["camera"].simulate(sim_6dof, rng.uniform(-2.5, 2.5, (150, 6)), Noise(1e-4), rng)
+    drawn = subsample(images)
+    assert drawn.n_images == 100
+    assert len(drawn.rows) == 600
 
 
 def test_images_without_weight_are_refused(sim_6dof, monkeypatch):

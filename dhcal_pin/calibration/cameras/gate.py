@@ -11,6 +11,8 @@ of the arm are those of greatest evidence at T, however narrow.
   which are never below the default ones.
 - r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images
   (`arm_types`).
+- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the arm
+  is demonstrably wrong, too, whatever the images show.
 - Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
   imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
@@ -31,6 +33,7 @@ import numpy as np
 
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
+from ...estimation.folds import factor_partition
 from ...estimation.priors import PriorGroups, effective_parameters
 from ...estimation.problem import Problem
 from ...estimation.robust import ZERO_WEIGHT
@@ -53,6 +56,8 @@ N_CLUSTERS = 5
 N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
+# Largest ratio of the errors of other instruments for which the arm is demonstrably wrong.
+MAX_OTHERS_RATIO = 0.8
 # Narrowest and widest prior with a closed gate, as a fraction of the default one.
 MIN_WIDTH, MAX_WIDTH = 1e-3, 1e2
 # Rounds of jitter and solution, and of the evidence.
@@ -72,11 +77,17 @@ class Gate:
     is_right: bool  # Whether the corners of an image share no displacement with the nominal arm
     is_complete: bool  # Whether they share none with the estimated arm
     arm_type: ArmType = INDUSTRIAL
+    others_ratio: float = float("nan")  # The same as `ratio` for other instruments; NaN if there are none
 
     @property
     def is_open(self) -> bool:
         """Whether the arm is demonstrably wrong."""
-        return self.ratio < self.max_ratio and not self.is_right
+        return self._is_shown_by_others or (self.ratio < self.max_ratio and not self.is_right)
+
+    @property
+    def _is_shown_by_others(self) -> bool:
+        """Whether measurements of other instruments show that the arm is wrong."""
+        return self.others_ratio < MAX_OTHERS_RATIO
 
     @property
     def max_ratio(self) -> float:
@@ -88,6 +99,9 @@ class Gate:
     def sentence(self) -> str:
         """Why the arm is estimated or kept."""
         effect = "estimating it changes the error of left-out parts of joint space to"
+        if self._is_shown_by_others:
+            ratio = format_ratio(self.others_ratio)
+            return f"The arm is demonstrably wrong: {effect} {ratio} for the measurements without images."
         if self.is_open:
             return f"The arm is demonstrably wrong: {effect} {format_ratio(self.ratio)}."
         start = "The nominal arm is kept, as the images do not show that the arm is wrong:"
@@ -162,7 +176,8 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
         for model, factor in models
     ]
     best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
-    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type)
+    others_ratio = _others_ratio(best.closed, max_iterations)
+    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
     if not gate.is_open:
         return GatedFit(kept, nominal, best.closed, gate)
     opened_at = 1.0
@@ -222,6 +237,29 @@ def _trial(
     if error is None or nominal is None:
         return _Trial(model, closed, float("nan"), float("nan"))
     return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
+
+
+def _others_ratio(fit: Fit, max_iterations: int) -> float:
+    """Return the error of left-out rows of other instruments with the arm of a fit over that of the nominal one.
+
+    It is NaN if there are too few.
+    """
+    others = [item for item in fit.problem.data if not item.n_images]
+    folds = []
+    for fold in cluster_folds(others) if others else ():
+        masks = iter(fold)
+        folds.append(
+            [np.zeros(len(item.rows), bool) if item.n_images else next(masks) for item in fit.problem.data]
+        )
+    if not folds:
+        return float("nan")
+    squares = []
+    for each in (fit, without_arm(fit, max_iterations)):
+        problem, x = each.problem, each.solution.x
+        columns = np.ones(len(x), bool)
+        systems = factor_partition(problem, x, folds)
+        squares.append(sum(one.n_rows * one.error(problem.weights, x, columns) ** 2 for one in systems))
+    return float(np.sqrt(squares[0] / squares[1])) if squares[1] else float("nan")
 
 
 def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) -> Fit:
