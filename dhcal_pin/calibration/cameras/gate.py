@@ -11,8 +11,8 @@ of the arm are those of greatest evidence at T, however narrow.
   which are never below the default ones.
 - r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images
   (`arm_types`).
-- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the arm
-  is demonstrably wrong, too, whatever the images show.
+- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
+  arm is demonstrably wrong, too, whatever the images show.
 - Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
   imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
@@ -240,7 +240,7 @@ def _trial(
 
 
 def _others_ratio(fit: Fit, max_iterations: int) -> float:
-    """Return the error of left-out rows of other instruments with the arm of a fit over that of the nominal one.
+    """Return the error of left-out rows of other instruments, relative to that with the nominal arm.
 
     It is NaN if there are too few.
     """
