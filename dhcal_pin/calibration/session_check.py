@@ -39,7 +39,9 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
         return True
     unchanged = extended(without)
-    problem = unchanged.problem.with_data(session.applied(unchanged.problem.data, ())[0])
+    timeline = session.timeline
+    fitted, _ = session.applied(unchanged.problem.data, timeline.data[timeline.n_fitted :])
+    problem = unchanged.problem.with_data(fitted)
     solution = minimize(problem, "lm", unchanged.solution.x, MAX_ITERATIONS, loose=True)
     changed = replace(unchanged, data=fit.data, problem=problem, solution=solution)
     residuals = [_residuals(each) for each in (unchanged, changed)]
