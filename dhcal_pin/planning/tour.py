@@ -86,9 +86,8 @@ def is_move_free(checker: CollisionChecker, start: Array, end: Array) -> bool:
     """Check the configurations of a straight line in joint space."""
     length = np.abs(scale_joint_units(checker.chain, (end - start)[None])).max()
     n_steps = max(1, int(np.ceil(length / MAX_STEP_RAD)))
-    return all(
-        checker.is_collision_free(start + step / n_steps * (end - start)) for step in _coarse_first(n_steps)
-    )
+    shares = np.fromiter(_coarse_first(n_steps), float)[:, None] / n_steps
+    return checker.are_collision_free(start + shares * (end - start))
 
 
 def _coarse_first(n_steps: int) -> Iterator[int]:

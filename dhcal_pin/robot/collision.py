@@ -124,11 +124,17 @@ class CollisionChecker:
 
     def is_collision_free(self, q: Array) -> bool:
         """Return whether no two shapes collide; True if there is nothing to check."""
+        return self.are_collision_free(q[None])
+
+    def are_collision_free(self, q: Array) -> bool:
+        """Return whether no two shapes collide at any of the joint positions (m, n), the first ones first."""
         if self.geometry is None:
             return True
-        data, shapes = self._data
-        configuration = self.chain.configurations(q[None])[0]
-        return not pin.computeCollisions(self.chain.model, data, self.geometry, shapes, configuration, True)
+        model, (data, shapes) = self.chain.model, self._data
+        return not any(
+            pin.computeCollisions(model, data, self.geometry, shapes, configuration, True)
+            for configuration in self.chain.configurations(q)
+        )
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
         """Return whether robot and obstacles leave the line between two points free.

@@ -51,7 +51,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
     errors = problem.errors
     outside = (BASE_FRAME, errors.chain.tool_frame_index)
-    is_arm = np.array([p.error_frame not in outside for p in errors.parameters], bool)
+    is_arm = np.array(
+        [p.error_frame not in outside and p.coefficient_index is None for p in errors.parameters], bool
+    )
     is_length = is_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
     if not measures_positions(problem.data) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
