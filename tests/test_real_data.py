@@ -85,13 +85,17 @@ def test_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
             ("B", "D", 0.16e-3, 0.24e-3, True),
             ("D", "B", 0.17e-3, 0.26e-3, True),
         ],
-        {0},
+        (),
     ),
 )
 def test_extensions_are_accurate_on_hold_out_and_on_another_series(
     dhcal, tmp_path, series, other, held, moved, is_whole
 ):
-    """The robot for the other series is that of half of the samples, or of the whole series."""
+    """The robot for the other series is that of half of the samples, or of the whole series.
+
+    The twins that always run: `test_urdf_alone.py` with halves of D, and
+    `test_poses_that_fill_bins_determine_curves_that_transfer`.
+    """
     fit, output = ur10(dhcal, series, "minimal,base,tool", tmp_path, "--holdout", "0.5")
     assert fit["holdout_after"]["position_rms_m"] <= held
     assert {"harmonics", "compliance", "curves"} <= set(fit["extension"]["families"])
