@@ -627,7 +627,7 @@ def _fit_selected(
         x = np.clip(x, *problem.bounds)
     selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
     solution = minimize(selected_problem, "lm", x, max_iterations, loose=True)
-    trimmed = _outlier_weights(problem, solution.x, fit.weights)
+    trimmed = outlier_weights(problem, solution.x, fit.weights)
     if any((w < 1).any() for w in trimmed):
         problem = problem.with_data(
             [item.with_weights(w) for item, w in zip(problem.data, trimmed, strict=True)]
@@ -643,7 +643,7 @@ def _fit_selected(
     return replace(fitted, problem=problem), model.noise
 
 
-def _outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
+def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
     """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,).
 
     Samples of low previous weight do not count for the scale of the residuals.

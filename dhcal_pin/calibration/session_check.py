@@ -14,10 +14,12 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.solver import minimize
+from ..measurements.base import Measurement
 from ..session import Session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
+from .model_selection import outlier_weights
 from .reweighting import Fit
 
 # Logarithm of the evidence that each coefficient of a change costs.
@@ -39,12 +41,7 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
         return True
     unchanged = extended(without)
-    timeline = session.timeline
-    fitted, _ = session.applied(unchanged.problem.data, timeline.data[timeline.n_fitted :])
-    problem = unchanged.problem.with_data(fitted)
-    solution = minimize(problem, "lm", unchanged.solution.x, MAX_ITERATIONS, loose=True)
-    changed = replace(unchanged, data=fit.data, problem=problem, solution=solution)
-    residuals = [_residuals(each) for each in (unchanged, changed)]
+    residuals = [_residuals(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
     noise = _noise(residuals[1])
     costs = [
         sum(
@@ -61,6 +58,18 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     share = min([1.0, *(min(each, 1 - each) for each in shares)])
     needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
     return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
+
+
+def _with_changes(fit: Fit, data: tuple[Measurement, ...], session: Session) -> Fit:
+    """Fit the same model to measurements with changes; samples that are outliers without them may count."""
+    x, timeline = fit.solution.x, session.timeline
+    unweighted = [item.with_weights(1 / w) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
+    fitted, _ = session.applied(tuple(unweighted), timeline.data[timeline.n_fitted :])
+    problem = fit.problem.with_data(fitted)
+    weights = outlier_weights(problem, x, fit.weights)
+    problem = problem.with_data([item.with_weights(w) for item, w in zip(fitted, weights, strict=True)])
+    solution = minimize(problem, "lm", x, MAX_ITERATIONS, loose=True)
+    return replace(fit, data=data, problem=problem, solution=solution, weights=weights)
 
 
 def _noise(residuals: Sequence[Array]) -> list[Array]:
