@@ -26,7 +26,7 @@ from .reweighting import Fit
 COST_PER_COEFFICIENT = 5.0
 # Largest number of iterations of the fit of changes and joint errors.
 MAX_ITERATIONS = 20
-# Ratio of the noise without changes to that with them above which no comparison with joint errors is needed.
+# Ratio of the residuals without changes to those with them above which joint errors need not be compared.
 MIN_GROSS_RATIO = 10.0
 
 
@@ -37,12 +37,17 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     errors that the measurements support without the changes. They are fitted to both. Joint errors do not
     imitate changes that are far larger than what they leave.
     """
-    noises = [_noise(_residuals(each)) for each in (without, fit)]
-    if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
+    changes = [cause for cause in session.causes if not cause.block.is_constant]
+    numbers = session.timeline.fitted_numbers
+    shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]
+    share = float(min([1.0, *(min(each, 1 - each) for each in shares)]))
+    # Half of the samples on the shorter side of a step have larger residuals.
+    sizes = [_sizes(_residuals(each), 1 - share / 2) for each in (without, fit)]
+    if max(np.max(a / b) for a, b in zip(*sizes, strict=True)) > MIN_GROSS_RATIO:
         return True
     unchanged = extended(without)
     residuals = [_residuals(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
-    noise = _noise(residuals[1])
+    noise = [1.4826 * size for size in _sizes(residuals[1], 0.5)]
     costs = [
         sum(
             float(np.sum(np.minimum(np.sum((r / s) ** 2, 0), len(r) + MAX_SAMPLE_COST)))
@@ -51,11 +56,7 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
         for each in residuals
     ]
     gain, n_rows = costs[0] - costs[1], sum(r.size for r in residuals[1])
-    changes = [cause for cause in session.causes if not cause.block.is_constant]
     n_coefficients = sum(len(cause.values) for cause in changes)
-    numbers = session.timeline.fitted_numbers
-    shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]
-    share = min([1.0, *(min(each, 1 - each) for each in shares)])
     needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
     return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
 
@@ -72,9 +73,9 @@ def _with_changes(fit: Fit, data: tuple[Measurement, ...], session: Session) -> 
     return replace(fit, data=data, problem=problem, solution=solution, weights=weights)
 
 
-def _noise(residuals: Sequence[Array]) -> list[Array]:
-    """Estimate the noise of each row of residuals (k, m) each, (k, 1) each."""
-    return [np.maximum(1.4826 * np.median(np.abs(r), 1, keepdims=True), MIN_NOISE) for r in residuals]
+def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
+    """Return the size that a share of the samples does not exceed, of each row of residuals (k, m) each."""
+    return [np.fmax(np.quantile(np.abs(r), share, axis=1, keepdims=True), MIN_NOISE) for r in residuals]
 
 
 def _residuals(fit: Fit) -> Sequence[Array]:
