@@ -75,7 +75,7 @@ def photograph(
     scene = scene.placed(rng)
     shown = scene.show(q, play)
     if len(shown.good) < 2 * n_images:
-        return photograph(seed + 10_000, n_images, is_on_wrist=is_on_wrist, wrong=wrong)
+        return photograph(seed + 10_000, n_images, is_on_wrist=scene.camera.link == "tip", wrong=wrong)
     others = shown.good[n_images:]
     images = scene.detect(shown, shown.good[:n_images], rng)
     return PaperArm(scene.arm, nominal_arm(), images, (shown.read[others], shown.local[others]))
