@@ -93,11 +93,14 @@ def test_few_images_say_what_is_missing_and_this_helps():
     assert 5 + int(found[1]) == len(q)
     # The joints that are named move farther in the other images.
     for text in found[2].split(", "):
-        name, low, high = re.fullmatch(r"(\w+) (\S+)° to (\S+)°", text).groups()
+        match = re.fullmatch(r"(\w+) (\S+)° to (\S+)°", text)
+        assert match
+        name, low, high = match.groups()
         moved = np.rad2deg(np.ptp(q[:, shot.nominal.joint_names.index(name)]))
         assert moved > float(high) - float(low)
     fit = calibrate(shot.nominal, images)
     assert fit.verdict.status == "ok"
+    assert fit.signs
     assert set(fit.signs.turned) == set(shot.arm.wrong)
     before, after = errors_of(shot, fit)
     assert after < 0.2 * before
