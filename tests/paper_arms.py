@@ -42,15 +42,30 @@ class PaperArm:
 
     def held_out_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
         """Return the distances of the middle of the board in the camera from the truth, (k,) [m]."""
+        found, truth = self._middles(chain, instruments)
+        return np.linalg.norm(found - truth, axis=1)
+
+    def tool_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
+        """Return these distances (k,) [m] for the camera at its best pose: they are errors of the arm alone.
+
+        The image centre of a lens that is not known can be exchanged for a rotation of the camera.
+        """
+        found, truth = (each - each.mean(0) for each in self._middles(chain, instruments))
+        u, _, v = np.linalg.svd(truth.T @ found)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        return np.linalg.norm(found @ rotation.T - truth, axis=1)
+
+    def _middles(self, chain: Chain, instruments: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the computed and the true middle of the board in the camera, (k, 3) each [m]."""
         q, truth = self.held_out
         rig, tools = self.images.rig, chain.poses(q)
-        (camera, board), mount = (_pose(instruments, name) for name in ("camera_cam", "board_paper")), rig
-        if mount.camera_mounts[0].moves:
+        camera, board = (_pose(instruments, name) for name in ("camera_cam", "board_paper"))
+        if rig.camera_mounts[0].moves:
             found = inverse(tools @ camera) @ board
         else:
             found = inverse(camera) @ tools @ board
         middle = np.append(rig.boards[0].points.mean(0), 1.0)
-        return np.linalg.norm((found @ middle - truth @ middle)[:, :3], axis=1)
+        return (found @ middle)[:, :3], (truth @ middle)[:, :3]
 
 
 def _pose(values: dict[str, float], name: str) -> np.ndarray:
@@ -75,7 +90,7 @@ def photograph(
     scene = scene.placed(rng)
     shown = scene.show(q, play)
     if len(shown.good) < 2 * n_images:
-        return photograph(seed + 10_000, n_images, is_on_wrist=is_on_wrist, wrong=wrong)
+        return photograph(seed + 10_000, n_images, is_on_wrist=scene.camera.link == "tip", wrong=wrong)
     others = shown.good[n_images:]
     images = scene.detect(shown, shown.good[:n_images], rng)
     return PaperArm(scene.arm, nominal_arm(), images, (shown.read[others], shown.local[others]))

@@ -70,10 +70,11 @@ def test_signs_are_right_and_the_arm_is_as_good_as_if_its_errors_were_known(n_im
             inside = fit.generalization.cross_validated
             assert inside is not None
             # The prediction contains play and sag: they are in the left-out images, too.
-            predictions.append(inside.after.groups["board"].rms / after)
+            tool = rms(shot.tool_errors(fit.chain, fit.instruments))
+            predictions.append(inside.after.groups["board"].rms / tool)
     if ratios:
         assert np.exp(np.mean(np.log(ratios))) < max_ratio
-        assert 0.5 < np.exp(np.mean(np.log(predictions))) < 2
+        assert 0.7 < np.exp(np.mean(np.log(predictions))) < 1.4
 
 
 @pytest.mark.slow
@@ -92,11 +93,14 @@ def test_few_images_say_what_is_missing_and_this_helps():
     assert 5 + int(found[1]) == len(q)
     # The joints that are named move farther in the other images.
     for text in found[2].split(", "):
-        name, low, high = re.fullmatch(r"(\w+) (\S+)° to (\S+)°", text).groups()
+        match = re.fullmatch(r"(\w+) (\S+)° to (\S+)°", text)
+        assert match
+        name, low, high = match.groups()
         moved = np.rad2deg(np.ptp(q[:, shot.nominal.joint_names.index(name)]))
         assert moved > float(high) - float(low)
     fit = calibrate(shot.nominal, images)
     assert fit.verdict.status == "ok"
+    assert fit.signs
     assert set(fit.signs.turned) == set(shot.arm.wrong)
     before, after = errors_of(shot, fit)
     assert after < 0.2 * before
