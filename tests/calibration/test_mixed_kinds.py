@@ -112,7 +112,7 @@ def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):
 
 @pytest.mark.parametrize("image_noise", [1e-4, 3e-3])
 def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_tool(image_noise):
-    """Images of this noise show nothing of the arm, or little; positions of a tracker show that it is wrong."""
+    """Images of this noise show little of the arm; positions of a tracker show that it is wrong."""
     rng = np.random.default_rng(9)
     arm = read_robot("example:ur10", tip="tool0")
     truth = placed(small_errors(arm, rng))

@@ -10,8 +10,8 @@ of the arm are those of greatest evidence at T, however narrow.
   is demonstrably wrong. It is estimated at T = 1 + N/20 with the prior widths of greatest evidence at T = 1,
   which are never below the default ones.
 - r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images.
-- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the arm
-  is demonstrably wrong, too, whatever the images show.
+- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
+  arm is demonstrably wrong, too, whatever the images show.
 - Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
   imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
@@ -242,7 +242,7 @@ def _trial(
 
 
 def _others_ratio(fit: Fit, max_iterations: int) -> float:
-    """Return the error of left-out rows of other instruments with the arm of a fit over that of the nominal one.
+    """Return the error of left-out rows of other instruments over that with the nominal arm.
 
     It is NaN if there are too few.
     """
