@@ -17,7 +17,7 @@ from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
 from robots import missing, paper
 
 from dhcal_pin import plots
-from dhcal_pin.calibration import evidence
+from dhcal_pin.calibration import evidence, verdict
 from dhcal_pin.plausibility.mixups import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
@@ -70,6 +70,14 @@ def unsuspected() -> Iterator[None]:
     """Leave out the search for mistakes in measurements, which takes seconds if an arm has large errors."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
+        yield
+
+
+@pytest.fixture(scope="module")
+def own_loss() -> Iterator[None]:
+    """Judge a calibration by its own loss alone; the verdict of another loss takes a second calibration."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(verdict, "_other_loss", lambda *_: [])
         yield
 
 

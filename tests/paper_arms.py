@@ -7,7 +7,8 @@ torques are those of Pinocchio.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +18,7 @@ from servo_arms import JOINTS, RANGES, SO101, TIP, ServoArm
 from dhcal_pin import Chain, read_robot
 from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.measurements import CameraCorners
-from dhcal_pin.measurements.mounting import mount_rig
+from dhcal_pin.measurements.mounting import MountedRig, mount_rig
 from dhcal_pin.plausibility.signs import with_wide_limits
 from dhcal_pin.se3 import inverse, transform
 
@@ -68,47 +69,123 @@ def photograph(
 ) -> PaperArm:
     """Simulate the photographs of an arm; a seed gives another arm, camera and board."""
     rng = np.random.default_rng(seed)
-    arm = ServoArm.random(rng, wrong=wrong)
-    arm = replace(arm, base=pin.SE3.Identity(), tool=pin.SE3.Identity())
-    is_on_wrist = bool(rng.integers(2)) if is_on_wrist is None else is_on_wrist
-    columns, rows, square = ON_TABLE if is_on_wrist else ON_GRIPPER
-    board = Board("paper", "world" if is_on_wrist else "tip", "checkerboard", columns=columns, rows=rows,
-                  square=square)  # fmt: skip
-    focal = rng.uniform(850, 1150)
-    lens = np.array([focal, focal * rng.uniform(0.995, 1.005), 639.5 + rng.normal(0, 12),
-                     359.5 + rng.normal(0, 12), rng.uniform(-0.2, 0.1), rng.normal(0, 0.03),
-                     *rng.normal(0, 5e-4, 2), 0.0])  # fmt: skip
-    camera = Camera("cam", "tip" if is_on_wrist else "world", WIDTH, HEIGHT, np.full(9, np.nan),
-                    LENSES["pinhole"], "free")  # fmt: skip
-    q = arm.configurations(rng, 4000, 0.8)
-    play = np.deg2rad(0.5) / 2 * rng.choice([-1.0, 1.0], q.shape)
-    tools = arm.poses(_sagged(arm.model, q + play))
-    camera_pose, board_pose = _places(rng, tools, board, is_on_wrist)
-    if is_on_wrist:
-        local = inverse(tools @ camera_pose) @ board_pose
-    else:
-        local = inverse(camera_pose) @ tools @ board_pose
-    points = np.einsum("kij,cj->kci", local[:, :3, :3], board.points) + local[:, None, :3, 3]
-    pixels = LENSES["pinhole"].project(points.reshape(-1, 3).T, lens)[0].T.reshape(*points.shape[:2], 2)
-    is_seen = np.all((pixels > 5) & (pixels < [WIDTH - 6, HEIGHT - 6]), 2)
-    is_seen &= (points[..., 2] > 0.08) & (points[..., 2] < 0.7)
-    is_seen &= np.linalg.norm(points[..., :2], axis=2) < 0.8 * points[..., 2]
-    # The printed side faces the camera, less than 60 degrees aside.
-    facing = np.sum(local[:, :3, 2] * local[:, :3, 3], 1) / np.linalg.norm(local[:, :3, 3], axis=1)
-    is_seen &= (np.abs(facing) > 0.5)[:, None]
-    good = np.flatnonzero(is_seen.sum(1) >= 12)
-    if len(good) < 2 * n_images:
+    scene = _Scene.random(rng, is_on_wrist, wrong)
+    q = scene.arm.configurations(rng, 4000, 0.8)
+    play = rng.choice([-1.0, 1.0], q.shape)
+    scene = scene.placed(rng)
+    shown = scene.show(q, play)
+    if len(shown.good) < 2 * n_images:
         return photograph(seed + 10_000, n_images, is_on_wrist=is_on_wrist, wrong=wrong)
-    counts = arm.counts(q)
-    middles = np.array([sum(RANGES[name]) / 2 for name in JOINTS])
-    read = np.deg2rad(360.0 * (counts - middles) / 4095.0)
-    chosen, nominal = good[:n_images], nominal_arm()
-    image, corner = np.nonzero(is_seen[chosen])
-    values = pixels[chosen][image, corner] + rng.normal(0, 0.3, (len(image), 2))
-    rig = mount_rig(Rig({"cam": camera}, {"paper": board}), nominal)
-    images = CameraCorners(read[chosen][image], values, corner, rig)
-    others = good[n_images:]
-    return PaperArm(arm, nominal, images, (read[others], local[others]))
+    others = shown.good[n_images:]
+    images = scene.detect(shown, shown.good[:n_images], rng)
+    return PaperArm(scene.arm, nominal_arm(), images, (shown.read[others], shown.local[others]))
+
+
+def photograph_plan(
+    seed: int, choose: Callable[[Chain, MountedRig], np.ndarray], *, is_on_wrist: bool
+) -> PaperArm:
+    """Photograph poses (m, 5) that are chosen with the nominal arm and a rig that is about right.
+
+    The arm is led to the poses by hand, with errors of 3 degrees in each joint. Poses without a view of the
+    board are left out.
+    """
+    rng = np.random.default_rng(seed)
+    scene, nominal = _Scene.random(rng, is_on_wrist, None).placed(rng).facing(), nominal_arm()
+    camera, board = (
+        pose @ transform(pin.exp3(rng.normal(0, 0.05, 3)), rng.normal(0, 0.01, 3))
+        for pose in (scene.camera_pose, scene.board_pose)
+    )
+    lens = np.array([1000.0, 1000.0, 639.5, 359.5, 0, 0, 0, 0, 0])
+    rig = Rig(
+        {"cam": replace(scene.camera, values=lens, pose=camera)}, {"paper": replace(scene.board, pose=board)}
+    )
+    q = choose(nominal, mount_rig(rig, nominal))
+    q = q + rng.normal(0, np.deg2rad(3), q.shape)
+    shown = scene.show(q, rng.choice([-1.0, 1.0], q.shape))
+    return PaperArm(scene.arm, nominal, scene.detect(shown, shown.good, rng), (shown.read, shown.local))
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """Board in images of m configurations."""
+
+    read: np.ndarray  # Joint values as read, (m, 5)
+    local: np.ndarray  # Poses in the camera, (m, 4, 4)
+    pixels: np.ndarray  # Corners in the image, (m, c, 2)
+    is_seen: np.ndarray  # Which corners are found, (m, c)
+
+    @property
+    def good(self) -> np.ndarray:
+        """Numbers of the configurations with enough corners."""
+        return np.flatnonzero(self.is_seen.sum(1) >= 12)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Arm, camera and board."""
+
+    arm: ServoArm
+    board: Board
+    camera: Camera
+    lens: np.ndarray
+    camera_pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    board_pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    @classmethod
+    def random(cls, rng: np.random.Generator, is_on_wrist: bool | None, wrong: int | None) -> _Scene:
+        arm = ServoArm.random(rng, wrong=wrong)
+        arm = replace(arm, base=pin.SE3.Identity(), tool=pin.SE3.Identity())
+        is_on_wrist = bool(rng.integers(2)) if is_on_wrist is None else is_on_wrist
+        columns, rows, square = ON_TABLE if is_on_wrist else ON_GRIPPER
+        board = Board("paper", "world" if is_on_wrist else "tip", "checkerboard", columns=columns, rows=rows,
+                      square=square)  # fmt: skip
+        focal = rng.uniform(850, 1150)
+        lens = np.array([focal, focal * rng.uniform(0.995, 1.005), 639.5 + rng.normal(0, 12),
+                         359.5 + rng.normal(0, 12), rng.uniform(-0.2, 0.1), rng.normal(0, 0.03),
+                         *rng.normal(0, 5e-4, 2), 0.0])  # fmt: skip
+        camera = Camera("cam", "tip" if is_on_wrist else "world", WIDTH, HEIGHT, np.full(9, np.nan),
+                        LENSES["pinhole"], "free")  # fmt: skip
+        return cls(arm, board, camera, lens)
+
+    def placed(self, rng: np.random.Generator) -> _Scene:
+        """Place camera and board in their links."""
+        camera, board = _places(rng, self.board, self.camera.link == "tip")
+        return replace(self, camera_pose=camera, board_pose=board)
+
+    def facing(self) -> _Scene:
+        """Turn the printed side of the board to the camera: its z axis points away from it."""
+        if self.camera.link == "tip" and self.board_pose[2, 2] < 0:
+            return self
+        middle = transform(np.eye(3), self.board.points.mean(0))
+        half_turn = transform(pin.exp3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
+        return replace(self, board_pose=self.board_pose @ middle @ half_turn @ inverse(middle))
+
+    def show(self, q: np.ndarray, play: np.ndarray) -> _Shown:
+        """Photograph the board at true joint values (m, 5), on side 1 or -1 of the play of each joint."""
+        tools = self.arm.poses(_sagged(self.arm.model, q + np.deg2rad(0.5) / 2 * play))
+        if self.camera.link == "tip":
+            local = inverse(tools @ self.camera_pose) @ self.board_pose
+        else:
+            local = inverse(self.camera_pose) @ tools @ self.board_pose
+        points = np.einsum("kij,cj->kci", local[:, :3, :3], self.board.points) + local[:, None, :3, 3]
+        pixels = LENSES["pinhole"].project(points.reshape(-1, 3).T, self.lens)[0].T
+        pixels = pixels.reshape(*points.shape[:2], 2)
+        is_seen = np.all((pixels > 5) & (pixels < [WIDTH - 6, HEIGHT - 6]), 2)
+        is_seen &= (points[..., 2] > 0.08) & (points[..., 2] < 0.7)
+        is_seen &= np.linalg.norm(points[..., :2], axis=2) < 0.8 * points[..., 2]
+        # The printed side faces the camera, less than 60 degrees aside.
+        facing = np.sum(local[:, :3, 2] * local[:, :3, 3], 1) / np.linalg.norm(local[:, :3, 3], axis=1)
+        is_seen &= (np.abs(facing) > 0.5)[:, None]
+        middles = np.array([sum(RANGES[name]) / 2 for name in JOINTS])
+        read = np.deg2rad(360.0 * (self.arm.counts(q) - middles) / 4095.0)
+        return _Shown(read, local, pixels, is_seen)
+
+    def detect(self, shown: _Shown, chosen: np.ndarray, rng: np.random.Generator) -> CameraCorners:
+        """Return the corners of some images with noise."""
+        image, corner = np.nonzero(shown.is_seen[chosen])
+        values = shown.pixels[chosen][image, corner] + rng.normal(0, 0.3, (len(image), 2))
+        rig = mount_rig(Rig({"cam": self.camera}, {"paper": self.board}), nominal_arm())
+        return CameraCorners(shown.read[chosen][image], values, corner, rig)
 
 
 def _sagged(model: pin.Model, q: np.ndarray) -> np.ndarray:
@@ -123,9 +200,7 @@ def _sagged(model: pin.Model, q: np.ndarray) -> np.ndarray:
     return out
 
 
-def _places(
-    rng: np.random.Generator, tools: np.ndarray, board: Board, is_on_wrist: bool
-) -> tuple[np.ndarray, np.ndarray]:
+def _places(rng: np.random.Generator, board: Board, is_on_wrist: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return the poses of camera and board in their links."""
     centre = transform(np.eye(3), -board.points.mean(0))
     small = transform(pin.exp3(rng.normal(0, 0.1, 3)), rng.uniform(-0.01, 0.01, 3))

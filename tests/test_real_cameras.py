@@ -21,6 +21,8 @@ from dhcal_pin.cli import main
 from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.ros_packages import resolve_robot_path
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 # Corners of a virtual board: 3 x 3 points, 80 mm apart [m].
 GRID = 0.08 * np.array([[x, y, 0.0] for y in (-1, 0, 1) for x in (-1, 0, 1)])
 LENS = np.array([640.0, 640, 640, 360, 0, 0, 0, 0, 0])

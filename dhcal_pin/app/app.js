@@ -3,7 +3,12 @@
 
 const LIMIT = Number(document.documentElement.dataset.limit);
 const MAX_FILES = Number(document.documentElement.dataset.files);
-const ROLES = { robot: "Robot", data: "Measurements", columns: "Column map", beside: "Sidecar or other" };
+const ROLES = {
+  robot: "Robot", data: "Measurements", images: "Photograph or video", rig: "Rig: camera and board", servos: "Servos",
+  columns: "Column map", beside: "Sidecar or other",
+};
+// Uses of which there is one file: a new one replaces the other.
+const SINGLE = ["robot", "columns", "rig", "servos"];
 const ROBOT = /\.(urdf|dh\.toml|dh\.csv|ya?ml)$/i;
 // Pause before the files are checked again after a change [ms].
 const CHECK_DELAY = 300;
@@ -43,7 +48,7 @@ function showError(id, text) {
 // Controls of the page by the options of the command line.
 const CONTROLS = {
   "--skip-bad-rows": "“Skip rows that lack a number or a name”", "--tip": "“Tip link”", "--columns": "a column map among the files",
-  "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
+  "--rig": "a rig file among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
 };
 
 // A message of the command, in the words of the page.
@@ -57,23 +62,28 @@ const named = role => [...files].filter(([, entry]) => entry.role === role).map(
 
 // --- files -----------------------------------------------------------------------------------------
 
-function roleOf(name) {
+async function roleOf(file) {
+  const { name } = file;
   if (/\.calibration\.toml$/i.test(name)) return "beside";
   if (ROBOT.test(name)) return "robot";
-  return /\.toml$/i.test(name) ? "columns" : "data";
+  if (/\.json$/i.test(name)) return "servos";
+  if (/\.(png|jpe?g|bmp|tiff?|webp|mp4|mov|avi|mkv|webm)$/i.test(name)) return "images";
+  if (!/\.toml$/i.test(name)) return "data";
+  const text = await file.text();
+  return /^\s*\[\s*(camera|board)\b/m.test(text) ? "rig" : /^\s*(\[\s*motor\b|lerobot\s*=)/m.test(text) ? "servos" : "columns";
 }
 
-// There is one robot and one column map: a new one replaces the other.
 function setRole(name, role) {
-  if (role === "robot" || role === "columns") {
+  if (SINGLE.includes(role)) {
     for (const [other, entry] of files) if (other !== name && entry.role === role) files.delete(other);
   }
   files.get(name).role = role;
 }
 
-function addFiles(added) {
+async function addFiles(added) {
+  added = [...added];
   const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
-  const size = [...added].reduce((sum, file) => sum + file.size, total);
+  const size = added.reduce((sum, file) => sum + file.size, total);
   if (files.size + added.length > MAX_FILES) {
     showError("file-error", `More than ${MAX_FILES} files; join the rows of several measurement files in one.`);
     return;
@@ -83,10 +93,11 @@ function addFiles(added) {
     return;
   }
   showError("file-error", "");
-  for (const file of added) {
+  const roles = await Promise.all(added.map(roleOf));
+  added.forEach((file, i) => {
     files.set(file.name, { file, role: "beside" });
-    setRole(file.name, roleOf(file.name));
-  }
+    setRole(file.name, roles[i]);
+  });
   filesChanged();
 }
 
@@ -97,11 +108,18 @@ function filesChanged() {
   showFiles();
   showLinks();
   showHoldoutFiles();
+  // Images have errors of their own, and all of them are needed.
+  const hasRig = named("rig").length > 0;
+  if (hasRig && !$("parameters").disabled) $("holdout").value = $("parameters").value = "";
+  $("parameters").disabled = hasRig;
+  $("parameters").options[0].text = hasRig ? "Arm, camera, board, lens" : "Joint origins, base, tool (default)";
   check();
 }
 
 function showFiles() {
-  $("files").replaceChildren(...[...files].map(([name, { file, role }]) => {
+  const images = named("images"), others = [...files].filter(([, { role }]) => role !== "images");
+  const rest = images.length ? [photographsItem(images)] : [];
+  $("files").replaceChildren(...rest, ...others.map(([name, { file, role }]) => {
     const use = element("select", { ariaLabel: `Use of ${name}` },
       ...Object.entries(ROLES).map(([value, text]) => element("option", { value, selected: value === role }, text)));
     use.onchange = () => { setRole(name, use.value); filesChanged(); };
@@ -110,6 +128,15 @@ function showFiles() {
     return element("li", {}, element("span", { className: "name" }, name),
       element("span", { className: "size" }, megabytes(file.size)), use, remove);
   }));
+}
+
+// All photographs are one entry of the list.
+function photographsItem(names) {
+  const size = names.reduce((sum, name) => sum + files.get(name).file.size, 0);
+  const remove = element("button", { type: "button", ariaLabel: "Remove all photographs" }, "Remove");
+  remove.onclick = () => { for (const name of names) files.delete(name); filesChanged(); $("picker").focus(); };
+  return element("li", {}, element("span", { className: "name" }, count(names.length, "photograph")),
+    element("span", { className: "size" }, megabytes(size)), remove);
 }
 
 // Suggests the links of the URDF as tip.
@@ -144,8 +171,8 @@ function showHoldoutFiles() {
 
 function form(request) {
   const out = new FormData();
-  const [robot] = named("robot"), [columns] = named("columns");
-  const options = { robot: robot ?? "", columns: columns ?? "", tip: $("tip").disabled ? "" : $("tip").value.trim() };
+  const options = { tip: $("tip").disabled ? "" : $("tip").value.trim(), images: named("images") };
+  for (const role of SINGLE) options[role] = named(role)[0] ?? "";
   out.append("request", JSON.stringify({ ...options, ...request }));
   for (const [name, { file }] of files) out.append("file", file, name);
   return out;
@@ -174,7 +201,9 @@ function failure(error) {
 // --- check -----------------------------------------------------------------------------------------
 
 function updateButtons() {
-  const missing = [...(named("robot").length ? [] : ["a robot"]), ...(named("data").length ? [] : ["measurements"])];
+  const hasImages = named("images").length > 0, measured = hasImages ? "a table of the joint values or counts of each photograph" : "measurements";
+  const missing = [...(named("robot").length ? [] : ["a robot"]), ...(named("data").length ? [] : [measured]),
+    ...(hasImages && !named("rig").length ? ["a rig file with camera and board"] : [])];
   $("cancel").hidden = $("progress").hidden = !running;
   $("calibrate").disabled = !!running || missing.length > 0;
   $("needed").textContent = running || !missing.length ? "" : `Add ${missing.join(" and ")}.`;
@@ -184,7 +213,7 @@ function check() {
   clearTimeout(timer);
   checking?.abort();
   updateButtons();
-  if (!named("data").length) {
+  if (!named("data").length && !named("images").length) {
     $("check").replaceChildren(element("p", { className: "hint" }, "The content of the files is shown here."));
     return;
   }
@@ -196,7 +225,7 @@ async function inspect() {
   $("check").replaceChildren(element("p", { className: "hint" }, "Reading the files …"));
   const show = message => {
     if (controller.signal.aborted) return;
-    const cards = message.error ? [element("p", { className: "error" }, spoken(message.error))] : message.result.files.map(fileCard);
+    const cards = message.error ? [element("p", { className: "error" }, spoken(message.error))] : message.result.boards ? message.result.boards.map(boardCard) : message.result.files.map(fileCard);
     $("check").replaceChildren(...cards);
   };
   try {
@@ -207,6 +236,13 @@ async function inspect() {
 }
 
 const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
+// What was found in the photographs.
+function boardCard({ board, images, used, problems }) {
+  const missed = Object.entries(problems).map(([name, problem]) => `${name}: ${problem}`);
+  return element("div", { className: `card ${used ? missed.length ? "warning" : "ok" : "problem"}` }, element("h3", {}, "Photographs"),
+    element("p", {}, `Board ${board} was found in ${used} of ${count(images, "photograph")}.`), list(missed));
+}
 
 function fileCard(file) {
   const bad = Object.entries(file.bad_rows).map(([line, reason]) => `line ${line}: ${reason}`);
@@ -303,9 +339,10 @@ function accuracies(result) {
     const add = (quantity, key, format) => {
       if (before[key] !== undefined && before[key] !== null) out.push([quantity, judged, format(before[key]), format(after[key])]);
     };
-    add("position", "position_rms_m", value => `${digits(1e3 * value)} mm`);
-    add("orientation", "orientation_rms_rad", value => `${digits(1e3 * value)} mrad`);
-    add("residual", "residual_rms", value => before.unit === "m" ? `${digits(1e3 * value)} mm` : `${digits(value)} ${before.unit ?? ""}`);
+    add("RMS position error", "position_rms_m", value => `${digits(1e3 * value)} mm`);
+    add("RMS orientation error", "orientation_rms_rad", value => `${digits(1e3 * value)} mrad`);
+    add("RMS error at the board", "board_rms_m", value => `${digits(1e3 * value)} mm`);
+    add(before.unit === "px" ? "RMS image error" : "RMS residual error", "residual_rms", value => before.unit === "m" ? `${digits(1e3 * value)} mm` : `${digits(value)} ${before.unit ?? ""}`);
   }
   return out;
 }
@@ -326,12 +363,12 @@ function showResult({ result, status, screen, files: outputs }) {
   if (!isRefused && rows.length) {
     const [quantity, judged, before, after] = rows[0];
     const value = (name, text) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
-    parts.push(element("h3", {}, `RMS ${quantity} error, ${judged}`),
+    parts.push(element("h3", {}, `${quantity}, ${judged}`),
       element("dl", { className: "headline" }, value("before", before), value("after", after)));
   }
   for (const quantity of new Set(rows.map(([name]) => name))) {
     const shown = rows.filter(([name]) => name === quantity).map(([, ...row]) => row);
-    parts.push(table(`RMS ${quantity} error`, ["judged on", "before", "after"], shown));
+    parts.push(table(quantity, ["judged on", "before", "after"], shown));
   }
   if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings.map(spoken))));
   parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem)));
@@ -341,7 +378,7 @@ function showResult({ result, status, screen, files: outputs }) {
   $("result").hidden = false;
 }
 
-const outputName = outputs => outputs.find(({ name }) => name.endsWith(".urdf"))?.name ?? "calibrated.urdf";
+const outputName = outputs => outputs.find(({ name }) => /_calibrated\.(json|urdf)$/.test(name))?.name ?? "calibrated.urdf";
 
 // Buttons for the remedies that the reasons name.
 function remedies(reasons) {
@@ -382,6 +419,16 @@ for (const name of ["dragover", "dragleave", "drop"]) {
   });
 }
 $("tip").onchange = check;
+$("example").onclick = async () => {
+  try {
+    const example = await (await fetch("example")).json();
+    files.clear();
+    $("tip").value = example.tip;
+    await addFiles(Object.entries(example.files).map(([name, text]) => new File([text], name)));
+  } catch (error) {
+    showError("file-error", failure(error));
+  }
+};
 $("options").onsubmit = event => event.preventDefault();
 $("calibrate").onclick = () => calibrate();
 $("cancel").onclick = () => running?.abort();

@@ -35,17 +35,35 @@ _PROGRESS = re.compile(r"progress: (.*) (\d+)/(\d+)")
 _PREFIX = re.compile(r"^dhcal( \w+)?: ")
 _SEE_HELP = re.compile(r"; see dhcal \w+ --help$")
 _REPORT, _SCENE, _RESULT, _RESIDUALS = "report.html", "scene.html", "result.json", "residuals.csv"
+# Corners that are found in photographs.
+_CORNERS = "corners.csv"
+# Phase of a search for corners.
+_DETECTING = {"phase": "finding the board in the photographs", "step": 1, "total": 1}
 
 
 async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
     """Yield messages about what the measurement files in a folder contain."""
-    kept = [word for word in upload.options if word.startswith(("--tip=", "--columns="))]
-    robot = [f"--robot={upload.robot}", *kept] if upload.robot else []
+    if upload.images:
+        error = await _detect(upload, folder)
+        yield error or {"result": _read_json(folder)}
+        return
+    kept = [word for name in ("tip", "columns", "rig", "servos") for word in upload.option(name)]
+    robot = [f"--robot={upload.robot}", *kept] if upload.robot else upload.option("rig")
     run = _Run(folder)
-    async with aclosing(run.lines("inspect", *upload.data, *robot, f"--json={_RESULT}")) as lines:
-        async for _ in lines:
-            pass
+    await run.finish("inspect", *upload.data, *robot, f"--json={_RESULT}")
     yield run.error() or {"result": _read_json(folder)}
+
+
+async def _detect(upload: Upload, folder: Path) -> dict[str, str]:
+    """Find the corners in the photographs of a folder; return an error, if there is one."""
+    rig = upload.option("rig")
+    if not rig:
+        return {"error": "photographs need a rig file; add one with a camera and a board (.toml)"}
+    run = _Run(folder)
+    await run.finish(
+        "detect", *upload.images, *rig, f"--joints={upload.data[0]}", "-o", _CORNERS, f"--json={_RESULT}"
+    )
+    return run.error()
 
 
 async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
@@ -53,10 +71,18 @@ async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, An
     if not upload.robot:
         yield {"error": "no robot file; add a URDF or a DH table"}
         return
-    name = upload.robot_name
-    urdf = f"{name}_calibrated.urdf"
+    data = upload.data
+    if upload.images:
+        yield _DETECTING
+        if error := await _detect(upload, folder):
+            yield error
+            return
+        data = (_CORNERS, *data[1:])
+    stem = f"{upload.robot_name}_calibrated"
+    is_lerobot = any(word.lower().endswith(".json") for word in upload.option("servos"))
+    output = f"{stem}.json" if is_lerobot else f"{stem}.urdf"
     files = [f"--report={_REPORT}", f"--scene={_SCENE}", f"--json={_RESULT}", f"--residuals={_RESIDUALS}"]
-    words = [upload.robot, *upload.data, *upload.options, "-o", urdf, *files, "--progress=lines"]
+    words = [upload.robot, *data, *upload.options, "-o", output, *files, "--progress=lines"]
     run = _Run(folder)
     screen = []
     async with aclosing(run.lines("calibrate", *words)) as lines:
@@ -69,10 +95,13 @@ async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, An
         yield error
         return
     labels = {
-        urdf: "Corrected URDF",
-        f"{name}_calibrated.calibration.toml": "Sidecar: base, tool and joint errors",
+        f"{stem}.json": "Corrected calibration of LeRobot",
+        f"{stem}.urdf": "Corrected URDF",
+        f"{stem}.servos.toml": "Servos with corrected zeros",
+        f"{stem}.calibration.toml": "Sidecar: base, tool and joint errors",
         _REPORT: "Report",
         _SCENE: "3-D scene",
+        **({_CORNERS: "Corners in the photographs"} if upload.images else {}),
         _RESIDUALS: "Residuals of all rows",
         _RESULT: "All figures as JSON",
     }
@@ -114,6 +143,12 @@ class _Run:
                 self._last_line = line.strip() or self._last_line
                 yield line
             self.status = await process.wait()
+
+    async def finish(self, *words: str) -> None:
+        """Run a command to its end."""
+        async with aclosing(self.lines(*words)) as lines:
+            async for _ in lines:
+                pass
 
     def error(self, *accepted: int) -> dict[str, str]:
         """Describe the failure of the command."""

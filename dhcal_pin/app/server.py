@@ -26,6 +26,7 @@ import tornado.netutil
 import tornado.web
 
 from ..exceptions import DhcalError, InvalidArgumentError
+from ..io.shipped_files import shipped_file
 from ..loopback import LOOPBACK, is_same_origin, local_application, new_token
 from ..messages import message_line
 from . import command
@@ -149,6 +150,7 @@ def _routes(service: _Service) -> list[tuple[Any, ...]]:
     pages = {"": "app.html", "app.css": "app.css", "app.js": "app.js"}
     operations: dict[str, Operation] = {"inspect": command.inspect, "calibrate": command.calibrate}
     return [
+        ("example", _ExampleHandler),
         *((path, _PageHandler, {"file": file, "limit": service.limit}) for path, file in pages.items()),
         *(
             (path, _RunHandler, {"service": service, "operation": operation})
@@ -179,6 +181,15 @@ class _PageHandler(_Handler):
         text = self._path.read_text(encoding="utf-8")
         text = text.replace("@LIMIT_BYTES@", str(self._limit)).replace("@MAX_FILES@", str(MAX_FILES))
         self.write(text)
+
+
+class _ExampleHandler(_Handler):
+    """Files of an example by name: photographs of a servo arm, whose corners were found, and its tip link."""
+
+    def get(self) -> None:
+        paths = [Path(shipped_file("so101.urdf")), *sorted((_PAGE_FOLDER / "example").iterdir())]
+        files = {path.name: path.read_text(encoding="utf-8") for path in paths}
+        self.write({"files": files, "tip": "gripper_frame_link"})
 
 
 @tornado.web.stream_request_body

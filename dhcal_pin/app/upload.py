@@ -22,8 +22,10 @@ _MAX_NAME_BYTES = 255
 # Largest number of files, and longest command line that is made of a request [bytes].
 MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
-_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns")
+_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos")
 _TOO_MANY_FILES = f"more than {MAX_FILES} files; join the rows of several measurement files in one"
+# Files of a request by their use, and what there is without any.
+_FILE_KEYS: Mapping[str, Any] = {"robot": "", "data": [], "images": []}
 # Options without a value.
 _SWITCHES = ("skip-bad-rows", "force")
 # Options with a list of texts.
@@ -36,7 +38,9 @@ class Upload:
 
     files: Mapping[str, bytes]  # Content of each file, by name
     robot: str  # Name of the robot file; empty if there is none
-    data: tuple[str, ...]  # Names of the measurement files
+    # Names of the measurement files; with photographs the first one has the joint values or counts of each.
+    data: tuple[str, ...]
+    images: tuple[str, ...]  # Names of the photographs
     options: tuple[str, ...]  # Words of the command line
 
     @classmethod
@@ -62,21 +66,28 @@ class Upload:
             if name in files:
                 raise InvalidArgumentError(f"{quote(name)}: two files have this name; rename one of them")
             files[name] = part["body"]
-        robot, data = request.pop("robot", ""), request.pop("data", [])
+        robot, data, images = (request.pop(key, empty) for key, empty in _FILE_KEYS.items())
         options = _option_words(request)
-        if not isinstance(data, list) or not data:
-            raise InvalidArgumentError("no measurement file; add at least one")
-        names = [*([robot] if robot else []), *data]
+        if not isinstance(data, list) or not isinstance(images, list) or not data:
+            missing = (
+                "table of the joint values or counts of each photograph" if images else "measurement file"
+            )
+            raise InvalidArgumentError(f"no {missing}; add at least one")
+        names = [*([robot] if robot else []), *data, *images]
         if unknown := [name for name in names if name not in files]:
             raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
         if sum(len(word.encode()) + 1 for word in (*names, *options)) > _MAX_COMMAND_BYTES:
             raise InvalidArgumentError("names and options are too long; expected at most 100 kB together")
-        return cls(files, robot, tuple(data), options)
+        return cls(files, robot, tuple(data), tuple(images), options)
 
     def save(self, folder: Path) -> None:
         """Write the files."""
         for name, content in self.files.items():
             (folder / name).write_bytes(content)
+
+    def option(self, name: str) -> list[str]:
+        """Return the word of an option as a list; empty without it."""
+        return [word for word in self.options if word.startswith(f"--{name}=")]
 
     @property
     def robot_name(self) -> str:

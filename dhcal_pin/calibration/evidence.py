@@ -18,6 +18,7 @@ from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
 from ..plausibility.signs import SignDecision
 from ..session import Session
+from .cameras.arm_types import INDUSTRIAL, ArmType
 from .cameras.board_size import BoardSize
 from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
 from .cameras.stages import Stage
@@ -69,6 +70,7 @@ class Evidence(FittedModel):
             calibration did.
         signs: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are
             those of the URDF.
+        arm_type: Limits by which images are judged.
     """
 
     region_comparison: Comparison | None = None
@@ -81,6 +83,7 @@ class Evidence(FittedModel):
     session: Session | None = None
     with_auto: Callable[[], Evidence] | None = None
     signs: SignDecision | None = None
+    arm_type: ArmType = INDUSTRIAL
 
     @cached_property
     def rows_per_direction(self) -> float:

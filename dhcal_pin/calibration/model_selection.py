@@ -107,10 +107,12 @@ EVIDENCE_TOL = 0.05
 MIN_NOISE_RATIO = 0.02
 # Narrowest prior of a family, as a fraction of the expected one.
 MIN_PRIOR_WIDTH = 1e-3
-# From this number of rows per line on, curves are tried only if lines stand out of the spectrum.
-SCREENED_ROWS_PER_UNKNOWN = 2
-# Highest line of white residuals, as a square in standard deviations, and largest excess of the sum of all.
+# From this number of rows per line on, the lines of residuals hardly depend on each other and on the fit.
+MANY_ROWS_PER_LINE = 2
+# Highest of these lines for white residuals, as a square in standard deviations, and largest excess of all.
 MAX_WHITE_LINE, SCREENING_SIGMAS = 20.0, 3.0
+# Largest excess of the sum for fewer rows. Curves that the measurements support have at least 2.1.
+FEW_ROWS_SIGMAS = 1.5
 # Limits of the scale of predicted standard deviations. Regions that are left out lie nearer to the others
 # than the rest of the workspace does; they may hardly lower a prediction.
 MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE = 0.8, 3.0
@@ -413,11 +415,46 @@ def _select(candidates: _Candidates, names: Sequence[str], model: _Model) -> tup
         remaining.remove(best.family)
 
 
-def _may_have_curves(problem: Problem, x: Array, orders: range) -> bool:
+def _may_have_curves(problem: Problem, x: Array, curves: Sequence[ErrorParameter], orders: range) -> bool:
+    """Check whether curves stand out of white residuals; this costs far less than a trial of them.
+
+    The prior weights of the problem are those that x was fitted with.
+    """
+    if any(item.configurations_per_row != 1 for item in problem.data):
+        return True
+    if count_rows(problem) < MANY_ROWS_PER_LINE * len(curves):
+        return _line_excess(problem, x, curves) > FEW_ROWS_SIGMAS
+    return _have_lines(problem, x, orders)
+
+
+def _line_excess(problem: Problem, x: Array, curves: Sequence[ErrorParameter]) -> float:
+    """Compute by how many standard deviations residuals along the columns of curves exceed white ones.
+
+    With M = I - J·(Jᵀ·J + W²)⁻¹·Jᵀ, white noise ε of variance σ² leaves the residuals r = M·ε. Their
+    components along the unit columns A of the curves have the sum of squares ‖Aᵀ·r‖². For B = M·A, its mean
+    is σ²·‖B‖² and its variance 2·σ⁴·‖Bᵀ·B‖². The estimate of σ² is ‖r‖²/‖M‖².
+    """
+    extended, start, family = _with_families(problem, x, {HARMONICS: list(curves)})
+    linearization = extended.linearize(start)
+    rows = np.concatenate(
+        [linearization.rows(chunk).reshape(len(family) + 1, -1) for chunk in extended.chunks], 1
+    )
+    own, residual = family == HARMONICS, rows[-1]
+    jacobian, lines = rows[:-1][~own], rows[:-1][own]
+    lines = lines / np.fmax(np.linalg.norm(lines, axis=1, keepdims=True), np.finfo(float).tiny)
+    information = jacobian @ jacobian.T + np.diag(extended.weights[~own] ** 2)
+    left = np.eye(len(residual)) - jacobian.T @ np.linalg.lstsq(information, jacobian, rcond=None)[0]
+    columns = left @ lines.T
+    variance = float(residual @ residual) / np.sum(left**2)
+    excess = np.sum((lines @ residual) ** 2) / max(variance, np.finfo(float).tiny) - np.sum(columns**2)
+    return float(excess / np.sqrt(2 * np.sum((columns.T @ columns) ** 2)))
+
+
+def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
     """Check whether lines stand out of the spectrum of the residuals over the joint values.
 
-    The check costs far less than a trial of the curves. With the whitened column a of a joint, the residuals
-    r with standard deviation 1, and white residuals, the sums
+    With the whitened column a of a joint, the residuals r with standard deviation 1, and white residuals, the
+    sums
 
         z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
 
@@ -426,11 +463,7 @@ def _may_have_curves(problem: Problem, x: Array, orders: range) -> bool:
     robot = len(problem.errors.parameters)
     chain = problem.errors.at(x[:robot])
     first = [p for p in PARAMETER_SETS[HARMONICS](chain) if p.name.endswith(("sin1", "cos1"))]
-    n_lines = len(first) * len(orders)
-    n_rows = count_rows(problem)
-    is_single = all(item.configurations_per_row == 1 for item in problem.data)
-    if n_rows < SCREENED_ROWS_PER_UNKNOWN * n_lines or not is_single:
-        return True
+    n_lines, n_rows = len(first) * len(orders), count_rows(problem)
     # The columns of sin q and cos q give the column a = a·sin q·sin q + a·cos q·cos q of each joint.
     errors = ErrorModel(chain, ()).with_parameters(first)
     instruments = x[robot:]
@@ -670,7 +703,7 @@ def _select_families(
     physical_families = [family.name for family in FAMILIES.values() if family.rule.is_universal]
     for added, tiers in stages:
         is_curve, orders = FAMILIES[added[0]].is_curve, FAMILIES[added[0]].orders
-        if is_curve and not _may_have_curves(problem, x, orders):
+        if is_curve and not _may_have_curves(problem, x, missing[added[0]], orders):
             break
         families = {
             name: ps for name, ps in missing.items() if name in (*model.widths, *added, *physical_families)
@@ -696,7 +729,7 @@ def _select_families(
             random_ratio = candidates.cv_error(model) / geometry if geometry else 1.0
         if is_curve and added[0] not in model.widths:
             break
-        problem = candidates.problem
+        problem = replace(candidates.problem, weights=candidates.weights(model.widths) * model.noise)
         x = np.array([model.values.get(name, 0.0) for name in _unknown_names(problem)])
     return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
 

@@ -52,6 +52,7 @@ from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
 from . import model_selection
 from .cameras import (
+    arm_type,
     default_sets,
     exchange_axes,
     has_images,
@@ -224,7 +225,7 @@ def calibrate(
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
     groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(groups, stages, max_iterations, progress, LOW_COST in robot_sets)
+        fitting = ImageFitting(groups, stages, max_iterations, progress, arm_type(robot_sets))
         images = calibrate_images(fitting, fit, chain, holdout, exchanges)
         return replace(images, signs=signs, with_auto=with_auto)
     fit = reweighted(fit, stages)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._typing import Array
+from ..estimation.solver import minimize
 from ..session import Session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
@@ -21,6 +22,8 @@ from .reweighting import Fit
 
 # Logarithm of the evidence that each coefficient of a change costs.
 COST_PER_COEFFICIENT = 5.0
+# Largest number of iterations of the fit of changes and joint errors.
+MAX_ITERATIONS = 20
 # Ratio of the noise without changes to that with them above which no comparison with joint errors is needed.
 MIN_GROSS_RATIO = 10.0
 
@@ -29,13 +32,19 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     """Return whether changes explain measurements beside all families of joint errors.
 
     `without` and `fit` are the first fits without and with the changes; `extended` adds all families of joint
-    errors that the measurements support. Joint errors do not imitate changes
-    that are far larger than what they leave.
+    errors that the measurements support without the changes. They are fitted to both. Joint errors do not
+    imitate changes that are far larger than what they leave.
     """
     noises = [_noise(_residuals(each)) for each in (without, fit)]
     if max(np.max(a / b) for a, b in zip(*noises, strict=True)) > MIN_GROSS_RATIO:
         return True
-    residuals = [_residuals(extended(each)) for each in (without, fit)]
+    unchanged = extended(without)
+    timeline = session.timeline
+    fitted, _ = session.applied(unchanged.problem.data, timeline.data[timeline.n_fitted :])
+    problem = unchanged.problem.with_data(fitted)
+    solution = minimize(problem, "lm", unchanged.solution.x, MAX_ITERATIONS, loose=True)
+    changed = replace(unchanged, data=fit.data, problem=problem, solution=solution)
+    residuals = [_residuals(each) for each in (unchanged, changed)]
     noise = _noise(residuals[1])
     costs = [
         sum(

@@ -24,7 +24,7 @@ from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
-from .cameras.diagnosis import MAX_PLAY_ERROR
+from .cameras.seen_ranges import small_ranges
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -41,8 +41,8 @@ MIN_MOTION = 1e-3
 MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
 # Errors after the fit by their unit: lengths relative to the size of the workspace, rotations [rad], image
 # coordinates [px]. Above the first, measurements and robot are to be checked; above the second, they do not
-# belong together.
-MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1, "px": 10.0}
+# belong together. The first of image coordinates depends on the type of arm.
+MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
 # Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
 MAX_FRAME_RATIO = 1 / 3
@@ -119,7 +119,7 @@ class Verdict:
 
 def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
-    findings = _unmoved_joints(fit)
+    findings = _unmoved_joints(fit) or _few_images(fit)
     if not any(finding.status == "refused" for finding in findings):
         findings += [*_mixups(fit.diagnosis), *_signs(fit), *_board_size(fit), *_two_robots(fit)]
     if not any(finding.status == "refused" for finding in findings):
@@ -171,6 +171,21 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
     text += ": the calibration holds only where they stand."
     return [Finding("caution", f"{text} Move them, too.")]
+
+
+def _few_images(fit: Evidence) -> list[Finding]:
+    """Refuse images that are too few for the type of arm, and say what is missing."""
+    needed, advised = fit.arm_type.min_images, fit.arm_type.advised_images
+    count = fit.extension.n_configurations if fit.extension else needed
+    if count >= needed or (fit.hand_eye and fit.hand_eye.is_noise):
+        return []
+    text = (
+        f"{count} different images are too few for the zeros and signs of this arm. Take at least "
+        f"{needed - count} more, better {advised - count}."
+    )
+    if small := small_ranges(fit.chain, fit.data):
+        text += f" Turn the joints that moved less than half of their range: {', '.join(small)}."
+    return [Finding("refused", text)]
 
 
 def _mixups(diagnosis: Diagnosis) -> list[Finding]:
@@ -231,8 +246,7 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that does not fit the measurements after the calibration either."""
     for group, after in fit.comparisons[-1].after.groups.items():
         error = after.rms / (workspace_radius(fit.chain) if after.unit == "m" else 1.0)
-        has_play = fit.signs is not None and after.unit == "px"
-        if error <= (MAX_PLAY_ERROR if has_play else MAX_USUAL_ERROR[after.unit]):
+        if error <= MAX_USUAL_ERROR.get(after.unit, fit.arm_type.max_error):
             continue
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
         text = f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms}"

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 # Value of --holdout for regions of joint space that are left out in turn.
 REGION = "region"
-# Values of --arm.
-ARMS = ("industrial", "low-cost")
 # Exit status with --strict of robots that are written with another verdict than "ok".
 DOUBTFUL = 4
 # File extension of a bundle, and of a manifest of several jobs.
@@ -77,15 +75,7 @@ class Job:
     skip_bad_rows: bool = field(default=False, metadata=options.SKIP_BAD_ROWS)
     mend: tuple[str, ...] = field(default=(), metadata=options.MEND)
     parameters: str | None = field(default=None, metadata=options.PARAMETERS)
-    arm: str | None = field(
-        default=None,
-        metadata={
-            "choices": ARMS,
-            "help": "low-cost: a servo arm that was put together by hand (default with --servos): estimate "
-            "its zeros, with the parameter set low-cost, and decide which joints turn the other way; "
-            "industrial: any other (default)",
-        },
-    )
+    arm: str | None = field(default=None, metadata=options.ARM)
     turned: str = field(
         default="auto",
         metadata={

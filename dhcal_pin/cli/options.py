@@ -138,6 +138,12 @@ SERVOS: dict[str, Any] = {
     "help": "servo file of columns NAME[ticks] with counts: LeRobot's calibration of the arm (.json), or "
     ".toml",
 }
+ARM: dict[str, Any] = {
+    "choices": ("industrial", "low-cost"),
+    "help": "low-cost: a servo arm that was put together by hand (default with --servos): estimate its "
+    "zeros, with the parameter set low-cost, and decide which joints turn the other way; industrial: any "
+    "other (default)",
+}
 SKIP_BAD_ROWS: dict[str, Any] = {
     "help": "skip rows that lack a number or a name, instead of an error that lists them"
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from .._typing import Array, PathLike
 from ..compensation import LIMITS, compensate
+from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import read_configurations, read_measurement_file, read_targets
 from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
@@ -22,7 +24,7 @@ from ..measurements.base import Noise
 from ..measurements.mounting import MountedRig, mount_rig
 from ..planning.changes import N_VISITS, change_options, repeated_count
 from ..planning.planner import MAX_CANDIDATES
-from ..planning.views import PlannedImages, with_measured_poses
+from ..planning.views import PlannedImages, with_measured_poses, with_typical_lenses
 from ..robot.chain import Chain
 from ..robot.collision import Obstacle, obstacles_from_urdf
 from ..robot.sampling import WorkspaceConstraints
@@ -30,7 +32,15 @@ from ..robot.urdf import read_urdf
 from ..units import ANGLES, LENGTHS, parse_noise
 from .options import split_commas
 from .outputs import existing_sidecars
-from .plan_options import DEFAULT_IMAGE_SIGMA, DEFAULT_SIGMA, N_CANDIDATES, N_IMAGE_CANDIDATES, N_RECHECKED
+from .plan_options import (
+    DEFAULT_IMAGE_SIGMA,
+    DEFAULT_LOW_COST_SIGMA,
+    DEFAULT_SIGMA,
+    LOW_COST_VIEWS,
+    N_CANDIDATES,
+    N_IMAGE_CANDIDATES,
+    N_RECHECKED,
+)
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
@@ -38,7 +48,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 def input_paths(args: Namespace) -> list[str]:
     """List the files that a plan reads."""
     paths = [args.robot, *existing_sidecars([args.robot]), *(args.data or [])]
-    paths += filter(None, (args.candidates_from, args.task, args.columns, args.instrument))
+    paths += filter(None, (args.candidates_from, args.task, args.columns, args.instrument, args.servos))
     paths += [*filter(_is_scene, args.obstacle), *([args.rig] if args.rig else [])]
     return paths if args.priors in (None, "default") else [*paths, args.priors]
 
@@ -53,7 +63,12 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
     images, noise = None, None
     if rig is not None:
-        images, noise = _planned_images(args, with_measured_poses(rig, chain, data))
+        rig, is_low_cost = with_measured_poses(rig, chain, data), LOW_COST in chain.parameters
+        sigma = args.sigma or (DEFAULT_LOW_COST_SIGMA if is_low_cost else DEFAULT_IMAGE_SIGMA)
+        options = LOW_COST_VIEWS if is_low_cost else {}
+        images, noise = _planned_images(
+            args, with_typical_lenses(rig) if is_low_cost else rig, sigma, options
+        )
     elif args.sigma or not any(item.kind == kind for item in data):
         noise = Noise(*parse_noise(args.sigma or DEFAULT_SIGMA, "--sigma"))
     keywords = {
@@ -124,13 +139,15 @@ def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
     return mount_rig(with_poses_of(rig, calibrated) if calibrated else rig, chain)
 
 
-def _planned_images(args: Namespace, rig: MountedRig) -> tuple[PlannedImages, Noise]:
+def _planned_images(
+    args: Namespace, rig: MountedRig, sigma: str, defaults: Mapping[str, float]
+) -> tuple[PlannedImages, Noise]:
     """Return the images to plan and the noise of the robot, from the options that need --rig."""
-    pixels, *others = (args.sigma or DEFAULT_IMAGE_SIGMA).split(",")
-    sigma = _parse_pixels(pixels, "--sigma", f"pixels above zero first, such as {DEFAULT_IMAGE_SIGMA}")
+    pixels, *others = sigma.split(",")
+    noise_px = _parse_pixels(pixels, "--sigma", f"pixels above zero first, such as {DEFAULT_IMAGE_SIGMA}")
     noise = Noise(*parse_noise(",".join(others), "--sigma")) if others else Noise()
     distance = _parse_distances(args.distance) if args.distance else None
-    options: dict[str, Any] = {"sigma": sigma, "distance": distance}
+    options: dict[str, Any] = {**defaults, "sigma": noise_px, "distance": distance}
     if args.angle:
         options["max_angle"] = _parse_angle(args.angle, "--angle", 90.0)
     if args.corners is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser
+from math import radians
 
 from . import options
 
@@ -10,6 +11,10 @@ from . import options
 DEFAULT_SIGMA = "0.1mm,0.01deg"
 # Standard deviation of detected corners and the same robot, used with --rig.
 DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
+# The same of a low-cost arm, whose joints have play.
+DEFAULT_LOW_COST_SIGMA = "0.3px,1mm,0.5deg"
+# Views of a low-cost arm, which is led to the poses by hand or by servos with wrong zeros.
+LOW_COST_VIEWS = {"min_share": 0.7, "joint_error": radians(5.0)}
 # Poses of a check.
 N_RECHECKED = 10
 # Random candidates; images have more rows each, and more of their candidates are good.
@@ -97,7 +102,8 @@ def _add_measurement_options(parser: ArgumentParser) -> None:
         "--corners",
         metavar="SHARE",
         type=float,
-        help="with --rig: smallest share of the corners of a board that is in the image (default: 1)",
+        help="with --rig: smallest share of the corners of a board that is in the image (default: 1; 0.7 "
+        "for a low-cost arm)",
     )
     parser.add_argument(
         "--border",
@@ -132,6 +138,8 @@ def _add_calibration_options(parser: ArgumentParser) -> None:
         help="configurations where the accuracy matters: joint values, or tool positions x[mm],y[mm],z[mm]",
     )
     parser.add_argument("--parameters", **options.PARAMETERS)
+    parser.add_argument("--arm", **options.ARM)
+    parser.add_argument("--servos", **options.SERVOS)
     parser.add_argument("--fix", default="", **options.FIX)
     parser.add_argument("--free", default="", **options.FREE)
     parser.add_argument(

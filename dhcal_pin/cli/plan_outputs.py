@@ -14,6 +14,7 @@ import numpy as np
 from .._typing import Array
 from ..io.measurement_files import configurations_text
 from ..io.robot import robot_name
+from ..io.servo_file import read_servos
 from ..planning.planner import Plan
 from ..planning.views import CameraViews
 from ..programs import Program, Stop, program_text
@@ -52,6 +53,7 @@ class Planned:
             f"predicted position error {1e3 * plan.error:.4g} mm RMS with standard deviation "
             f"{pixels}{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
         ]
+        comments += _counts(self)
         units = self.args.joint_units
         decimals = DEGREE_DECIMALS if units == "deg" else None
         return configurations_text(plan.q, self.chain, [*comments, *self.moves], units, decimals)
@@ -70,6 +72,21 @@ class Planned:
             rig=images.rig if images else None,
             title=f"{len(plan.q)} poses for {robot_name(self.args.robot)}",
         )
+
+
+def _counts(done: Planned) -> list[str]:
+    """Return the counts of the servos at each pose."""
+    if not done.args.servos:
+        return []
+    servos, names = read_servos(done.args.servos).servos, done.chain.joint_names
+    lines = []
+    for number, q in enumerate(done.plan.q, 1):
+        values = dict(zip(names, q.tolist(), strict=True))
+        counts = [
+            f"{s.joint} {round(s.zero + values[s.joint] / s.step)}" for s in servos if s.joint in values
+        ]
+        lines.append(f"counts of pose {number}: {', '.join(counts)}")
+    return lines
 
 
 def _move_texts(result: Plan) -> list[str]:

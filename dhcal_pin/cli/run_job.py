@@ -43,13 +43,13 @@ from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.hypotheses import JOINT_CHANGES, mend
 from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
 from ..robot.correction_table import joint_corrections
+from .arm_types import with_arm_type
 from .bundle_content import bundle_content
 from .job import REGION, Job
 from .job_outputs import (
@@ -123,8 +123,7 @@ def run_job(
     inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
-    if job.arm == "low-cost" or (servos and job.arm is None and job.parameters is None):
-        chain = replace(chain, parameters=HAND_BUILT)
+    chain = with_arm_type(chain, job.arm, job.servos, job.parameters)
     if job.payload:
         chain = chain.with_payload(parse_payload(job.payload))
     sets = job.parameters if job.parameters is not None else MIXED_SETS if job.rig else chain.parameters
@@ -191,8 +190,6 @@ def _holdout_file(job: Job) -> str | None:
 def checked_inputs(job: Job) -> list[str]:
     """Check the paths of a job; return those of its input files."""
     servos = read_servos(job.servos) if job.servos else None
-    if job.arm and job.parameters:
-        raise InvalidArgumentError("--arm: not allowed with --parameters, which may name the set low-cost")
     if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
         raise InvalidArgumentError(
             f"--mend {changes[0]}: not allowed with --servos; expected a corrected servo file, or --turned "
@@ -407,6 +404,9 @@ def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **o
     full = full_fit.comparisons[0]
     if not full_fit.converged or full.after.groups[group].rms > MAX_ERROR_RATIO * after.rms:
         return ""
+    fitted = {item.source: item for item in full_fit.data}
+    if any(poorly_fitted_files(full_fit.chain, fitted, full_fit.instruments).values()):
+        return ""  # More parameters do not explain the measurements either.
     with_full_set, with_this_set = summary.headline([full]).after, summary.headline([current]).after
     return (
         f"--parameters {FULL_SET} reduces the RMS {ERROR_GROUPS[group].label} on samples that are not "

@@ -64,7 +64,10 @@ _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Model of all corners at one state. Derivatives by the unknowns are computed on first use."""
+    """Model of all corners at one state. Derivatives by the unknowns are computed on first use.
+
+    What belongs to a camera or a board has shape (..., 1) if the rig has only one, else (..., m).
+    """
 
     pixels: Array  # Image coordinates, (2, m) [px]
     by_local: Array  # Derivative by the corner in the frame of the camera, (2, 3, m) [px/m]
@@ -77,43 +80,45 @@ class _Projection:
     arm: Array  # Corner relative to the camera in the frame of the camera's end, (3, m) [m]
     turned: Array  # Corner relative to the board in the frame of the board's end, (3, m) [m]
     lever: Array  # Corner relative to the tool in the measuring frame, (3, m) [m]
-    camera_links: Array  # Axes of the link of the camera in the frame of its end, (3, 3, m)
-    board_links: Array  # Axes of the link of the board in the frame of its end, (3, 3, m)
-    # Derivative of the camera's rotation by its rotation vector, (3, 3, m); see `_end_poses`.
+    camera_links: Array  # Axes of the link of each camera in the frame of its end, (c, 3, 3)
+    board_links: Array  # Axes of the link of each board in the frame of its end, (b, 3, 3)
+    # Derivative of the rotation of each camera by its rotation vector, (c, 3, 3); see `_end_poses`.
     camera_turns: Array
-    board_turns: Array  # Derivative of the board's rotation by its rotation vector, (3, 3, m)
-
-    @property
-    def by_velocity(self) -> Array:
-        """Derivative by the velocity of the tool, (2, 6, m)."""
-        # Axes of the measuring frame in the camera, with the sign of the motion of the corner.
-        measuring = np.where(self.moves, -_product(self.to_camera, self.between), self.to_camera)
-        by_linear = _product(self.by_local, measuring)
-        return np.concatenate([by_linear, -_cross(by_linear, self.lever)], 1)
-
-    @property
-    def by_camera(self) -> Array:
-        """Derivative by position and rotation vector of the camera, (2, 6, m)."""
-        by_position = -_product(self.by_local, self.to_camera)
-        # d = R_cᵀ·[arm]×·Jl·δ for a change δ of the rotation vector of the camera in its end.
-        by_rotation = _product(-_cross(by_position, self.arm), self.camera_turns)
-        return np.concatenate([_product(by_position, self.camera_links), by_rotation], 1)
-
-    @property
-    def by_board(self) -> Array:
-        """Derivative by position and rotation vector of the board, (2, 6, m)."""
-        by_rotation = _product(-_cross(self._by_end, self.turned), self.board_turns)
-        return np.concatenate([_product(self._by_end, self.board_links), by_rotation], 1)
-
-    @property
-    def by_point(self) -> Array:
-        """Derivative by the corner in its board, (2, 3, m)."""
-        return _product(self._by_end, self.board_axes)
+    board_turns: Array  # Derivative of the rotation of each board by its rotation vector, (b, 3, 3)
 
     @cached_property
-    def _by_end(self) -> Array:
+    def by_velocity(self) -> Array:
+        """Derivative by the velocity of the tool, (2, 6, m)."""
+        by_linear = np.where(self.moves, -self._by_board_end, self._by_camera_end)
+        return np.concatenate([by_linear, -_cross(by_linear, self.lever)], 1)
+
+    def by_camera(self, number: int, samples: slice | Array) -> Array:
+        """Derivative of samples of a camera by its position and rotation vector, (2, 6, k)."""
+        by_position = -self._by_camera_end[:, :, samples]
+        # d = R_cᵀ·[arm]×·Jl·δ for a change δ of the rotation vector of the camera in its end.
+        by_rotation = -_cross(by_position, self.arm[:, samples])
+        return _by_pose(by_position, self.camera_links[number], by_rotation, self.camera_turns[number])
+
+    def by_board(self, number: int, samples: slice | Array) -> Array:
+        """Derivative of samples of a board by its position and rotation vector, (2, 6, k)."""
+        by_position = self._by_board_end[:, :, samples]
+        by_rotation = -_cross(by_position, self.turned[:, samples])
+        return _by_pose(by_position, self.board_links[number], by_rotation, self.board_turns[number])
+
+    @cached_property
+    def by_point(self) -> Array:
+        """Derivative by the corner in its board, (2, 3, m)."""
+        return _product(self._by_board_end, self.board_axes)
+
+    @cached_property
+    def _by_camera_end(self) -> Array:
+        """Derivative by the corner in the frame of the camera's end, (2, 3, m)."""
+        return _product(self.by_local, self.to_camera)
+
+    @cached_property
+    def _by_board_end(self) -> Array:
         """Derivative by the corner in the frame of the board's end, (2, 3, m)."""
-        return _product(self.by_local, _product(self.to_camera, self.between))
+        return _product(self._by_camera_end, self.between)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -396,31 +401,33 @@ class CameraCorners(Measurement):
         """Project all corners."""
         m = len(self.rows)
         camera_parts, board_parts = self._split(u)
-        mounts = self.rig.camera_mounts
-        camera_poses, camera_turns = _end_poses(camera_parts, mounts)
-        board_poses, board_turns = _end_poses(board_parts, self.rig.board_mounts)
+        mounts, n_cameras = self.rig.camera_mounts, len(camera_parts)
+        poses, turns = _end_poses([*camera_parts, *board_parts], [*mounts, *self.rig.board_mounts])
+        camera_poses, board_poses = poses[:n_cameras], poses[n_cameras:]
         points = np.zeros((3, m))
         for number, corners in enumerate(self.points(u)):
-            of_board = self.board == number
+            of_board = _samples_of(self.board, number)
             points[:, of_board] = corners[self.corner[of_board]].T
-        moves = np.array([mount.moves for mount in mounts], bool)[self.camera]
+        moves = _of_samples(np.array([mount.moves for mount in mounts], bool), self.camera)
         tool = frames.tool
-        r_camera = camera_poses[self.camera, :3, :3].transpose(1, 2, 0)
-        r_board = board_poses[self.board, :3, :3].transpose(1, 2, 0)
+        r_camera, r_board = (
+            _of_samples(poses[:, :3, :3].transpose(1, 2, 0), numbers)
+            for poses, numbers in ((camera_poses, self.camera), (board_poses, self.board))
+        )
         turned = _rotate(r_board, points)
-        on_end = turned + board_poses[self.board, :3, 3].T
+        on_end = turned + _of_samples(board_poses[:, :3, 3].T, self.board)
         # Rotation of the tool [columns are axes], and of the link of the board in the link of the camera.
         r_tool = tool[:3].swapaxes(0, 1)
         r_between = np.where(moves, r_tool.swapaxes(0, 1), r_tool)
         # The corner in the frame of the camera's end.
         lever = np.where(moves, on_end - tool[3], _rotate(r_tool, on_end))
         in_end = np.where(moves, _rotate(r_between, on_end - tool[3]), lever + tool[3])
-        arm = in_end - camera_poses[self.camera, :3, 3].T
+        arm = in_end - _of_samples(camera_poses[:, :3, 3].T, self.camera)
         to_camera = r_camera.swapaxes(0, 1)
         local = _rotate(to_camera, arm)
         pixels, by_local, by_lens = np.empty((2, m)), np.empty((2, 3, m)), []
         for number, (camera, values) in enumerate(zip(self.rig.cameras, self.lens_values(u), strict=True)):
-            of_camera = self.camera == number
+            of_camera = _samples_of(self.camera, number)
             found = camera.lens.project(local[:, of_camera], values)
             pixels[:, of_camera], by_local[:, :, of_camera] = found[:2]
             by_lens.append(found[2])
@@ -436,10 +443,10 @@ class CameraCorners(Measurement):
             arm=arm,
             turned=turned,
             lever=lever,
-            camera_links=camera_poses_of_links(mounts)[self.camera].transpose(1, 2, 0),
-            board_links=camera_poses_of_links(self.rig.board_mounts)[self.board].transpose(1, 2, 0),
-            camera_turns=camera_turns[self.camera].transpose(1, 2, 0),
-            board_turns=board_turns[self.board].transpose(1, 2, 0),
+            camera_links=np.array([mount.link_pose[:3, :3] for mount in mounts]),
+            board_links=np.array([mount.link_pose[:3, :3] for mount in self.rig.board_mounts]),
+            camera_turns=turns[:n_cameras],
+            board_turns=turns[n_cameras:],
         )
 
     @cached_property
@@ -488,7 +495,7 @@ class CameraCorners(Measurement):
         start = 0
         for number, camera in enumerate(self.rig.cameras):
             of_camera = _samples_of(self.camera, number)
-            out[start : start + 6, :, of_camera] = found.by_camera[:, :, of_camera].swapaxes(0, 1)
+            out[start : start + 6, :, of_camera] = found.by_camera(number, of_camera).swapaxes(0, 1)
             start += 6
             if camera.intrinsics != "fixed":
                 size = len(camera.values)
@@ -496,7 +503,7 @@ class CameraCorners(Measurement):
                 start += size
         for number, board in enumerate(self.rig.boards):
             of_board = _samples_of(self.board, number)
-            out[start : start + 6, :, of_board] = found.by_board[:, :, of_board].swapaxes(0, 1)
+            out[start : start + 6, :, of_board] = found.by_board(number, of_board).swapaxes(0, 1)
             start += 6
             if board.has_free_points:
                 for axis in range(3):
@@ -630,11 +637,6 @@ def simulated_rig(chain: Chain, q: Array) -> Rig:
     return Rig(cameras, {"target": board})
 
 
-def camera_poses_of_links(mounts: Sequence[Any]) -> Array:
-    """Return the rotations of the links of mounts in the frames of their ends."""
-    return np.array([mount.link_pose[:3, :3] for mount in mounts])
-
-
 def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Array]:
     """Return poses in the frames of the ends (c, 4, 4), and their derivatives by rotation vectors (c, 3, 3).
 
@@ -642,20 +644,31 @@ def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Ar
     """
     values = np.array([part[:6] for part in parts])
     links = np.array([mount.link_pose for mount in mounts])
-    poses = links @ se3.transform(se3.exp3(values[:, 3:]), values[:, :3])
-    return poses, links[:, :3, :3] @ left_jacobian(values[:, 3:])
+    rotations, jacobians = exp_and_jacobian(values[:, 3:])
+    return links @ se3.transform(rotations, values[:, :3]), links[:, :3, :3] @ jacobians
 
 
-def left_jacobian(rotvec: Array) -> Array:
-    """Compute the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order."""
-    _, second, third = se3.exp_coefficients(np.linalg.norm(rotvec, axis=-1))
+def exp_and_jacobian(rotvec: Array) -> tuple[Array, Array]:
+    """Compute exp(φ) and the left Jacobian of SO(3): exp(φ + δ) = exp(Jl·δ)·exp(φ) to first order."""
+    first, second, third = (c[..., None, None] for c in se3.exp_coefficients(np.linalg.norm(rotvec, axis=-1)))
     k = se3.skew(rotvec)
-    return np.eye(3) + second[..., None, None] * k + third[..., None, None] * (k @ k)
+    square = k @ k
+    return np.eye(3) + first * k + second * square, np.eye(3) + second * k + third * square
 
 
 def _samples_of(numbers: Array, number: int) -> slice | Array:
     """Return the index of the samples with a number, a slice without copies if all samples have it."""
     return slice(None) if np.all(numbers == number) else np.flatnonzero(numbers == number)
+
+
+def _of_samples(values: Array, numbers: Array) -> Array:
+    """Return values (..., c) of cameras or boards for each sample, (..., m); for all of them if c is 1."""
+    return values if values.shape[-1] == 1 else values.take(numbers, axis=-1)
+
+
+def _by_pose(by_position: Array, link: Array, by_rotation: Array, turn: Array) -> Array:
+    """Return derivatives (2, 6, k) by a pose from those by its position and rotation in its end."""
+    return np.concatenate([link.T @ by_position, turn.T @ by_rotation], 1)
 
 
 def _rotate(rotations: Array, vectors: Array) -> Array:

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from .._typing import Array
-from ..calibration.cameras import DEFAULT_SETS, held_values, split_sets
+from ..calibration.cameras import held_values, image_sets, split_sets
 from ..calibration.procedure import calibrate
 from ..estimation import qr
 from ..estimation.error_model import ErrorModel
@@ -270,7 +270,9 @@ def _before_images(planned: PlannedCalibration, images: PlannedImages, q: Array)
     Existing images are linearized at the nominal robot: a plan does not depend on their measured values.
     """
     chain = planned.chain
-    robot_sets, rig_sets = split_sets(planned.parameters if planned.parameters is not None else DEFAULT_SETS)
+    robot_sets, rig_sets = split_sets(
+        planned.parameters if planned.parameters is not None else image_sets(chain)
+    )
     errors = ErrorModel(chain, ())
     if robot_sets or planned.free:
         errors = select_parameters(chain, robot_sets, planned.fix, planned.free)

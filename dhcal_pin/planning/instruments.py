@@ -26,7 +26,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise, whitened_jacobian
-from ..measurements.camera import CameraCorners, left_jacobian
+from ..measurements.camera import CameraCorners, exp_and_jacobian
 from ..measurements.images import rig_parameters
 from ..robot.chain import Chain
 from .views import PlannedImages
@@ -286,7 +286,7 @@ class _End:
     @classmethod
     def of_pose(cls, pose: Array, link: Array, point: Array, first: int, u: Array) -> _End:
         """Return an end that the parameters of its pose move; `first` is the first of these six."""
-        turn = link @ left_jacobian(u[first + 3 : first + 6])
+        turn = link @ exp_and_jacobian(u[first + 3 : first + 6])[1]
         zero = np.zeros((3, 3))
         return cls(pose, point, first + np.arange(6), np.hstack([link, zero]), np.hstack([zero, turn]))
 

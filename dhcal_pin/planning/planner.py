@@ -24,10 +24,12 @@ import numpy as np
 
 from .._typing import Array, Progress
 from ..calibration.cameras import judged_boards
+from ..estimation.parameters import LOW_COST
 from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise
+from ..plausibility.signs import simulate_decision
 from ..plots import plot_plan_curve
 from ..robot.chain import Chain
 from ..robot.collision import CollisionChecker
@@ -261,7 +263,22 @@ def plan(
     predicted = _predict(searched, goal, pool, found, notes, rng)
     next(phases)
     limits = limits_with_margin(chain, margin.rotation, margin.position)
-    return _in_order_of_tour(replace(predicted, criterion=criterion, curves=curves), pool, limits, rng)
+    ordered = _in_order_of_tour(replace(predicted, criterion=criterion, curves=curves), pool, limits, rng)
+    if LOW_COST in (parameters or chain.parameters).split(","):
+        ordered = replace(ordered, notes=(*ordered.notes, _signs_note(chain, ordered.q, rng)))
+    return ordered
+
+
+def _signs_note(chain: Chain, q: Array, rng: np.random.Generator) -> str:
+    """Say whether poses at joint positions (m, n) decide which joints of the arm turn the other way."""
+    found = simulate_decision(chain, q, rng)
+    if not found.is_compared:
+        return "so few poses do not decide which joints turn the other way; plan at least 8"
+    undecided = {name for each in found.open for name in each.joints} | set(found.turned)
+    if undecided:
+        names = ", ".join(name for name in chain.joint_names if name in undecided)
+        return f"in a simulation, the poses leave the signs of {names} open; plan more poses"
+    return "in a simulation with play of 0.5°, the poses decide which joints turn the other way"
 
 
 def _require_enough(count: int, candidates: int | Array) -> None:

@@ -22,6 +22,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
+from ..measurements.images import ViewLimits
 from ..robot.inverse_kinematics import characteristic_length, pose_task, solve_ik, wrap_into_limits
 from ..robot.sampling import ConfigurationSampler, collect_draws
 from .views import PlannedImages, draw_views
@@ -30,6 +31,8 @@ from .views import PlannedImages, draw_views
 _IK_STEPS, _BATCH = 40, 1000
 # Rounds of draws per batch of configurations, and rounds without any board in view before giving up.
 _MAX_ROUNDS, _MAX_EMPTY_ROUNDS = 60, 3
+# Errors of all joints together at which a board must still be in view.
+_N_ERRORS = 6
 # Part of the line of sight next to the board that is not checked: the board has a thickness.
 _BOARD_SHARE = 0.05
 
@@ -48,8 +51,9 @@ class ViewSampler(ConfigurationSampler):
     def in_workspace(self, q: Array) -> Array:
         """Return in which configurations the tool is in the workspace and a board is in view."""
         inside = super().in_workspace(q)
-        near = np.flatnonzero(inside)
-        inside[near] = self.images.in_view(self.chain.poses(q[near]))
+        for error in self._joint_errors:
+            near = np.flatnonzero(inside)
+            inside[near] = self.images.in_view(self.chain.poses(q[near] + error))
         return inside
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
@@ -94,7 +98,7 @@ class ViewSampler(ConfigurationSampler):
             rows = np.flatnonzero(chosen == number)
             if not rows.size:
                 continue
-            views = draw_views(rig, camera, board, self.images.limits(camera, board), len(rows), rng)
+            views = draw_views(rig, camera, board, self._limits[camera, board], len(rows), rng)
             camera_pose, board_pose = rig.camera_in_end(camera), rig.board_in_end(board)
             if rig.camera_mounts[camera].moves:
                 targets[rows] = board_pose @ se3.inverse(views) @ se3.inverse(camera_pose)
@@ -104,6 +108,28 @@ class ViewSampler(ConfigurationSampler):
         q, _ = solve_ik(self.chain, task, start, _IK_STEPS)
         q, _ = wrap_into_limits(replace(self.chain, lower=self.low, upper=self.high), q)
         return np.clip(q, self.low, self.high)
+
+    @cached_property
+    def _joint_errors(self) -> Array:
+        """Errors of the joints at which a board is still in view, (e, n); the first one is 0."""
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_N_ERRORS, self.chain.n_joints))
+        errors = self.images.joint_error * signs * ~self.chain.is_prismatic
+        return np.concatenate(
+            [np.zeros_like(errors[:1]), errors[: _N_ERRORS * bool(self.images.joint_error)]]
+        )
+
+    @cached_property
+    def _limits(self) -> dict[tuple[int, int], ViewLimits]:
+        """Limits of the views of each pair, with the distances that the robot reaches."""
+        q = np.random.default_rng(0).uniform(self.low, self.high, (_BATCH, self.chain.n_joints))
+        tools, out = self.chain.poses(q), {}
+        for pair in self.images.pairs:
+            middle = np.append(self.images.rig.boards[pair[1]].points.mean(0), 1.0)
+            reached = np.linalg.norm((self.images.rig.board_in_camera(*pair, tools) @ middle)[:, :3], axis=1)
+            limits = self.images.limits(*pair)
+            low, high = max(limits.min_distance, reached.min()), min(limits.max_distance, reached.max())
+            out[pair] = replace(limits, min_distance=low, max_distance=high) if low < high else limits
+        return out
 
     def _is_hidden(self, q: Array) -> bool:
         """Return whether the robot or an obstacle hides a board that is in view at q, shape (n,)."""

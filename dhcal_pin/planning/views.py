@@ -35,6 +35,8 @@ MIN_SQUARE_PX, MIN_MARKER_PX, MIN_BOARD_SHARE = 20.0, 40.0, 0.1
 MARGIN_SHARE = 0.02
 # Default limit of the angle between the normal of a board and the line of sight [rad].
 MAX_VIEW_ANGLE = np.deg2rad(60.0)
+# Focal length of a usual webcam, as a share of the larger side of its image: a field of view of 60°.
+FOCAL_SHARE = 0.87
 # Views that are drawn at once, rounds of draws, and rounds without any view in the image before giving up.
 _BATCH, _MAX_ROUNDS, _MAX_EMPTY_ROUNDS = 1000, 200, 20
 # Cells of an image along u and v, in which corners are counted.
@@ -54,6 +56,8 @@ class PlannedImages:
         min_share: Smallest share of the corners of a board in the image.
         margin: Distance of the corners from the edge of the image [px]; by default `MARGIN_SHARE` of its
             width.
+        joint_error: Largest error of each joint with which the robot reaches a pose; a board must still be in
+            view then [rad].
     """
 
     rig: MountedRig
@@ -62,6 +66,7 @@ class PlannedImages:
     max_angle: float = MAX_VIEW_ANGLE
     min_share: float = 1.0
     margin: float | None = None
+    joint_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check that poses and intrinsics are known."""
@@ -163,6 +168,17 @@ def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measuremen
         return rig
     fit = calibrate(chain, images, "camera,board,intrinsics", extend="none")
     return fit.rig or rig
+
+
+def with_typical_lenses(rig: MountedRig) -> MountedRig:
+    """Return a rig whose cameras of unknown lens have that of a usual webcam."""
+
+    def typical(camera: Camera) -> Camera:
+        focal = FOCAL_SHARE * max(camera.width, camera.height)
+        values = np.pad([focal, focal, *camera.image_centre], (0, len(camera.values) - 4))
+        return camera if camera.has_intrinsics else replace(camera, values=values)
+
+    return replace(rig, cameras=tuple(map(typical, rig.cameras)))
 
 
 def draw_views(

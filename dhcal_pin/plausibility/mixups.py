@@ -2,12 +2,12 @@
 
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
-the same way. A hypothesis is left out if it moves the nominal robot much farther from the measured positions
-than it is from them as they were read: undoing a mistake takes its error away and adds none. A hypothesis is
-decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed
-samples as it fits ordinary measurements. If none does, and no robot fits the file, each of the best ones is
-combined with a second one. Several hypotheses can describe the same change of the data, such as the sign of
-a joint and the zeros of two others; all of them are reported.
+the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured positions
+than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its
+evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed samples as it fits
+ordinary measurements. If none does, and no robot fits the file, each of the best ones is combined with a
+second one. Several hypotheses can describe the same change of the data, such as the sign of a joint and the
+zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if it increases the distance of the nominal robot from the positions by more than
-# this factor. The distance is computed if there are at least this many rows per unknown of the frames.
-_MAX_DISTANCE_GROWTH, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, 4
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, but not
+# below the least limit, or if it exceeds the largest limit: no robot is so wrong. The misfit is computed from
+# at least this many rows per unknown of the frames.
+_MAX_MISFIT_RATIO, _MISFIT_LIMITS, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, (0.01, 0.7), 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -113,14 +114,17 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    diagnosis = _diagnose(chain, items, sets)
-    if diagnosis.hypotheses or not diagnosis.is_suspicious or len(items) < 2:
+    diagnosis, trial = _find_single(chain, items, sets)
+    if diagnosis.hypotheses or trial is None:
         return diagnosis
-    separate = [(item, _diagnose(chain, [item], sets)) for item in items]
-    for item, one in separate:
-        if one.hypotheses:
-            return replace(one, source=item.source)
-    return replace(diagnosis, fits_separately=not any(one.is_suspicious for _, one in separate))
+    if len(items) > 1:
+        separate = [(item, _find_one_or_two(chain, item, sets)) for item in items]
+        for item, one in separate:
+            if one.hypotheses:
+                return replace(one, source=item.source)
+        if not any(one.is_suspicious for _, one in separate):
+            return replace(diagnosis, fits_separately=True)
+    return _find_pair(trial)
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
@@ -142,19 +146,36 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
-def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis:
-    """Look for one mistake in all of the measurements."""
+class _Trial(NamedTuple):
+    """Suspicious samples for which no single hypothesis is decisive."""
+
+    chain: Chain
+    samples: Sequence[Measurement]
+    neighbourhood: Sequence[Measurement]
+    sets: str
+    before: Evidence
+    hypotheses: Sequence[Hypothesis]
+    scored: Sequence[_Scored]
+
+
+def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[Diagnosis, _Trial | None]:
+    """Look for one mistake in all of the measurements; return what was tried if they remain suspicious."""
     samples, neighbourhood = draw_samples(data)
     if not has_enough_rows(samples):
-        return Diagnosis(NO_EVIDENCE)
+        return Diagnosis(NO_EVIDENCE), None
     before = fit_evidence(chain, samples, sets)
     if not is_suspicious(before):
-        return Diagnosis(before)
+        return Diagnosis(before), None
     listed = list(list_hypotheses(chain, samples))
     scored = _score(chain, samples, neighbourhood, listed, sets)
-    if found := _decisive(before, scored):
-        return found
-    if leaves_residuals(before):
+    trial = _Trial(chain, samples, neighbourhood, sets, before, listed, scored)
+    return _decisive(before, scored) or Diagnosis(before), trial
+
+
+def _find_pair(trial: _Trial) -> Diagnosis:
+    """Look for two mistakes in measurements with positions, by which pairs are compared."""
+    chain, samples, neighbourhood, sets, before, listed, scored = trial
+    if leaves_residuals(before) and nominal_misfit(chain, samples):
         first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
@@ -165,6 +186,12 @@ def _diagnose(chain: Chain, data: Sequence[Measurement], sets: str) -> Diagnosis
     return Diagnosis(before)
 
 
+def _find_one_or_two(chain: Chain, item: Measurement, sets: str) -> Diagnosis:
+    """Look for one mistake or two in one measurement."""
+    diagnosis, trial = _find_single(chain, [item], sets)
+    return diagnosis if diagnosis.hypotheses or trial is None else _find_pair(trial)
+
+
 def _closest_pairs(
     chain: Chain,
     samples: Sequence[Measurement],
@@ -172,14 +199,12 @@ def _closest_pairs(
     hypotheses: Sequence[Hypothesis],
 ) -> list[Hypothesis]:
     """Return the pairs of mistakes in joint columns that move the nominal robot nearest to the positions."""
-    if not nominal_distance(chain, samples):
-        return []  # there are no positions, or too few
     of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
     found = []
     for pair in starmap(both, permutations(of_joints, 2)):
         changed = _apply(pair, samples, neighbourhood)
         if changed is not None:
-            found.append((nominal_distance(chain, changed), pair))
+            found.append((nominal_misfit(chain, changed), pair))
     return [pair for _, pair in sorted(found, key=lambda each: each[0])[:_N_CLOSEST_PAIRS]]
 
 
@@ -198,12 +223,17 @@ def _score(
     hypotheses: Sequence[Hypothesis],
     sets: str,
 ) -> list[_Scored]:
-    """Compute the evidence of the hypotheses that apply and add no error to the nominal robot."""
+    """Compute the evidence of the hypotheses that apply and bring the nominal robot near the positions."""
+    changes = [(each, _apply(each, samples, neighbourhood)) for each in hypotheses]
+    candidates = [
+        (nominal_misfit(chain, changed), hypothesis, changed)
+        for hypothesis, changed in changes
+        if changed is not None
+    ]
+    smallest = min([nominal_misfit(chain, samples), *(misfit for misfit, _, _ in candidates)])
     scored = []
-    largest = _MAX_DISTANCE_GROWTH * nominal_distance(chain, samples)
-    for hypothesis in hypotheses:
-        changed = _apply(hypothesis, samples, neighbourhood)
-        if changed is not None and nominal_distance(chain, changed) <= largest:
+    for misfit, hypothesis, changed in candidates:
+        if misfit <= np.clip(_MAX_MISFIT_RATIO * smallest, *_MISFIT_LIMITS):
             after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append(_Scored(hypothesis, after, log))
@@ -230,20 +260,25 @@ def leaves_residuals(evidence: Evidence) -> bool:
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
 
 
-def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
-    """Compute how far the nominal robot is from measured positions, with any base, target and unit of length.
+def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
+    """Compute how far the nominal robot is from measured poses, with any base, tool and unit of length.
 
     A position p of a target at t in the tip frame, which has the rotation R and the position p_tip, fulfils
 
         A·p + b - R·t = p_tip
 
     with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
-    are free here, which makes the equation linear and the distance too small rather than too large.
+    are free here, which makes the equation linear and the error too small rather than too large. Its mean
+    square per degree of freedom counts relative to that of p_tip about its mean. A measured rotation M
+    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, both sides differ by
+    the mean square 1 - σ for the largest singular value σ of the mean of M⊗R, a third of that of the angles.
+    The two mean squares are added.
     """
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
-    squares, counts = [0.0], [0]
+    squares = spreads = turns = 0.0
+    count = 0
     for item in data:
-        p = positions_at_end(item)
+        p, measured = positions_at_end(item), item.rotations()
         if item.configurations_per_row != 1 or len(p) != len(item.rows):
             continue
         tip = arm.poses(item.conditions().of_arm)
@@ -255,9 +290,13 @@ def nominal_distance(chain: Chain, data: Sequence[Measurement]) -> float:
             continue
         target = tip[:, :3, 3].ravel()
         error = target - rows @ np.linalg.lstsq(rows, target, rcond=None)[0]
-        squares.append(float(error @ error))
-        counts.append(len(p))
-    return float(np.sqrt(sum(squares) / max(sum(counts), 1)))
+        squares += float(error @ error) * len(rows) / (len(rows) - rows.shape[1])
+        spreads += float(np.sum((tip[:, :3, 3] - tip[:, :3, 3].mean(0)) ** 2))
+        if len(measured) and item.conditions().base_motion is None:
+            products = np.einsum("mij,mkl->ikjl", measured, tip[:, :3, :3]).reshape(9, 9)
+            turns += max(0.0, len(p) - float(np.linalg.norm(products, 2)))
+        count += len(p)
+    return float(np.sqrt(squares / spreads + turns / count)) if spreads else 0.0
 
 
 def _count(data: Sequence[Measurement]) -> int:

@@ -22,6 +22,7 @@ from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
+from ..measurements.pose import Pose
 from ..robot.chain import Chain
 from ..robot.sampling import joint_range
 from ..robot.urdf_edit import with_turned_joints
@@ -38,6 +39,8 @@ _MAX_TURNED = 2
 _N_CONFIGURATIONS, _MIN_DISTANCE = 1000, 0.01
 # Largest usual zeros, in default standard deviations.
 _LARGEST_ZEROS = 1.5
+# Play of the joints in simulations [rad].
+_PLAY = np.deg2rad(0.5)
 # Number of open questions that are stated.
 _MAX_LISTED = 3
 
@@ -160,6 +163,12 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
         turned=_names(chain, chosen),
         open=tuple(_open_signs(chain, chosen, other, fits) for other in others),
     )
+
+
+def simulate_decision(chain: Chain, q: Array, rng: np.random.Generator) -> SignDecision:
+    """Decide the signs from simulated poses of a right arm with play at joint positions (m, n)."""
+    play = np.where(chain.is_prismatic, 0.0, _PLAY / 2 * rng.choice([-1.0, 1.0], q.shape))
+    return decide_signs(chain, [Pose(q, chain.poses(q + play))])
 
 
 def first_errors(chain: Chain, data: Sequence[Measurement]) -> Mapping[str, float]:

@@ -132,8 +132,9 @@ class Layout:
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
         flat = rows.reshape(-1, rows.shape[-1])
         changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))
-        model = flat[:, self.model] / np.where(largest > 0, largest, 1.0)[self.model]
-        left = flat[:, changing] - model @ np.linalg.lstsq(model, flat[:, changing], rcond=1e-9)[0]
+        model = flat[:, self.model]
+        explained = inverse(model.T @ model) @ (model.T @ flat[:, changing])
+        left = flat[:, changing] - model @ explained
         share = np.sum(left**2, 0) / np.maximum(np.sum(flat[:, changing] ** 2, 0), 1e-300)
         constant_only = set(changing[is_observed[changing] & (share > MAX_UNEXPLAINED)].tolist())
         blocks = [

@@ -68,11 +68,12 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     )
     rounding = MIN_VARIANCE * np.eye(len(arm))
     covariances = lengths[:, None] + angles + noise * by_both + rounding
-    factors = np.linalg.inv(np.linalg.cholesky(covariances))
-    z, column = factors @ (x[arm] * unit), factors @ (by_scale * unit)
+    factors = np.linalg.cholesky(covariances)
+    both = np.linalg.solve(factors, np.stack([x[arm] * unit, by_scale * unit], -1))
+    z, column = both[..., 0], both[..., 1]
     information = np.sum(column**2, -1)
     changes = np.sum(column * z, -1) / information
-    likelihood = np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.sum(z**2, -1)
+    likelihood = -np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.sum(z**2, -1)
     likelihood += 0.5 * (changes**2 * information - np.log(information))
     weights = np.exp(likelihood - likelihood.max())
     weights /= weights.sum()

@@ -763,8 +763,9 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
 def _cell_products(rows: Array, edges: Array, columns: Array | None = None) -> Array:
     """Return the inner products of the rows of each cell, (K, c, ·)."""
     other = rows if columns is None else columns
-    if len(edges) == len(rows) + 1:
-        return rows.swapaxes(1, 2) @ other
+    if np.ptp(np.diff(edges)) == 0:
+        parts = [each.reshape(len(edges) - 1, -1, each.shape[-1]) for each in (rows, other)]
+        return parts[0].swapaxes(1, 2) @ parts[1]
     return np.array(
         [
             rows[a:b].reshape(-1, rows.shape[-1]).T @ other[a:b].reshape(-1, other.shape[-1])

@@ -13,8 +13,11 @@ import pytest
 from pages import AXE, READY, VIEWPORT
 from slow_cases import some_slow
 
+import dhcal_pin.app.server
+
 # Width and colours of the looks at the page.
 LOOKS = tuple(product((390, 768, 1200), ("light", "dark")))
+EXAMPLE = Path(dhcal_pin.app.server.__file__).parent / "example"
 DROP = """([files]) => {
   const data = new DataTransfer();
   for (const [name, text] of files) data.items.add(new File([text], name));
@@ -131,6 +134,27 @@ def test_a_proposed_column_map_is_used(page, example):
     page.wait_for_selector("#result:not([hidden])")
     assert "Verdict: ok" in page.inner_text("#result")
     assert "--columns columns.toml" in page.text_content("#result pre")
+
+
+@pytest.mark.slow
+def test_the_example_ends_in_the_corrected_files_of_a_servo_arm(page):
+    page.click("#example")
+    page.wait_for_selector("#check .card.ok")
+    page.click("#calibrate")
+    page.wait_for_selector("#result .card.ok")
+    assert "elbow_flex" in page.inner_text("#result .card.warning")
+    assert page.is_disabled("#parameters")
+    before, after = page.eval_on_selector_all(
+        ".headline dd", "them => them.map(it => parseFloat(it.textContent))"
+    )
+    assert after < 0.3 * before
+    motors = json.loads(download(page, "so101_calibrated.json"))
+    stated = json.loads((EXAMPLE / "so101.json").read_text())
+    assert motors["elbow_flex"]["homing_offset"] != stated["elbow_flex"]["homing_offset"]
+    assert download(page, "so101_calibrated.urdf").startswith(b"<?xml")
+    # Without the rig the corners are no measurement.
+    page.click('[aria-label="Remove rig.toml"]')
+    page.wait_for_selector("#check .card.problem")
 
 
 def test_errors_are_shown_as_one_line(page, example):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,6 +18,7 @@ from urllib.parse import urlsplit
 import psutil
 import pytest
 from app_requests import example_form, form, post, start_app
+from robots import ROOT, URDF
 
 from dhcal_pin.app.upload import MAX_FILES, Upload
 from dhcal_pin.cli.main import main
@@ -268,3 +271,45 @@ def test_a_port_in_use_is_one_line(app):
         assert run.returncode == 2
         assert run.stderr.startswith(f"dhcal: --port {value}: ")
         assert run.stderr.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory):
+    """Folder with the rig, photographs, counts and servo file of the guide."""
+    folder = tmp_path_factory.mktemp("photographed")
+    text = (ROOT / "docs/howto/paper_arm.md").read_text()
+    rig, code = (re.search(rf"```{name}\n(.*?)```", text, re.S)[1] for name in ("toml", "python"))
+    (folder / "rig.toml").write_text(rig)
+    shutil.copy(URDF / "so101.urdf", folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(code, {})
+    return folder
+
+
+def photograph_form(folder, count, **changes):
+    """Form with some of the photographs and all files that belong to them."""
+    files = {path.name: path.read_bytes() for path in sorted((folder / "photographs").iterdir())[:count]}
+    request = {"images": list(files), "data": ["counts.csv"], "robot": "so101.urdf", "rig": "rig.toml"}
+    request |= {"servos": "so101.json", "tip": "gripper_frame_link"}
+    files |= {name: (folder / name).read_bytes() for name in ("so101.urdf", "rig.toml", "so101.json")}
+    counts = (folder / "counts.csv").read_text().splitlines(keepends=True)
+    files["counts.csv"] = "".join(counts[: 1 + count]).encode()
+    return form(files, request | changes)
+
+
+def test_photographs_are_searched(app, photographed):
+    body, headers = photograph_form(photographed, 2)
+    (board,) = result_of(post(app, "inspect", body, **headers)[1])["result"]["boards"]
+    assert (board["images"], board["used"]) == (2, 2)
+    body, headers = photograph_form(photographed, 2, rig="")
+    assert "rig" in post(app, "calibrate", body, **headers)[1][-1]["error"]
+
+
+@pytest.mark.slow
+def test_few_photographs_say_what_is_missing(app, photographed):
+    body, headers = photograph_form(photographed, 5)
+    message = result_of(post(app, "calibrate", body, **headers)[1])
+    assert message["status"] == "refused"
+    assert "Take at least 5 more, better 15" in message["result"]["verdict"]["reasons"][0]
+    assert b"shoulder_pan[ticks]" in files_of(message)["corners.csv"]

@@ -12,6 +12,8 @@ from slow_cases import some_slow
 import dhcal_pin as dh
 from dhcal_pin.measurements import CameraCorners
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 
 def photograph(seed, error, is_on_wrist=True):
     """Simulate 40 images of an arm whose links are wrong by a size [m]."""

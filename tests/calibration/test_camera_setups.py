@@ -16,6 +16,8 @@ from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.cameras import Board
 from dhcal_pin.measurements import CameraCorners
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 
 def image_rms(fit, data):
     """Return the RMS of the image coordinates under a calibration [px]."""

@@ -20,6 +20,8 @@ from dhcal_pin.cameras import Board
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 
 @pytest.fixture(scope="module")
 def arm():

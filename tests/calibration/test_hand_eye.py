@@ -13,6 +13,8 @@ import dhcal_pin as dh
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 # Cause that should be named for each fault.
 CAUSES = {
     "arm": "arm geometry",

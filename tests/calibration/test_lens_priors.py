@@ -12,6 +12,8 @@ from dhcal_pin.calibration.cameras import procedure
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation.priors import PriorGroups
 
+pytestmark = pytest.mark.usefixtures("own_loss")
+
 SETS = "camera,board,intrinsics"
 
 

@@ -82,10 +82,10 @@ def test_geometric_errors_alone_are_fitted_as_without_extension(seed):
     fit, geometry = calibrate(arm, data), calibrate(arm, data, extend="none")
     assert fit.extension is not None
     assert fit.extension.families == ()
-    # Curves of high order are tried only on top of those of low order.
+    # Curves are tried only if they stand out of the residuals, those of high order only on top of others.
     # Backlash and thermal growth need conditions that these data do not state.
-    untried = {"fine-curves", "backlash", "thermal"}
-    assert {trial.family for trial in fit.extension.trials} == set(EXTENSIONS) - untried
+    untried = {"curves", "fine-curves", "backlash", "thermal"}
+    assert {trial.family for trial in fit.extension.trials} - {"curves"} == set(EXTENSIONS) - untried
     assert fit.extension.temperature == 1
     assert np.array_equal(fit.x, geometry.x)
     assert np.array_equal(fit.std, geometry.std)
@@ -161,6 +161,16 @@ def test_curves_of_high_order_have_a_prior_width_of_their_own(has_fine_lines):
         q = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 6))
         offsets = [one.chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3] for one in (fit, without)]
         assert np.std(offsets[0]) < 0.9 * np.std(offsets[1])
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_curves_are_found_in_few_samples(kind):
+    """Forty samples have fewer rows than there are lines, and show curves of a tenth of a millimetre."""
+    arm, truth, data = with_curves(0, 40)
+    data = kind.simulate(truth, data.q, Noise(2e-5, 4e-5), np.random.default_rng(0))
+    fit = calibrate(arm, data)
+    assert fit.extension is not None
+    assert "curves" in fit.extension.families
 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(20, marks=pytest.mark.slow)])

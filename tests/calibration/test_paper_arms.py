@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -73,3 +74,29 @@ def test_signs_are_right_and_the_arm_is_as_good_as_if_its_errors_were_known(n_im
     if ratios:
         assert np.exp(np.mean(np.log(ratios))) < max_ratio
         assert 0.5 < np.exp(np.mean(np.log(predictions))) < 2
+
+
+@pytest.mark.slow
+def test_few_images_say_what_is_missing_and_this_helps():
+    shot = photograph(4, 20)
+    images = shot.images
+    q = np.unique(images.q, axis=0)
+    near = q[np.argsort(np.linalg.norm(q - np.median(q, axis=0), axis=1))[:5]]
+    first = calibrate(shot.nominal, images.take(np.any(np.all(images.q[:, None] == near, 2), 1)))
+    assert first.verdict.status == "refused"
+    found = re.match(
+        r"5 different images are too few .* Take at least 5 more, better (\d+)\. Turn the joints .*: (.*)\.",
+        first.verdict.reasons[0],
+    )
+    assert found
+    assert 5 + int(found[1]) == len(q)
+    # The joints that are named move farther in the other images.
+    for text in found[2].split(", "):
+        name, low, high = re.fullmatch(r"(\w+) (\S+)° to (\S+)°", text).groups()
+        moved = np.rad2deg(np.ptp(q[:, shot.nominal.joint_names.index(name)]))
+        assert moved > float(high) - float(low)
+    fit = calibrate(shot.nominal, images)
+    assert fit.verdict.status == "ok"
+    assert set(fit.signs.turned) == set(shot.arm.wrong)
+    before, after = errors_of(shot, fit)
+    assert after < 0.2 * before

@@ -417,7 +417,7 @@ def test_unknown_corners_are_predicted_as_the_calibration_knows_them():
     reached = dict(zip([p.name for p in fit.parameters], fit.std / fit.unit_weight_std, strict=True))
     assert fit.unit_weight_std == pytest.approx(1, abs=0.1)
     for name, value in predicted.items():
-        assert value == pytest.approx(reached[name], rel=0.05), name
+        assert value == pytest.approx(reached[name], rel=0.07), name
 
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(40, marks=pytest.mark.slow)])

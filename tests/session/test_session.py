@@ -231,12 +231,13 @@ def test_an_event_is_found_beside_outliers():
     assert len(fit.outliers[0]) >= 9
 
 
-def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side():
+@pytest.mark.parametrize("size", [0.3e-3, 5e-3])
+def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side(size):
     simulation = Simulation("ur10", 100, 0)
-    data = simulation.measure(Position, Changes("base", 5e-3))
+    data = simulation.measure(Position, Changes("base", size))
     is_held_out = np.isin(np.arange(100), [47, 48, 49, 50, 51, *range(0, 40, 3)])
     fit = calibrate(simulation.chain, data.take(~is_held_out), holdout=data.take(is_held_out), extend="none")
-    assert session_of(fit).events[0].line == 51
+    assert abs(session_of(fit).events[0].line - 51) <= (2 if size < 1e-3 else 0)
     assert fit.comparisons[0].after.groups["position"].rms < 2e-4
 
 

@@ -1,11 +1,11 @@
 """Public names of dhcal_pin.calibration.cameras; `__init__.py` loads each on first use."""
 
+from .arm_types import arm_type as arm_type
 from .axis_order import axis_stages as axis_stages
 from .axis_order import exchange_axes as exchange_axes
 from .axis_order import reorder as reorder
 from .board_size import BoardSize as BoardSize
 from .board_size import find_board_size as find_board_size
-from .diagnosis import LARGE_ERROR as LARGE_ERROR
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .gate import apply_gate as apply_gate
@@ -23,6 +23,7 @@ from .sets import default_sets as default_sets
 from .sets import has_images as has_images
 from .sets import has_joint_values as has_joint_values
 from .sets import held_values as held_values
+from .sets import image_sets as image_sets
 from .sets import require_joint_values as require_joint_values
 from .sets import split_sets as split_sets
 from .stages import STAGES as STAGES

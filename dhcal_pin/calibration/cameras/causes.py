@@ -174,8 +174,9 @@ def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> Came
     if not causes.shift:
         return item
     sequence = hand_eye.sequence
-    number = np.array([int(np.argmin(np.abs(sequence - q).max(1))) for q in item.q])
-    place = number + causes.shift
+    different, of_row = np.unique(item.q, axis=0, return_inverse=True)
+    number = np.array([int(np.argmin(np.abs(sequence - q).max(1))) for q in different])
+    place = number[of_row] + causes.shift
     low = np.clip(np.floor(place).astype(int), 0, len(sequence) - 2)
     part = (place - low)[:, None]
     is_inside = (place >= 0) & (place <= len(sequence) - 1)

@@ -34,6 +34,7 @@ from ...plausibility.displacement import measure_correction
 from ...subsampling import evenly_spaced_indices
 from ..partition import configuration_groups, k_fold
 from ..reweighting import Fit
+from .arm_types import INDUSTRIAL
 from .causes import (
     ARM_SETS,
     CORNERS,
@@ -62,10 +63,6 @@ MAX_NOISE_RATIO = 1.5
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
 # up to this ratio of their errors.
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
-# Errors of images above this are those of wrong joint values rather than of arm, board or lens [px].
-LARGE_ERROR = 10.0
-# The same of an arm with play and sag: 2° for a lens of 1150 px [px].
-MAX_PLAY_ERROR = 40.0
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
 # explain images that are paired with wrong joint values.
 MAX_LINKS_ERROR = 0.05
@@ -80,8 +77,9 @@ MAX_REJECTED_SHARE = 0.03
 MIN_WRONG_RATIO = 5.0
 # Number of folds, smallest number of configurations, and largest number of causes.
 N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
-# Largest number of configurations in which causes are looked for: more of them do not change the cause.
-MAX_CONFIGURATIONS = 300
+# Largest number of configurations in which causes are looked for, and of corners in over a third of them:
+# more of them do not change the cause.
+MAX_CONFIGURATIONS, MAX_CORNERS = 300, 4000
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
 # the images show.
 MIN_ROTATION = np.deg2rad(8.0)
@@ -312,8 +310,9 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
     count = int(label.max(initial=-1)) + 1
     if count < MIN_CONFIGURATIONS:
         return None
-    if count > MAX_CONFIGURATIONS:
-        is_used = np.isin(label, evenly_spaced_indices(count, MAX_CONFIGURATIONS))
+    n_used = min(MAX_CONFIGURATIONS, max(MAX_CORNERS * count // len(label), MAX_CONFIGURATIONS // 3))
+    if count > n_used:
+        is_used = np.isin(label, evenly_spaced_indices(count, n_used))
         ends = np.cumsum([len(item.rows) for item in data])[:-1]
         parts = zip(data, np.split(is_used, ends), strict=True)
         data = tuple(item.take(used) for item, used in parts if used.any())
@@ -449,7 +448,7 @@ def _is_plausible(name: str, state: _State) -> bool:
 def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
     """Fit each further cause on top of those of a state, those with few unknowns first."""
     causes, start, out = state.causes, state.values, {}
-    is_large = state.error.pixels > LARGE_ERROR
+    is_large = state.error.pixels > INDUSTRIAL.max_error
 
     def attempt(name: str, more: Causes, values: Mapping[str, float] | None = start) -> None:
         try:

@@ -9,7 +9,8 @@ of the arm are those of greatest evidence at T, however narrow.
 - r < 0.5 if the arm's errors explain the images up to the noise of the corners, and r < 0.25 if not: the arm
   is demonstrably wrong. It is estimated at T = 1 + N/20 with the prior widths of greatest evidence at T = 1,
   which are never below the default ones.
-- r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images.
+- r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images
+  (`arm_types`).
 - r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
   arm is demonstrably wrong, too, whatever the images show.
 - Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
@@ -42,6 +43,7 @@ from ...measurements.camera import CameraCorners
 from ...measurements.images.camera_parameters import POINTS_SET
 from ..partition import Fold, configuration_groups, k_fold
 from ..reweighting import Fit
+from .arm_types import CORNERS, IMAGES, INDUSTRIAL, ArmType
 from .corner_noise import fit_with_corner_noise
 from .jitter import Jitter, estimate_jitter, with_jitter
 from .sets import MAX_POINTS, count_corners
@@ -54,12 +56,7 @@ N_CLUSTERS = 5
 N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
-# Largest ratio of the errors for which the arm is demonstrably wrong: if its errors explain the images up to
-# the noise of the corners, and if the model lacks other errors, which errors of the links then imitate.
-MAX_COMPLETE_RATIO, MAX_INCOMPLETE_RATIO = 0.5, 0.25
-# The same of an arm whose play and sag are known to displace the images: its zeros are wrong by degrees.
-MAX_PLAY_RATIO = 0.8
-# The same for measurements of other instruments.
+# Largest ratio of the errors of other instruments for which the arm is demonstrably wrong.
 MAX_OTHERS_RATIO = 0.8
 # Narrowest and widest prior with a closed gate, as a fraction of the default one.
 MIN_WIDTH, MAX_WIDTH = 1e-3, 1e2
@@ -79,7 +76,7 @@ class Gate:
     n_configurations: int  # Number of different configurations
     is_right: bool  # Whether the corners of an image share no displacement with the nominal arm
     is_complete: bool  # Whether they share none with the estimated arm
-    has_play: bool = False  # Whether the arm has play and sag, which displace images
+    arm_type: ArmType = INDUSTRIAL
     others_ratio: float = float("nan")  # The same as `ratio` for other instruments; NaN if there are none
 
     @property
@@ -95,9 +92,8 @@ class Gate:
     @property
     def max_ratio(self) -> float:
         """Largest ratio for which the arm is demonstrably wrong."""
-        if self.has_play:
-            return MAX_PLAY_RATIO
-        return MAX_COMPLETE_RATIO if self.is_complete else MAX_INCOMPLETE_RATIO
+        limits = self.arm_type
+        return limits.max_complete_ratio if self.is_complete else limits.max_incomplete_ratio
 
     @property
     def sentence(self) -> str:
@@ -150,7 +146,7 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
     return try_target_points(fit, images, clusters, max_iterations)
 
 
-def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, has_play: bool = False) -> GatedFit:
+def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: ArmType) -> GatedFit:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong."""
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
@@ -162,7 +158,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, has_play: boo
         kept = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
     kept = _solve(kept, kept.problem, 1.0, max_iterations)
     if not fit.problem.errors.has_arm:
-        gate = Gate(float("nan"), 1.0, n_configurations, is_right, is_right)
+        gate = Gate(float("nan"), 1.0, n_configurations, is_right, is_right, arm_type)
         return GatedFit(kept, nominal, kept, gate)
     shared, jitter = fit_with_jitter(fit, max_iterations)
     is_complete = not jitter.is_significant
@@ -170,16 +166,18 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, has_play: boo
     share = 1.0 if is_complete else rows_per_displacement(fit.without_rejected().data)
     models = [(fit, share)]
     if not is_complete:
-        models = [(shared, 1.0)]
-        if not has_play:
-            models.insert(0, (fit_with_corner_noise(fit, max_iterations), share))
+        fits = {
+            CORNERS: lambda: (fit_with_corner_noise(fit, max_iterations), share),
+            IMAGES: lambda: (shared, 1.0),
+        }
+        models = [fits[name]() for name in arm_type.noise_models]
     trials = [
         _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
         for model, factor in models
     ]
     best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
     others_ratio = _others_ratio(best.closed, max_iterations)
-    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, has_play, others_ratio)
+    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
     if not gate.is_open:
         return GatedFit(kept, nominal, best.closed, gate)
     opened_at = 1.0
@@ -242,7 +240,7 @@ def _trial(
 
 
 def _others_ratio(fit: Fit, max_iterations: int) -> float:
-    """Return the error of left-out rows of other instruments over that with the nominal arm.
+    """Return the error of left-out rows of other instruments, relative to that with the nominal arm.
 
     It is NaN if there are too few.
     """

@@ -26,9 +26,10 @@ from ...robot.chain import Chain
 from ..model_selection import Extension
 from ..result import Result, make_result
 from ..reweighting import Fit, reweight
+from .arm_types import CORNERS, IMAGES, ArmType
 from .axis_order import Exchange, axis_stages
 from .board_size import find_board_size
-from .diagnosis import LARGE_ERROR, MAX_PLAY_ERROR, HandEyeFit
+from .diagnosis import HandEyeFit
 from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
 from .jitter import with_jitter
 from .lens_priors import lens_prior_groups, with_lens_priors
@@ -71,8 +72,7 @@ class ImageFitting:
     stages: tuple[str, ...]  # Stages of the robust loss
     max_iterations: int  # Largest number of iterations of one solution
     progress: Progress | None  # Function that is called with the progress, if any
-    # Whether the arm has play and sag, which displace all corners of an image by far more than their noise
-    has_play: bool = False
+    arm_type: ArmType  # Limits by which the images are judged
 
     def reweight(self, fit: Fit) -> Fit:
         """Estimate noise, weights and widths of priors, those of lenses included."""
@@ -88,10 +88,22 @@ class ImageFitting:
         return fit
 
 
-def _with_displacement(fit: Fit) -> Fit:
-    """Return a fit whose images have a displacement each, so that only those beyond it are outliers."""
+def _reweight(fitting: ImageFitting, fit: Fit) -> tuple[ImageFitting, Fit]:
+    """Reweight a fit of independent corners."""
+    return fitting, fitting.reweight(fit)
+
+
+def _reweight_displaced(fitting: ImageFitting, fit: Fit) -> tuple[ImageFitting, Fit]:
+    """Reweight with the outliers among images that have a displacement each, and keep these outliers."""
     data = with_jitter(fit.problem, fit.solution.x, fit.data, residual_jitter(fit))
-    return replace(fit.solved_with(data, 0), data=data, start=fit.solution.x)
+    displaced = replace(fit.solved_with(data, 0), data=data, start=fit.solution.x)
+    kept = replace(fit, weights=fitting.reweight(displaced).weights)
+    fitting = replace(fitting, stages=(KEPT,))
+    return fitting, fitting.reweight(kept)
+
+
+# First estimate of noise, weights and widths, by the model of errors of images with which outliers are found.
+_FIRST_REWEIGHT = {CORNERS: _reweight, IMAGES: _reweight_displaced}
 
 
 def calibrate_images(
@@ -103,15 +115,12 @@ def calibrate_images(
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     has_arm = fit.problem.errors.has_arm
-    if fitting.has_play:
-        fit = replace(fit, weights=fitting.reweight(_with_displacement(fit)).weights)
-        fitting = replace(fitting, stages=(KEPT,))
-    fit = fitting.reweight(fit)
+    fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
     points = judge_target_points(fit, fitting.max_iterations)
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
     ungated = with_lens_priors(fit)
-    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.has_play)
+    gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.arm_type)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
@@ -123,10 +132,9 @@ def calibrate_images(
         extension=Extension(temperature=gate.temperature, n_configurations=gate.n_configurations),
         input_warnings=tuple(warnings),
         camera_stages=(*axis_stages(exchanges), *stages),
+        arm_type=fitting.arm_type,
     )
-    if gate.is_open and fitted_error(gated.fit).pixels < (
-        MAX_PLAY_ERROR if fitting.has_play else LARGE_ERROR
-    ):
+    if gate.is_open and fitted_error(gated.fit).pixels < fitting.arm_type.max_error:
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))

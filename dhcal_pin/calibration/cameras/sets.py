@@ -42,14 +42,18 @@ def has_images(data: Sequence[Measurement]) -> bool:
     return any(item.rig is not None for item in data)
 
 
+def image_sets(chain: Chain, sets: str = DEFAULT_SETS) -> str:
+    """Return parameter sets of images for the type of arm: its own in place of those of other arms."""
+    return sets.replace(_ARM_SETS, LOW_COST) if LOW_COST in chain.parameters else sets
+
+
 def default_sets(chain: Chain, data: Sequence[Measurement]) -> str:
     """Return the parameter sets that are estimated by default."""
     if not has_images(data):
         return chain.parameters
     if not has_joint_values(data):
         return HAND_EYE_SETS
-    sets = DEFAULT_SETS if all(item.rig is not None for item in data) else MIXED_SETS
-    return sets.replace(_ARM_SETS, LOW_COST) if LOW_COST in chain.parameters else sets
+    return image_sets(chain, DEFAULT_SETS if all(item.rig is not None for item in data) else MIXED_SETS)
 
 
 def has_joint_values(data: Sequence[Measurement]) -> bool:

@@ -23,6 +23,7 @@ def run(args: Namespace) -> int:
     from ...planning import plan, with_repeats
     from ...programs import require_program_ending
     from ...report.provenance import file_digests
+    from ..arm_types import with_arm_type
     from ..output_table import chosen_files, file_contents, require_endings
     from ..outputs import require_writable_outputs, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
@@ -37,6 +38,7 @@ def run(args: Namespace) -> int:
     for path in args.export:
         require_program_ending(path)
     chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    chain = with_arm_type(chain, args.arm, args.servos, args.parameters)
     given, rows = read_input(args, chain, kind)
     with console.show_progress(f"choosing {count} poses") as progress:
         result = plan(chain, count, progress=progress, **given)

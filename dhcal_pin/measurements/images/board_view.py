@@ -23,9 +23,11 @@ class ViewLimits:
     margin: float = 10.0  #: Distance of a corner from the edge of the image [px].
 
 
-def project_board(rig: MountedRig, camera: int, board: int, poses: Array) -> tuple[Array, Array]:
-    """Project all corners of a board."""
-    points = rig.boards[board].points
+def project_board(
+    rig: MountedRig, camera: int, board: int, poses: Array, chosen: Array | slice = np.s_[:]
+) -> tuple[Array, Array]:
+    """Project the corners of a board, or some of them."""
+    points = rig.boards[board].points[chosen]
     local = np.einsum("mij,cj->mci", poses[:, :3, :3], points) + poses[:, None, :3, 3]
     lens, values = rig.cameras[camera].lens, rig.cameras[camera].values
     pixels = lens.project(local.reshape(-1, 3).T, values)[0].T
@@ -41,10 +43,18 @@ def visible_corners(rig: MountedRig, camera: int, board: int, poses: Array, limi
     in_view = (distance >= limits.min_distance) & (distance <= limits.max_distance) & (middle[:, 2] > 0)
     if rig.boards[board].type != "points":
         in_view &= along >= np.cos(limits.max_angle) * distance
-    near = np.flatnonzero(in_view)
-    pixels, depth = project_board(rig, camera, board, poses[near])
-    last = np.array([rig.cameras[camera].width, rig.cameras[camera].height]) - 1 - limits.margin
-    is_inside = np.all((pixels >= limits.margin) & (pixels <= last), 2) & (depth > 0)
+    near, last = np.flatnonzero(in_view), np.array([rig.cameras[camera].width, rig.cameras[camera].height])
+
+    def is_in_image(chosen: Array | slice) -> Array:
+        pixels, depth = project_board(rig, camera, board, poses[near], chosen)
+        inside = (pixels >= limits.margin) & (pixels <= last - 1 - limits.margin)
+        return np.all(inside, 2) & (depth > 0)
+
+    if limits.min_share == 1:
+        # All corners are in the image only if the outer ones are.
+        along = rig.boards[board].points @ np.column_stack([np.eye(3), np.ones(3)])
+        near = near[is_in_image(np.unique([along.argmin(0), along.argmax(0)])).all(1)]
+    is_inside = is_in_image(np.s_[:])
     out = np.zeros((len(poses), is_inside.shape[1]), bool)
     out[near] = is_inside & (is_inside.mean(1) >= limits.min_share)[:, None]
     return out
