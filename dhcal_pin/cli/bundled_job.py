@@ -20,6 +20,7 @@ from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.bundle import Bundle, read_bundle
 from ..io.robot import find_format, read_robot
 from ..io.sidecar import sidecar_path
+from ..io.tabular import read_bytes
 from ..parallel import SERIAL, TaskExecutor
 from ..report.provenance import short_names
 from .bundle_content import with_output_paths
@@ -61,7 +62,7 @@ def run_any_job(
         for path, name in names.items():
             copy = Path(copies, name)
             copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(Path(path).read_bytes())
+            copy.write_bytes(read_bytes(path))
         shown = {os.path.abspath(path): path for path in _output_files(job)}
         moved = with_output_paths(_renamed(job, names), os.path.abspath)
         moved = replace(moved, package_dir=tuple(map(os.path.abspath, job.package_dir)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,7 +71,8 @@ def read_image(path: PathLike) -> Array:
     """Read an image as grey values."""
     cv2 = require_opencv()
     _require_few_pixels(path)
-    with discard_native_messages():
+    image = None
+    with discard_native_messages(), suppress(cv2.error):  # a damaged file may state an enormous size
         image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise FileFormatError(f"{os.fspath(path)}: {_NO_IMAGE}")

@@ -16,6 +16,7 @@ import numpy as np
 
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError
+from ..native_output import discard_native_messages
 from .opencv import require_opencv, silent_opencv_log
 
 # Endings of videos.
@@ -66,11 +67,13 @@ def _frames(path: PathLike) -> Iterator[tuple[Array, float]]:
     """Yield the frames of a video, each with the number of frames per second."""
     cv2 = require_opencv()
     with silent_opencv_log():
-        video = cv2.VideoCapture(os.fspath(path))
+        with discard_native_messages():
+            video = cv2.VideoCapture(os.fspath(path))
         rate = float(video.get(cv2.CAP_PROP_FPS)) or 30.0
         try:
             while True:
-                is_read, frame = video.read()
+                with discard_native_messages():
+                    is_read, frame = video.read()
                 if not is_read:
                     return
                 yield frame, rate

@@ -108,6 +108,8 @@ def read_bundle(path: PathLike) -> Bundle:
         with zipfile.ZipFile(path) as archive:
             members = _read_members(archive, path)
             comment = archive.comment
+    except FileFormatError:
+        raise
     except OSError as error:
         raise FileFormatError(
             f"{path}: cannot read it: {error.strerror}; give the path of a bundle"
@@ -123,11 +125,8 @@ def read_bundle(path: PathLike) -> Bundle:
             raise FileFormatError(changed % quote(name))
     if hashlib.sha256(text).hexdigest().encode() != comment:
         raise FileFormatError(changed % quote(MANIFEST))
-    try:
-        result = json.loads(members[RESULT])
-    except (KeyError, ValueError):
-        result = None
-    if not isinstance(result, dict):
+    result = _json_object(members.get(RESULT, b""))
+    if result is None:
         raise FileFormatError(f"{path}: no {RESULT}; expected a bundle of `dhcal calibrate --bundle`")
     inputs, outputs = (
         {name.removeprefix(folder): data for name, data in members.items() if name.startswith(folder)}
@@ -140,6 +139,15 @@ def read_bundle(path: PathLike) -> Bundle:
 def _json_bytes(content: Any) -> bytes:
     """Return the text of a JSON document as members have it."""
     return json.dumps(content, indent=2, ensure_ascii=False).encode(errors="backslashreplace")
+
+
+def _json_object(data: bytes) -> dict[str, Any] | None:
+    """Return the object of a JSON document, None if there is none."""
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def _read_members(archive: zipfile.ZipFile, path: PathLike) -> dict[str, bytes]:
@@ -179,11 +187,7 @@ def _read_members(archive: zipfile.ZipFile, path: PathLike) -> dict[str, bytes]:
 
 def _read_manifest(data: bytes, path: PathLike) -> dict[str, Any]:
     """Read the manifest of a bundle."""
-    try:
-        content = json.loads(data)
-    except ValueError:
-        content = None
-    manifest: dict[str, Any] = content if isinstance(content, dict) else {}
+    manifest = _json_object(data) or {}
     has_types = all(isinstance(manifest.get(key), kind) for key, kind in _TYPES.items())
     if manifest.get("format") != FORMAT or not has_types:
         raise FileFormatError(

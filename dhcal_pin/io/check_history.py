@@ -71,7 +71,7 @@ def read_history(path: PathLike) -> list[Check]:
         where = f"{path}:{number}"
         try:
             values = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             raise FileFormatError(f"{where}: not JSON; expected one check per line") from None
         if not isinstance(values, dict):
             raise FileFormatError(f"{where}: not a JSON object; expected one check per line")

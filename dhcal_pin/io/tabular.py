@@ -38,14 +38,19 @@ _REFUSED_TOML = {
 }
 
 
-def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Read a text file."""
+def read_bytes(path: PathLike, max_bytes: int = -1) -> bytes:
+    """Read a file, or its first bytes."""
     try:
         with open(path, "rb") as file:
-            data = file.read(max_bytes + 1)
+            return file.read(max_bytes)
     except (OSError, ValueError) as error:  # a path with a zero byte raises ValueError
         reason = getattr(error, "strerror", None) or error
         raise FileFormatError(f"{path}: cannot read it: {reason}; give the path of a file") from error
+
+
+def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Read a text file."""
+    data = read_bytes(path, max_bytes + 1)
     if len(data) > max_bytes:
         raise FileFormatError(
             f"{path}: the file is larger than {size_text(max_bytes)}; check the path or shorten the file"

@@ -237,6 +237,8 @@ def suggest_names(name: str, known: Iterable[str]) -> str:
     """Suggest names that are similar to an unknown one, or list the known names."""
     # Matching takes quadratic time in the length of a name, and the names come from a file.
     short = [other for other in known if len(other) <= 100]
+    if not short:
+        return "the file has none"
     similar = difflib.get_close_matches(name[:100], short, 3)
     if similar:
         return f"did you mean {' or '.join(map(quote, similar))}?"

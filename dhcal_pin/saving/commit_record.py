@@ -44,7 +44,7 @@ class CommitRecord:
                 content = json.load(file)
         except FileNotFoundError:  # another run has just completed the commit
             return None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             reason = error.strerror if isinstance(error, OSError) else "it is damaged"
             raise FileFormatError(f"{path}: cannot be read: {reason}; remove this file") from error
         no_record = FileFormatError(f"{path}: is not a record of saved files; remove this file")

@@ -78,23 +78,33 @@ def changed(source, target, name, data):
 
 
 @pytest.mark.parametrize(
-    ("member", "message"),
+    ("member", "data", "message"),
     [
-        ("inputs/laser.csv", "was changed"),
-        ("manifest.json", "no manifest"),
-        ("inputs/more.csv", "was changed"),
-        ("../out.txt", "unsafe name"),
-        ("/tmp/out.txt", "unsafe name"),
-        ("inputs/../../out.txt", "unsafe name"),
+        ("inputs/laser.csv", b"x", "was changed"),
+        ("manifest.json", b"x", "no manifest"),
+        ("manifest.json", b"[" * 10**5, "no manifest"),
+        ("inputs/more.csv", b"x", "was changed"),
+        ("../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
+        ("/tmp/out.txt", b"x", "bad.dhcal.zip: unsafe name"),
+        ("inputs/../../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
     ],
+    ids=range(7),
 )
-def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, message):
-    path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, b"x")
+def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, data, message):
+    path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, data)
     assert main(["calibrate", "--from", str(path), "-o", str(tmp_path / "out.urdf")]) == 2
     error = capsys.readouterr().err
     assert message in error
-    assert error.count("\n") == 1
+    assert error.count("\n") == error.count("bad.dhcal.zip") == 1
     assert [each.name for each in tmp_path.iterdir()] == ["bad.dhcal.zip"]
+
+
+def test_a_missing_file_is_named_before_a_bundle_is_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["none.csv", "-o", "out.urdf", "--bundle", "arm.dhcal.zip"]
+    assert main(["calibrate", str(URDF / "sim_6dof.dh.toml"), *words]) == 2
+    assert capsys.readouterr().err.startswith("dhcal: none.csv: cannot read it: ")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_large_content_and_other_files_are_refused(first, tmp_path, monkeypatch):

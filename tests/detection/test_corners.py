@@ -19,6 +19,7 @@ from dhcal_pin.detection import (
     read_image,
     render_images,
 )
+from dhcal_pin.detection.video import read_stills
 from dhcal_pin.exceptions import DhcalError
 
 cv2 = pytest.importorskip("cv2")
@@ -155,6 +156,30 @@ def test_images_that_are_not_used_are_named(tmp_path):
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(DhcalError, match="cannot be read as an image"):
         read_image(tmp_path / "text.png")
+
+
+def test_an_image_of_an_impossible_width_is_refused(tmp_path):
+    path = tmp_path / "wide.bmp"
+    cv2.imwrite(str(path), np.zeros((2, 2), np.uint8))
+    data = bytearray(path.read_bytes())
+    data[18:22] = (3_000_000).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(DhcalError, match=r"wide\.bmp: "):
+        read_image(path)
+
+
+def test_a_damaged_video_is_refused_without_messages_of_its_library(tmp_path, capfd):
+    path = tmp_path / "arm.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))  # pyright: ignore
+    for _ in range(8):
+        video.write(np.zeros((48, 64, 3), np.uint8))
+    video.release()
+    data = path.read_bytes()
+    assert len(read_stills(path)) == 1
+    path.write_bytes(data.replace(b"movi", b"mowi"))
+    with pytest.raises(DhcalError, match="no frames can be read"):
+        read_stills(path)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.type)

@@ -169,6 +169,9 @@ def test_command(tmp_path: Path, capsys):
     assert main(args) == 2
     assert f"{history}:3: time is missing" in capsys.readouterr().err
     assert history.read_text() == before
+    history.write_text("[" * 10**5)
+    assert main(args) == 2
+    assert f"{history}:1: not JSON" in capsys.readouterr().err
     (tmp_path / "cal.calibration.toml").unlink()
     assert main(args) == 2
     assert "no sidecar" in capsys.readouterr().err
