@@ -21,9 +21,9 @@ samples, and their sizes do not show which samples are wrong. The good samples a
    All samples are good unless the left side is smaller and there is at least one clear outlier.
 
 Outliers by mistakes are set apart from good samples, and occur anywhere in joint space. If errors of all
-sizes occur instead, or outliers lie together in joint space, the model is incomplete: a fit to a part of joint
-space is then too good there and wrong elsewhere. In both cases samples are only rejected if they are very
-far off.
+sizes occur instead, or outliers lie together in joint space, the model is incomplete: a fit to a part of
+joint space is then too good there and wrong elsewhere. In both cases samples are only rejected if they are
+very far off.
 
 The search is skipped if there are many data and the residuals of the fit to all samples look like noise. With
 many rows per unknown, independent outliers hardly bend the fit: unknowns divided by rows is the fraction of
