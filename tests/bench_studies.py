@@ -31,12 +31,13 @@ from robots import ROOT
 
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.io import read_robot
-from dhcal_pin.measurements import MultiTargetPosition
+from dhcal_pin.measurements import MultiTargetPosition, Noise
+from dhcal_pin.planning import plan
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.sampling import joint_range
 from dhcal_pin.ros_packages import resolve_robot_path
 from dhcal_pin.studies import read_study
-from dhcal_pin.studies.grid import StudyGrid
+from dhcal_pin.studies.grid import StudyGrid, draw_configurations
 from dhcal_pin.studies.runner import result_table, run, run_block
 
 FOLDER = ROOT / "docs" / "evidence" / "studies"
@@ -60,6 +61,8 @@ SEEDS = 100
 PARTS, PLACES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), 5
 # Distances of the second reflector [m], arms of each setting, and the noise of each axis [m].
 DISTANCES, REFLECTOR_SEEDS, NOISE = (0.05, 0.1, 0.2, 0.4), 12, 2e-5
+# Number of random configurations from which poses are planned.
+N_CANDIDATES = 2000
 
 
 def grid(arm: str, seeds: int = SEEDS, **settings: Any) -> StudyGrid:
@@ -96,15 +99,28 @@ def by_poses(arm: str) -> Iterator[dict]:
 
 
 def by_planning(arm: str) -> Iterator[dict]:
-    """Error of random and of planned poses, measured by a laser tracker.
+    """Error of random poses and of those that `plan` chooses from random ones, measured by a laser tracker.
 
-    Few configurations of Baxter pass the collision check, so that there is no plan for it.
+    Collisions are not checked, neither of random nor of planned poses.
     """
-    if arm.startswith("Baxter"):
-        return
-    for label in ("random", "planned"):
-        settings = {"kind": "position", "noise": "0.02mm", "poses": [10, 15, 30]}
-        yield from simulated(arm, label, "poses", pose_selection=label, **settings)
+    counts = [10, 15, 30]
+    settings = {"kind": "position", "noise": "0.02mm"}
+    yield from simulated(arm, "random", "poses", **settings, poses=counts)
+    study = grid(arm, **settings, poses=counts)
+    for case in study.cases:
+        candidates = draw_configurations(case.nominal, N_CANDIDATES, np.random.default_rng(0))
+        planned = plan(
+            case.nominal,
+            case.setting.poses,
+            kind="position",
+            noise=Noise(NOISE),
+            parameters=case.setting.parameters,
+            candidates=candidates,
+        )
+        block = run_block((replace(case, poses=planned.q), 0, study.seeds))
+        errors = [row[5] for row in block]
+        median, high = float(np.median(errors)), float(np.quantile(errors, 0.9))
+        yield result_row(arm, "planned", case.setting.poses, median, high)
 
 
 def by_spread(arm: str) -> Iterator[dict]:

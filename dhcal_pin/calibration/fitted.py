@@ -83,6 +83,7 @@ class FittedModel:
         extension: Families of joint errors that were added, and how much the samples count; None if nothing
             was tried.
         bare: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
+        stage: Robust stage that the weights are from, see `robust.WEIGHT_FUNCTIONS`.
     """
 
     errors: ErrorModel
@@ -97,6 +98,7 @@ class FittedModel:
     shrinkage_factor: float = 1.0
     extension: Extension | None = None
     bare: BareGeometry | None = None
+    stage: str = robust.KEPT
 
     @property
     def urdf_alone(self) -> Chain:

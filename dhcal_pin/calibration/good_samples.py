@@ -20,8 +20,10 @@ samples, and their sizes do not show which samples are wrong. The good samples a
 
    All samples are good unless the left side is smaller and there is at least one clear outlier.
 
-Outliers by mistakes are set apart from good samples. If errors of all sizes occur instead, the model is
-incomplete, and samples are only rejected if they are very far off.
+Outliers by mistakes are set apart from good samples, and occur anywhere in joint space. If errors of all
+sizes occur instead, or outliers lie together in joint space, the model is incomplete: a fit to a part of
+joint space is then too good there and wrong elsewhere. In both cases samples are only rejected if they are
+very far off.
 
 The search is skipped if there are many data and the residuals of the fit to all samples look like noise. With
 many rows per unknown, independent outliers hardly bend the fit: unknowns divided by rows is the fraction of
@@ -53,6 +55,7 @@ from ..estimation.qr import rank
 from ..estimation.solver import SolverResult
 from ..estimation.trimmed_squares import MIN_SCALE, LinearizedRows, linearize_rows, search_majorities
 from ..measurements.base import Measurement
+from ..measurements.measured_region import MIN_SPREAD
 
 # Smallest number of rows per unknown, and of samples of each measurement, with which the search may be
 # skipped. The rows of one configuration count once.
@@ -68,6 +71,8 @@ STRICT_THRESHOLD = 3.0
 N_HIDDEN, MAX_CHANCE, MAX_FEW = 40, 0.01, 100
 # Largest number of extensions of the good samples.
 MAX_EXTENSIONS = 20
+# Number of permutations that show how far apart outliers and other samples are by chance.
+N_PERMUTATIONS = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +82,8 @@ class GoodSamples:
     # Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
     weights: list[Array]
     # Robust stage that judges the samples with the nonlinear model: "reject" if outliers were found that are
-    # set apart from the other samples, otherwise "reject_far".
+    # set apart from the other samples, "reject_regional" if these lie together in joint space, otherwise
+    # "reject_far".
     stage: str
 
 
@@ -106,7 +112,11 @@ def find_good_samples(
     if core is None:
         return all_good
     stage = robust.rejection_stage(core.t)
-    threshold = robust.REJECTION_THRESHOLD if stage == robust.REJECTED else robust.FAR_THRESHOLD
+    if stage == robust.REJECTED and _are_regional(
+        part.data, groups[drawn], core.t > robust.REJECTION_THRESHOLD
+    ):
+        stage = robust.REGIONAL
+    threshold = robust.WEIGHT_FUNCTIONS[stage][1]
     if len(drawn) < len(groups):
         x = solution.x + root @ core.y
         return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)
@@ -185,6 +195,32 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
         t = robust.standardize_ratios(np.mean(residual**2, 0), len(residual))
         weights.append(np.where(t > threshold, robust.ZERO_WEIGHT, 1.0))
     return weights
+
+
+def _are_regional(data: Sequence[Measurement], groups: Array, is_outlier: Array) -> bool:
+    """Return whether outliers (m,) are in other places of joint space than the other samples.
+
+    Their places are compared by the energy test of two samples (Szekely & Rizzo 2013): 2·E‖a - b‖ - E‖a - a'‖
+    - E‖b - b'‖ is zero for configurations a and b of one distribution. A configuration is an outlier if half
+    of its samples are. Configurations of different measurements are not compared.
+    """
+    rng, first = np.random.default_rng(0), 0
+    energies = np.zeros(N_PERMUTATIONS + 1)
+    for item in data:
+        part = slice(first, first + len(item.rows))
+        first = part.stop
+        _, rows, labels = np.unique(groups[part], return_index=True, return_inverse=True)
+        outlying = np.bincount(labels, is_outlier[part]) >= 0.5 * np.bincount(labels)
+        if not item.configurations_per_row or outlying.all() or not outlying.any():
+            continue
+        q = np.concatenate(np.split(item.configurations(), item.configurations_per_row), 1)[rows]
+        scaled = q / np.fmax(q.std(0), MIN_SPREAD)
+        distances = np.linalg.norm(scaled[:, None] - scaled, axis=2)
+        drawn = rng.permuted(np.tile(outlying, (N_PERMUTATIONS, 1)), axis=1)
+        a = np.vstack([outlying, drawn]) / outlying.sum()
+        b = np.vstack([~outlying, ~drawn]) / np.sum(~outlying)
+        energies -= np.sum(((a - b) @ distances) * (a - b), 1)
+    return bool(np.mean(energies[1:] >= energies[0]) <= MAX_CHANCE)
 
 
 def independent_rows(rows: LinearizedRows, groups: Array) -> int:

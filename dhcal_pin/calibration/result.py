@@ -218,4 +218,5 @@ def make_result(
         weights=fit.weights,
         shrinkage_factor=shrinkage_factor,
         bare=bare,
+        stage=fit.stage,
     )

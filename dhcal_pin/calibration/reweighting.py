@@ -160,7 +160,8 @@ def _next_round(
         found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
         weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
         # The rounds go on with these weights, then with another search or with those of the nonlinear model.
-        n_searches = state.n_searches + 1
+        # A fit to all parts of joint space does not show that one of them agrees better by itself.
+        n_searches = MAX_SEARCHES if found.stage == robust.REGIONAL else state.n_searches + 1
         next_search = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
         state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:

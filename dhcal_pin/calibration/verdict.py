@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..formatting import format_quantity
@@ -134,6 +135,7 @@ def judge(fit: Evidence) -> Verdict:
             *_hand_eye_images(fit),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
+            *_regional_errors(fit),
             *_few_measurements(fit),
             *_hidden_outliers(fit),
             *_outliers(fit),
@@ -365,6 +367,18 @@ def _unexplained_holdout(fit: Evidence) -> list[Finding]:
     remedy = "Measure all regions of joint space"
     remedy += ", and allow joint errors (--extend auto)." if fit.extension is None else "."
     return [Finding("caution", f"{text} {remedy}")]
+
+
+def _regional_errors(fit: Evidence) -> list[Finding]:
+    """Advise caution if the samples of one part of joint space agree better by themselves."""
+    if fit.stage != robust.REGIONAL or (fit.extension and fit.extension.families):
+        return []
+    text = "The samples of one part of joint space agree better by themselves than with the others: the arm "
+    text += (
+        "has errors that the model does not contain, or the other samples are wrong. Those not very far off "
+    )
+    text += "are fitted."
+    return [Finding("caution", f"{text} Measure more poses in all parts that the arm works in.")]
 
 
 def _overfitting(fit: Evidence) -> float:

@@ -65,8 +65,9 @@ FAR_THRESHOLD = 12.0
 # Number of equally likely parts of the distribution of squares, and largest χ² of the counts in them. It is
 # exceeded by two in a hundred sets of good samples.
 N_PARTS, MAX_PARTS_CHI_SQUARE = 10, 20.0
-# Stages that reject outliers that are set apart from all other samples, and only those that are very far off.
-REJECTED, FAR_REJECTED = "reject", "reject_far"
+# Stages that reject outliers that are set apart from all other samples, and only those that are very far off:
+# where residuals of all sizes occur, and where outliers lie together in joint space.
+REJECTED, FAR_REJECTED, REGIONAL = "reject", "reject_far", "reject_regional"
 # Outliers are set apart if at most this many samples per outlier lie between the thresholds, plus one.
 MAX_BETWEEN = 0.2
 
@@ -112,6 +113,7 @@ def _tukey(t: Array) -> Array:
 WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
     REJECTED: (_uniform, REJECTION_THRESHOLD),
     FAR_REJECTED: (_uniform, FAR_THRESHOLD),
+    REGIONAL: (_uniform, FAR_THRESHOLD),
     "huber": (_huber, OUTLIER_THRESHOLD),
     "cauchy": (_cauchy, OUTLIER_THRESHOLD),
     "tukey": (_tukey, OUTLIER_THRESHOLD),

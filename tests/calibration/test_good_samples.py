@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from robots import joint_sample, measured_arm, robot_file, with_random_frames
+from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import calibrate, good_samples
@@ -280,6 +281,44 @@ def test_errors_of_all_sizes_point_to_the_model_and_are_kept():
     weights = fit.weights[0]
     assert set(weights) <= {1.0, 1e-12}
     assert np.sum(weights < 0.5) < 0.5 * len(fit.outliers[0])
+
+
+@pytest.mark.parametrize("seed", some_slow([11, 0, 2, 3, 4, 7], {0}))
+def test_a_part_of_joint_space_that_agrees_by_itself_is_no_majority(seed):
+    """The fit is of geometry, the arm has other errors, and 60 % of the poses are close together.
+
+    A fit to the close ones states 0.2 mm, and the arm is 0.7 to 1.3 mm wrong.
+    """
+    simulation = Simulation("panda", 57, seed)
+    simulation.add_eccentricities(1e-3)
+    rng, low, high = simulation.rng, simulation.chain.lower.clip(-2.8), simulation.chain.upper.clip(max=2.8)
+    centre = rng.uniform(0.5 * low, 0.5 * high)
+    simulation.q, q = (
+        np.concatenate([rng.normal(centre, 0.3, (near, 7)), rng.uniform(low, high, (far, 7))])
+        for near, far in ((34, 23), (120, 80))
+    )
+    fit = calibrate(simulation.chain, simulation.measure(Pose), extend="none")
+    true = np.array([(simulation.base * pose * simulation.tool).translation for pose in simulation.poses(q)])
+    error = np.sqrt(np.mean(np.sum((fit.chain.poses(q)[:, :3, 3] - true) ** 2, 1)))
+    assert fit.comparisons[0].after["position_rms_m"] > 0.6 * error
+    assert fit.n_outliers <= 5
+    assert fit.verdict.status == "caution"
+    assert "one part of joint space" in fit.verdict.reasons[0]
+
+
+def test_outliers_anywhere_in_joint_space_are_not_taken_for_errors_of_the_model():
+    """Places of the outliers are drawn: at most a few in a hundred draws lie together by chance."""
+    rng = np.random.default_rng(5)
+    q = rng.normal(size=(60, 6))
+    data = [Position(q, np.zeros((60, 3)))]
+    groups = np.arange(60)
+    found = [
+        good_samples._are_regional(data, groups, np.isin(groups, rng.permutation(60)[:20]))
+        for _ in range(100)
+    ]
+    assert sum(found) <= 5
+    assert good_samples._are_regional(data, groups, q[:, 0] > 0.5)
+    assert good_samples._are_regional(data, groups, np.linalg.norm(q, axis=1) > 2.5)
 
 
 @pytest.mark.parametrize("slip", [2e-4, 1e-3, 1e-2])
