@@ -1,6 +1,6 @@
 """Pictures of the tour: a UR10 in front of a laser tracker, series D in notebooks/data.
 
-    python docs/evidence/tour.py FOLDER
+    python docs/evidence/tour.py FOLDER [PICTURE ...]
 
 The calibration is that of the tour's command `dhcal calibrate`. The learning curve is drawn from
 docs/evidence/leaderboard and docs/evidence/tour/learning.json. `sphinx-build` calls `draw`.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -139,27 +140,27 @@ def draw_learning() -> Axes:
     return ax
 
 
-def draw(folder: Path) -> None:
-    """Draw all pictures into a folder; those that are newer than this script are kept."""
+def draw(folder: Path, chosen: Sequence[str] = ()) -> None:
+    """Draw the chosen pictures, or all; these are kept if they are newer than this script."""
     scripts = max(path.stat().st_mtime for path in (Path(__file__), HERE / "tour" / "learning.json"))
     last = folder / "tour_remains.svg"
-    if last.exists() and last.stat().st_mtime > scripts:
+    if not chosen and last.exists() and last.stat().st_mtime > scripts:
         return
     fit = calibrate()
-    pictures = {
-        "content": draw_content(fit),
-        "accuracy": fit.plot_residuals(over="histogram"),
-        "corrections": fit.plot_joint_corrections()[0],
-        "certainty": draw_certainty(fit),
-        "learning": draw_learning(),
-        "where": draw_where(fit),
-        "remains": fit.plot_residuals(over="sample"),
+    pictures: dict[str, Callable[[], Axes]] = {
+        "content": lambda: draw_content(fit),
+        "accuracy": lambda: fit.plot_residuals(over="histogram"),
+        "corrections": lambda: fit.plot_joint_corrections()[0],
+        "certainty": lambda: draw_certainty(fit),
+        "learning": draw_learning,
+        "where": lambda: draw_where(fit),
+        "remains": lambda: fit.plot_residuals(over="sample"),
     }
     with mpl.rc_context({"svg.hashsalt": "dhcal"}):
-        for name, ax in pictures.items():
-            ax.figure.savefig(folder / f"tour_{name}.svg", metadata={"Date": None})
+        for name in chosen or pictures:
+            pictures[name]().figure.savefig(folder / f"tour_{name}.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":
     mpl.use("agg")
-    draw(Path(sys.argv[1]))
+    draw(Path(sys.argv[1]), sys.argv[2:])
