@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, starmap
+from itertools import permutations, product, starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +24,16 @@ from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .evidence import MANUFACTURED, Evidence, fit_evidence
-from .hypotheses import BothChanges, Hypothesis, JointChange, RowShift, both, list_hypotheses
+from .hypotheses import (
+    AxisChange,
+    BothChanges,
+    Hypothesis,
+    JointChange,
+    LengthChange,
+    RowShift,
+    both,
+    list_hypotheses,
+)
 
 # Evidence of too few measurements: nothing is known about them.
 NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
@@ -176,7 +185,7 @@ def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
     chain, samples, neighbourhood, sets, before, listed, scored = trial
     if leaves_residuals(before) and nominal_misfit(chain, samples):
-        first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
+        first = sorted(scored, key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
             trials.append([both(each.hypothesis, second) for second in listed if second != each.hypothesis])
@@ -198,10 +207,19 @@ def _closest_pairs(
     neighbourhood: Sequence[Measurement],
     hypotheses: Sequence[Hypothesis],
 ) -> list[Hypothesis]:
-    """Return the pairs of mistakes in joint columns that move the nominal robot nearest to the positions."""
+    """Return the pairs of mistakes whose changes bring the nominal robot nearest to the measured poses.
+
+    Units and axes of positions do not change this misfit; changes of joints may follow all others.
+    """
     of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
+    others = [
+        each
+        for each in hypotheses
+        if not isinstance(each.change, JointChange | RowShift | LengthChange | AxisChange)
+    ]
+    pairs = [*permutations(of_joints, 2), *product(others, of_joints), *permutations(others, 2)]
     found = []
-    for pair in starmap(both, permutations(of_joints, 2)):
+    for pair in starmap(both, pairs):
         changed = _apply(pair, samples, neighbourhood)
         if changed is not None:
             found.append((nominal_misfit(chain, changed), pair))

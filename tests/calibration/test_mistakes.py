@@ -288,7 +288,7 @@ def judge_pair(seed: int) -> str:
     return "named" if keys and not found.is_suspicious else f"{outcome}: {seed}: {', '.join(names)}: {keys}"
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, 5, 231])
 def test_two_mistakes_are_named(seed):
     assert judge_pair(seed) == "named"
 
