@@ -185,7 +185,7 @@ def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
     chain, samples, neighbourhood, sets, before, listed, scored = trial
     if leaves_residuals(before) and nominal_misfit(chain, samples):
-        first = sorted(scored, key=lambda each: -each.log)
+        first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
             trials.append([both(each.hypothesis, second) for second in listed if second != each.hypothesis])
