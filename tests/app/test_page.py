@@ -207,7 +207,7 @@ def test_the_keyboard_is_enough(page, example):
         if visited[-1] == "calibrate":
             break
     assert [name for name in visited if name] == [
-        *("Use of ur10.urdf", "Remove ur10.urdf", "Use of laser.csv", "Remove laser.csv"),
+        *("example", "Use of ur10.urdf", "Remove ur10.urdf", "Use of laser.csv", "Remove laser.csv"),
         *("tip", "parameters", "holdout", "skip-bad-rows", "calibrate"),
     ]
     page.keyboard.press("Enter")
