@@ -89,10 +89,11 @@ def photograph(
     play = rng.choice([-1.0, 1.0], q.shape)
     scene = scene.placed(rng)
     shown = scene.show(q, play)
-    if len(shown.good) < 2 * n_images:
+    good = shown.good()
+    if len(good) < 2 * n_images:
         return photograph(seed + 10_000, n_images, is_on_wrist=scene.camera.link == "tip", wrong=wrong)
-    others = shown.good[n_images:]
-    images = scene.detect(shown, shown.good[:n_images], rng)
+    others = good[n_images:]
+    images = scene.detect(shown, good[:n_images], rng)
     return PaperArm(scene.arm, nominal_arm(), images, (shown.read[others], shown.local[others]))
 
 
@@ -117,7 +118,7 @@ def photograph_plan(
     q = choose(nominal, mount_rig(rig, nominal))
     q = q + rng.normal(0, np.deg2rad(3), q.shape)
     shown = scene.show(q, rng.choice([-1.0, 1.0], q.shape))
-    return PaperArm(scene.arm, nominal, scene.detect(shown, shown.good, rng), (shown.read, shown.local))
+    return PaperArm(scene.arm, nominal, scene.detect(shown, shown.good(8), rng), (shown.read, shown.local))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +130,9 @@ class _Shown:
     pixels: np.ndarray  # Corners in the image, (m, c, 2)
     is_seen: np.ndarray  # Which corners are found, (m, c)
 
-    @property
-    def good(self) -> np.ndarray:
+    def good(self, n_corners: int = 12) -> np.ndarray:
         """Numbers of the configurations with enough corners."""
-        return np.flatnonzero(self.is_seen.sum(1) >= 12)
+        return np.flatnonzero(self.is_seen.sum(1) >= n_corners)
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,7 @@ from .plan_options import (
     LOW_COST_VIEWS,
     N_CANDIDATES,
     N_IMAGE_CANDIDATES,
+    N_LOW_COST_CANDIDATES,
     N_RECHECKED,
 )
 
@@ -108,7 +109,8 @@ def planned_count(args: Namespace) -> tuple[int, int]:
 def _read_candidates(args: Namespace, chain: Chain) -> tuple[int | Array, Array]:
     """Return the number of candidates to draw, or those of --from, and their rows in the file."""
     if not args.candidates_from:
-        return args.candidates or (N_IMAGE_CANDIDATES if args.rig else N_CANDIDATES), np.zeros(0, int)
+        of_images = N_LOW_COST_CANDIDATES if LOW_COST in chain.parameters else N_IMAGE_CANDIDATES
+        return args.candidates or (of_images if args.rig else N_CANDIDATES), np.zeros(0, int)
     candidates = read_configurations(args.candidates_from, chain, args.columns)
     rows = np.arange(len(candidates))
     if args.rig:

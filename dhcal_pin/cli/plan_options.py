@@ -14,11 +14,13 @@ DEFAULT_IMAGE_SIGMA = "0.3px,0.1mm,0.01deg"
 # The same of a low-cost arm, whose joints have play.
 DEFAULT_LOW_COST_SIGMA = "0.3px,1mm,0.5deg"
 # Views of a low-cost arm, which is led to the poses by hand or by servos with wrong zeros.
-LOW_COST_VIEWS = {"min_share": 0.7, "joint_error": radians(5.0)}
+LOW_COST_VIEWS = {"min_share": 0.4, "joint_error": radians(3.0)}
 # Poses of a check.
 N_RECHECKED = 10
 # Random candidates; images have more rows each, and more of their candidates are good.
 N_CANDIDATES, N_IMAGE_CANDIDATES = 5000, 2000
+# The same of images of a low-cost arm: with five joints, few poses have the board in view.
+N_LOW_COST_CANDIDATES = 400
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -102,7 +104,7 @@ def _add_measurement_options(parser: ArgumentParser) -> None:
         "--corners",
         metavar="SHARE",
         type=float,
-        help="with --rig: smallest share of the corners of a board that is in the image (default: 1; 0.7 "
+        help="with --rig: smallest share of the corners of a board that is in the image (default: 1; 0.4 "
         "for a low-cost arm)",
     )
     parser.add_argument(
@@ -162,7 +164,7 @@ def _add_search_options(parser: ArgumentParser) -> None:
         type=options.POSITIVE_INTEGER,
         metavar="N",
         help=f"number of random candidates (default: {N_CANDIDATES}; {N_IMAGE_CANDIDATES} with --rig, "
-        "1500 with --iso9283)",
+        f"{N_LOW_COST_CANDIDATES} with --rig for a low-cost arm, 1500 with --iso9283)",
     )
     parser.add_argument(
         "--from", dest="candidates_from", metavar="FILE", help="choose from the joint values in a file"

@@ -79,7 +79,7 @@ MIN_WRONG_RATIO = 5.0
 N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
 # Largest number of configurations in which causes are looked for, and of corners in over a third of them:
 # more of them do not change the cause.
-MAX_CONFIGURATIONS, MAX_CORNERS = 300, 4000
+MAX_CONFIGURATIONS, MAX_CORNERS = 300, 3000
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
 # the images show.
 MIN_ROTATION = np.deg2rad(8.0)
