@@ -46,7 +46,9 @@ _MIN_LOG_RATIO = 15.0
 _MIN_NAMED_RATIO = 2.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
-# Number of hypotheses that are tried as the first of two mistakes, and of pairs in joint columns.
+# Largest fall of the log evidence by undoing one of two mistakes, while the other one spoils all samples.
+_MAX_LOG_LOSS = 100.0
+# Number of hypotheses that are tried as the first of two mistakes, and of pairs by their misfit.
 _N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
 # Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
@@ -185,7 +187,8 @@ def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
     chain, samples, neighbourhood, sets, before, listed, scored = trial
     if leaves_residuals(before) and nominal_misfit(chain, samples):
-        first = sorted((each for each in scored if each.log > before.log), key=lambda each: -each.log)
+        first = [each for each in scored if each.log > before.log - _MAX_LOG_LOSS]
+        first.sort(key=lambda each: -each.log)
         trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
         for each in first[:_N_FIRST_OF_PAIR]:
             trials.append([both(each.hypothesis, second) for second in listed if second != each.hypothesis])
