@@ -19,6 +19,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator
 from sphinx.application import Sphinx
 
 from dhcal_pin.plots import STUDY_COLORS, new_axes
@@ -259,6 +260,7 @@ def draw_study(rows: Sequence[dict], title: str, path: Path) -> None:
     ax.set(xlabel=title, ylabel="RMS position error [mm]", xscale="log", yscale="log")
     ax.set_xticks(x, [f"{value:g}" for value in x])
     ax.minorticks_off()
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.legend(frameon=False, fontsize="small")
     _save(ax, path)
