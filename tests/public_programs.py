@@ -147,9 +147,10 @@ def by_figaroh(task: Task) -> Answer | None:
 def by_pybotics(task: Task) -> Answer | None:
     """Calibrate all modified DH parameters, base and tool by pybotics, which fits positions.
 
-    Its loop over the poses is slow, so that it gets 100 of them at most, evenly taken.
+    Its loop over the poses is slow, so that it gets 100 of them at most, evenly taken. It fits one distance
+    per pose and needs as many poses as unknowns: four per joint, six of the base and six of the tool.
     """
-    if not isinstance(task.fit, Pose):
+    if not isinstance(task.fit, Pose) or len(task.fit.q) < 4 * task.chain.n_joints + 12:
         return None
     rows = np.unique(np.linspace(0, len(task.fit.q) - 1, 100).astype(int))
     fit = task.fit.take(rows)

@@ -19,6 +19,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator
 from sphinx.application import Sphinx
 
 from dhcal_pin.plots import STUDY_COLORS, new_axes
@@ -169,7 +170,7 @@ def draw_leaderboard(programs: dict[str, dict], folder: Path) -> None:
         for number, (title, series) in enumerate(rows):
             values = [pooled(series.get(arm, {}).get(split, []), "position_rms_m") for split in splits]
             y = [np.nan if value is None else 1e3 * value for value in values]
-            ax.plot(range(len(splits)), y, **_style(number), label=title)
+            ax.plot(range(len(splits)), y, **_style(number), label=title.replace("`", ""))
         ax.set(title=arm, ylabel="RMS position error [mm]", yscale="log")
         ax.set_xticks(range(len(splits)), [_SPLITS[split].replace(" ", "\n", 1) for split in splits])
         ax.yaxis.set_major_formatter("{x:g}")
@@ -190,7 +191,7 @@ def draw_leaderboard(programs: dict[str, dict], folder: Path) -> None:
         ]
         x, y = ([1e3 * case[key] for case in cases] for key in ("stated_position_rms_m", "position_rms_m"))
         style = _style(number) | {"linestyle": ""}
-        ax.plot(x, y, **style, label=document["program"])
+        ax.plot(x, y, **style, label=document["program"].replace("`", ""))
     limits = np.array([0.04, 12])
     ax.plot(limits, limits, color="#51606e", linewidth=0.8)
     ax.set(xlabel="stated RMS position error [mm]", ylabel="true RMS position error [mm]")
@@ -259,6 +260,7 @@ def draw_study(rows: Sequence[dict], title: str, path: Path) -> None:
     ax.set(xlabel=title, ylabel="RMS position error [mm]", xscale="log", yscale="log")
     ax.set_xticks(x, [f"{value:g}" for value in x])
     ax.minorticks_off()
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g}")
     ax.legend(frameon=False, fontsize="small")
     _save(ax, path)
@@ -275,6 +277,7 @@ def write_evidence(app: Sphinx) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     programs = read_leaderboard(evidence / "leaderboard")
     (folder / "leaderboard.md").write_text(leaderboard_tables(programs), encoding="utf-8")
+    (folder / "summary.md").write_text(summary_table(programs) + "\n", encoding="utf-8")
     draw_leaderboard(programs, folder)
     for name, title in _STUDY_AXES.items():
         rows = json.loads((evidence / "studies" / f"{name}.json").read_text(encoding="utf-8"))
