@@ -104,9 +104,9 @@ def by_planning(arm: str) -> Iterator[dict]:
     Collisions are not checked, neither of random nor of planned poses.
     """
     counts = [10, 15, 30]
-    settings = {"kind": "position", "noise": "0.02mm"}
-    yield from simulated(arm, "random", "poses", **settings, poses=counts)
-    study = grid(arm, **settings, poses=counts)
+    kind, noise = "position", "0.02mm"
+    yield from simulated(arm, "random", "poses", kind=kind, noise=noise, poses=counts)
+    study = grid(arm, kind=kind, noise=noise, poses=counts)
     for case in study.cases:
         candidates = draw_configurations(case.nominal, N_CANDIDATES, np.random.default_rng(0))
         planned = plan(

@@ -88,6 +88,7 @@ def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
     images = KINDS["camera"].simulate(sim_6dof, q, Noise(1e-4), rng)
     assert images.rig is not None
     cameras = mount_rig(simulated_rig(sim_6dof, q), sim_6dof).cameras
+    assert images.rig is not None
     boards = tuple(replace(board, pose=None) for board in images.rig.boards)
     rig = replace(images.rig, cameras=cameras, boards=boards)
     names = [cameras[i].name for i in images.camera]
@@ -104,6 +105,7 @@ def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):
     q = np.stack([pan, lift, elbow, down - lift - elbow, down, pan], 1)
     images = KINDS["camera"].simulate(truth, q, noise, rng)
     cameras = mount_rig(simulated_rig(truth, q), truth).cameras
+    assert images.rig is not None
     boards = tuple(replace(board, pose=None) for board in images.rig.boards)
     rig = replace(images.rig, cameras=cameras, boards=boards)
     names = [cameras[i].name for i in images.camera]
