@@ -138,7 +138,7 @@ def read_bundle(path: PathLike) -> Bundle:
 
 def _json_bytes(content: Any) -> bytes:
     """Return the text of a JSON document as members have it."""
-    return json.dumps(content, indent=2, ensure_ascii=False).encode(errors="backslashreplace")
+    return json.dumps(content, indent=2).encode()
 
 
 def _json_object(data: bytes) -> dict[str, Any] | None:

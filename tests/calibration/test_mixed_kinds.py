@@ -104,6 +104,7 @@ def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):
     down = np.full(25, -np.pi / 2)
     q = np.stack([pan, lift, elbow, down - lift - elbow, down, pan], 1)
     images = KINDS["camera"].simulate(truth, q, noise, rng)
+    assert images.rig is not None
     cameras = mount_rig(simulated_rig(truth, q), truth).cameras
     assert images.rig is not None
     boards = tuple(replace(board, pose=None) for board in images.rig.boards)

@@ -239,8 +239,7 @@ def run_trial(nominal: Chain, seed: int, totals: Totals):
     links = [
         i for i, p in enumerate(errors.parameters) if "." in p.name and p.name[:4] not in ("base", "tool")
     ]
-    assert fit.extension is not None
-    totals.extended += bool(fit.extension.families)
+    totals.extended += fit.extension is not None and bool(fit.extension.families)
     # A family of joint errors that chance has added has further parameters.
     place = {parameter.name: i for i, parameter in enumerate(fit.parameters)}
     links = [i for i in links if errors.parameters[i].name in place]

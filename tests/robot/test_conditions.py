@@ -289,6 +289,10 @@ def test_rows_with_a_time_are_in_order(arm, tmp_path):
             "column 'temperature' has unit 'K'; write one of temperature[degC]",
         ),
         (
+            {"payload[kg]": [1, 1e5, 1.1e5]},
+            "data.csv:4: column 'payload': 110000 is not plausible; expected a number from 0 to 100000",
+        ),
+        (
             {"payload[kg]": [1, -1, 1]},
             "data.csv:3: column 'payload': -1 is not plausible; expected a number from 0",
         ),

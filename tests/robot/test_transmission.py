@@ -19,7 +19,13 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload, parse_urdf
-from dhcal_pin.robot.transmission import MAX_CURVE_ORDER, Transmission, fill_harmonics, n_coefficients
+from dhcal_pin.robot.transmission import (
+    MAX_CURVE_ORDER,
+    Transmission,
+    fill_harmonics,
+    harmonic_orders,
+    n_coefficients,
+)
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
 pytestmark = pytest.mark.usefixtures("unsuspected")
@@ -429,3 +435,13 @@ def test_invalid_payload_is_refused(tmp_path, table, words):
     (tmp_path / "arm.calibration.toml").write_text(f"[payload]\n{table}\n")
     with pytest.raises(DhcalError, match=words):
         read_robot(tmp_path / "arm.urdf", "tool0")
+
+
+def test_only_coefficients_of_sines_and_cosines_have_an_order():
+    """Rows of couplings come first, then a sine and a cosine of each order, then the other terms."""
+    n = 6
+    orders = np.repeat(np.arange(1, MAX_CURVE_ORDER + 1), 2 * n)
+    wanted = np.concatenate([np.zeros(n * n), orders])
+    found = harmonic_orders(np.arange(n_coefficients(n, n)), n)
+    np.testing.assert_array_equal(found[: len(wanted)], wanted)
+    assert not found[len(wanted) :].any()
