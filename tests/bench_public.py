@@ -75,7 +75,8 @@ def judge(
     """Calibrate by a program and return its errors on the judged rows; None if it cannot."""
     q = np.concatenate([judged.q, task.fit.q])
     answer: Answer | None = program.calibrate(Task(task.chain, task.fit, task.sets, q, task.split))
-    if answer is None:
+    # Base and tool are fitted to poses; positions without orientation do not give the tool.
+    if answer is None or (fits_frames and not answer.has_orientation):
         return None
     count = len(judged.q)
     stated = answer.stated
