@@ -72,6 +72,8 @@ FINE_CONSTANTS = (np.inf, *np.geomspace(1.4, 0.08, 16))
 MIN_GROSS_EVIDENCE, MIN_GROSS_EFFECT = 60.0, 3.0
 # Gain in the logarithm of the likelihood from which a drift is exponential rather than linear.
 MIN_CURVATURE_GAIN = 3.0
+# Largest rise of the mean logarithm of the noise by a cause that is kept.
+MAX_NOISE_RISE = 0.02
 # Largest number of causes that are tried in vain.
 MAX_REJECTED = 2
 # Largest number of times that steps and time constants of drifts are changed.
@@ -392,15 +394,22 @@ class _Search:
             found = self.best_cause(fit)
             if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
                 break
+            before = self.x, self.changes, [*self.causes], self.edges
             self._add(found)
-            fit = self._settle()
+            settled = self._settle()
             rows = self.linearize()
             judged = self._judge(rows, self.solve(rows, self.causes), len(self.causes) - 1)
-            if judged.log_evidence < MIN_LOG_EVIDENCE:
-                self.rejected.add((found.block, type(found.shape)))
-                fit = self._remove(len(self.causes) - 1)
-                if len(self.rejected) > MAX_REJECTED:
-                    break
+            # A fit that has diverged is no evidence for a cause.
+            if (
+                judged.log_evidence >= MIN_LOG_EVIDENCE
+                and self._log_noise(settled) < self._log_noise(fit) + MAX_NOISE_RISE
+            ):
+                fit = settled
+                continue
+            self.x, self.changes, self.causes, self.edges = before
+            self.rejected.add((found.block, type(found.shape)))
+            if len(self.rejected) > MAX_REJECTED:
+                break
         self._confirm()
 
     def _remove(self, i: int) -> LinearFit:

@@ -21,6 +21,8 @@ from dhcal_pin.measurements import mount_rig, project_board
 
 NOISE = 0.1
 N_FITTED, N_OTHER = 20, 12
+# Angle of a count of the simulated servos [rad].
+STEP = 2 * np.pi / 2**20
 
 
 @pytest.fixture(scope="module")
@@ -173,3 +175,51 @@ def test_a_plan_reads_the_sidecar_of_estimated_corners(run, calibrated):
     args = ("plan", "arm.urdf", "-n", "3", "--tip", "tool0", "--rig", "rig.toml", "--candidates", "20")
     document = json_of(run(*args, "-o", "poses.csv", "--json", "-"))
     assert document["views"][0]["angle_max_rad"] < np.deg2rad(60.1)
+
+
+def test_counts_of_servos_need_no_rig(run, calibrated):
+    """The same images with counts in place of joint values have the same error, without --rig."""
+    joints = dh.read_robot("arm.urdf", tip="tool0").joint_names
+    head, *rows = Path("other.csv").read_text().splitlines()
+    values = np.array([row.split(",") for row in rows], float)
+    counts = np.round((values[:, :6] + 2 * np.pi) / STEP).astype(int)
+    for name, header, cells in (
+        ("counts.csv", head.replace("[rad]", "[ticks]"), counts),
+        ("rounded.csv", head, counts * STEP - 2 * np.pi),
+    ):
+        lines = (
+            ",".join(map(repr, [*q, u, v, int(i)]))
+            for q, (u, v, i) in zip(cells.tolist(), values[:, 6:].tolist(), strict=True)
+        )
+        Path(name).write_text("\n".join([header, *lines]))
+    motors = {name: {"zero": 2**20, "resolution": 2**21, "counts_per_turn": 2**20} for name in joints}
+    Path("servos.toml").write_text(tomli_w.dumps({"motor": motors}))
+    images = ("--tip", "tool0", "--json", "-")
+    by_counts = json_of(run("validate", "arm.urdf", "counts.csv", "--servos", "servos.toml", *images))
+    by_angles = json_of(run("validate", "arm.urdf", "rounded.csv", *images))
+    figures = [
+        [value for value in each["before"].values() if isinstance(value, float)]
+        for each in (by_counts, by_angles)
+    ]
+    assert len(figures[0]) > 2
+    assert figures[0] == pytest.approx(figures[1], rel=1e-9)
+    status, _, err = run("validate", "arm.urdf", "counts.csv", *images[:2])
+    assert status == 2
+    assert "--servos" in err
+
+
+def test_joint_names_with_a_suffix_are_explained(run, calibrated):
+    """A column map would be wrong: the unit is not known, and image coordinates are not positions."""
+    text = Path("fitted.csv").read_text()
+    joints = dh.read_robot("arm.urdf", tip="tool0").joint_names
+    arguments = ("example:ur10", "theirs.csv", "--rig", "rig.toml", "--tip", "tool0", "-o", "out.urdf")
+    Path("theirs.csv").write_text(text.replace("[rad]", ".pos"))
+    status, _, err = run("calibrate", *arguments)
+    assert status == 2
+    assert f"expected '{joints[0]}[ticks]'" in unfolded(err)
+    assert "from =" not in err
+    Path("theirs.csv").write_text(text.replace("[rad]", "_measured"))
+    status, _, err = run("calibrate", *arguments)
+    assert status == 2
+    assert f'order = ["{joints[0]}_measured"' in unfolded(err)
+    assert "from =" not in err

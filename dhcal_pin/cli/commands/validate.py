@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ...calibration import Accuracy, Result
     from ...estimation.uncertainty import Predictor
     from ...io import MeasurementFile
+    from ...io.servo_file import ServoFile
     from ...measurements import MeasuredRegion, Measurement, MountedRig
     from ...report.validation import Validation
     from ...robot import Chain
@@ -215,9 +216,9 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     from ...measurements.position import require_common_reference_target
 
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
-    rig, estimated = _mounted_rig(args, sidecar, chain)
-    predictor = _predictor(chain, sidecar, args) if args.map else None
     servos = read_servos(args.servos) if args.servos else None
+    rig, estimated = _mounted_rig(args, sidecar, chain, servos)
+    predictor = _predictor(chain, sidecar, args) if args.map else None
     files = [
         read_measurement_file(
             path,
@@ -293,7 +294,9 @@ def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str
     return remarks
 
 
-def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[MountedRig | None, list[str]]:
+def _mounted_rig(
+    args: Namespace, sidecar: str | None, chain: Chain, servos: ServoFile | None
+) -> tuple[MountedRig | None, list[str]]:
     """Return the cameras and boards of the images, with the estimates of a calibration.
 
     Without a rig file, they are those of the sidecar. Other measurements than images need none.
@@ -308,7 +311,7 @@ def _mounted_rig(args: Namespace, sidecar: str | None, chain: Chain) -> tuple[Mo
     else:
         is_usable = calibrated is not None and calibrated.is_complete
         has_images = is_usable and any(
-            has_image_coordinates(path, chain, args.columns, args.sheet) for path in args.data
+            has_image_coordinates(path, chain, args.columns, servos, args.sheet) for path in args.data
         )
         rig = calibrated if has_images else None
     if rig is None or calibrated is None:

@@ -34,6 +34,8 @@ _HEADER_UNITS = {
 }
 # Greatest number of column names that a message lists.
 _MAX_LISTED_NAMES = 12
+# Image coordinates: a file with these has no measured positions.
+_IMAGE_COLUMNS = frozenset(("u", "v"))
 # Headers of coordinates that are not measured, and of rotations.
 _NOT_MEASURED = r"std|sigma|goal|target|command|nominal|soll"
 _ROTATION = r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|[abcwpr]|roll|pitch|yaw|rot.*)(?![a-z])"
@@ -43,12 +45,13 @@ def propose_map(table: DataTable, chain: Chain) -> list[str]:
     """Propose the lines of a column map."""
     columns = _numeric_columns(table)
     joints = _choose_joints(table, chain, columns)
-    if not joints:
+    if not joints or _suffixed_joint(table, chain):
         return []
     lines = ["header = false"] if table.has_numbers_as_header else []
     lines.append(f"joints = {{order = {_names(table, joints)}, unit = {_joint_unit(table, chain, joints)}}}")
     others = [i for i in columns if i not in joints]
-    position = _choose_position(table, others)
+    has_images = not table.has_numbers_as_header and _IMAGE_COLUMNS <= table.columns.keys()
+    position = [] if has_images else _choose_position(table, others)
     names = ("length",) if len(position) == 1 else "xyz"
     if position:
         unit = _unit(table, position[0], np.stack([columns[i] for i in position]), is_length=True)
@@ -140,6 +143,13 @@ def header_problem(table: DataTable, chain: Chain) -> str:
     if table.has_numbers_as_header:
         example = f"{chain.joint_names[0]}[deg],…,x[mm],y[mm],z[mm]"
         return f"{where}: numbers where the header must be; write one such as {example}"
+    if suffixed := _suffixed_joint(table, chain):
+        joint, header = suffixed
+        return (
+            f"{where}: column {quote(header)} is not understood; expected '{joint}[ticks]' for the counts "
+            f"that the servo reports, with --servos FILE, or '{joint}[deg]' or '{joint}[rad]'; rename the columns "
+            "of all joints"
+        )
     headers = [quote(header) for header in table.headers if header]
     n_more = len(headers) - _MAX_LISTED_NAMES
     listed = ", ".join(headers[:_MAX_LISTED_NAMES]) + (f" and {n_more} more" if n_more > 0 else "")
@@ -147,6 +157,19 @@ def header_problem(table: DataTable, chain: Chain) -> str:
     if set(chain.joint_names) & set(table.columns):
         expected = "a measured value, such as x[mm]"
     return f"{where}: no column is {expected}; the columns are {listed}; rename them"
+
+
+def _suffixed_joint(table: DataTable, chain: Chain) -> tuple[str, str] | None:
+    """Return the first joint and header of its name with a suffix, such as LeRobot's `shoulder_pan.pos`."""
+    return next(
+        (
+            (joint, header)
+            for joint in chain.joint_names
+            for header in table.headers
+            if re.fullmatch(rf"{re.escape(joint)}[.:/]\w+", header.strip())
+        ),
+        None,
+    )
 
 
 def missing_header_error(table: DataTable, chain: Chain) -> FileFormatError:

@@ -157,10 +157,14 @@ def open_measurement_table(
 
 
 def has_image_coordinates(
-    source: PathLike | Any, chain: Chain, columns: PathLike | None = None, sheet: str = ""
+    source: PathLike | Any,
+    chain: Chain,
+    columns: PathLike | None = None,
+    servos: ServoFile | None = None,
+    sheet: str = "",
 ) -> bool:
     """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
-    table = open_measurement_table(source, chain, columns, sheet=sheet)
+    table = open_measurement_table(source, chain, columns, servos, sheet)
     return not needs_column_map(table, chain) and find_kind(value_table(table, chain)).kind == "camera"
 
 
