@@ -147,8 +147,8 @@ def header_problem(table: DataTable, chain: Chain) -> str:
         joint, header = suffixed
         return (
             f"{where}: column {quote(header)} is not understood; expected '{joint}[ticks]' for the counts "
-            f"that the servo reports, with --servos FILE, or '{joint}[deg]' or '{joint}[rad]'; rename the columns "
-            "of all joints"
+            f"that the servo reports, with --servos FILE, or '{joint}[deg]' or '{joint}[rad]'; rename the "
+            "columns of all joints"
         )
     headers = [quote(header) for header in table.headers if header]
     n_more = len(headers) - _MAX_LISTED_NAMES
