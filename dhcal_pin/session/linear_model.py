@@ -125,7 +125,7 @@ class Layout:
     def restricted_to(self, rows: Array) -> Layout:
         """Return the layout with the causes that the rows (m, k, c) can show.
 
-        Columns without an effect on the rows are held at zero. A change over time is only looked for if the
+        Columns without an effect on the rows are held at their values. A change over time is only looked for if the
         calibration also estimates a constant error of the same kind.
         """
         largest = np.abs(rows).max((0, 1))
@@ -142,7 +142,9 @@ class Layout:
             for block in self.blocks
             if block.is_constant or not constant_only.intersection(block.columns.tolist())
         ]
-        return replace(self, blocks=tuple(blocks))
+        # The rotation of a tool of which only a point is measured would turn with the direction of its steps.
+        weights = np.where(is_observed[self.model], self.weights, 1 / HELD_SIZE)
+        return replace(self, blocks=tuple(blocks), weights=weights)
 
     def errors_at(self, x: Array) -> Array:
         """Return the values of all parameters of `problem`, for unknowns x (p,) of the calibration."""

@@ -223,6 +223,13 @@ def test_an_event_is_found_without_priors_and_with_redundant_parameters(sets):
     assert is_named(session_of(fit), changes, simulation)
 
 
+def test_a_large_step_of_a_point_does_not_turn_the_tool():
+    """Positions do not show the rotation of the tool, but steps of the point are in its frame."""
+    simulation, changes = Simulation("panda", 300, 104), EVENTS["tool 30 mm at 0.5"]
+    fit = calibrate(simulation.chain, simulation.measure(Position, changes), extend="none")
+    assert is_named(session_of(fit), changes, simulation)
+
+
 def test_an_event_is_found_beside_outliers():
     simulation = Simulation("ur10", 100, 5)
     changes = Changes("base", 2e-3, 0.1 * DEGREE, n_outliers=10)
