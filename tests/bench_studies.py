@@ -104,7 +104,7 @@ def by_planning(arm: str) -> Iterator[dict]:
     Collisions are not checked, neither of random nor of planned poses.
     """
     counts = [10, 15, 30]
-    settings = {"kind": "position", "noise": "0.02mm"}
+    settings: dict[str, Any] = {"kind": "position", "noise": "0.02mm"}
     yield from simulated(arm, "random", "poses", **settings, poses=counts)
     study = grid(arm, **settings, poses=counts)
     for case in study.cases:
