@@ -261,6 +261,7 @@ def test_the_address_has_a_line_of_its_own(tmp_path):
     app.process.send_signal(signal.SIGTERM)
     assert app.first_line == f"{app.url}\n"
     # Not communicate(), which drops what readline() has read ahead.
+    assert app.process.stderr is not None
     with app.process.stderr as rest:
         assert rest.read() == "end with Ctrl-C\n"
     assert app.process.wait(20) == 0
@@ -281,7 +282,7 @@ def photographed(tmp_path_factory):
     """Folder with the rig, photographs, counts and servo file of the guide."""
     folder = tmp_path_factory.mktemp("photographed")
     text = (ROOT / "docs/howto/paper_arm.md").read_text()
-    rig, code = (re.search(rf"```{name}\n(.*?)```", text, re.S)[1] for name in ("toml", "python"))
+    rig, code = (re.findall(rf"```{name}\n(.*?)```", text, re.S)[0] for name in ("toml", "python"))
     (folder / "rig.toml").write_text(rig)
     shutil.copy(URDF / "so101.urdf", folder)
     with pytest.MonkeyPatch.context() as patch:
