@@ -6,8 +6,8 @@ Each program calibrates the same rows of each series and is judged by the same o
 `public_series.py` for series and splits, `public_programs.py` for the programs. One JSON file per program is
 written into docs/evidence/leaderboard (`-o FOLDER`: elsewhere), after each split; the documentation makes its
 tables and figures from them. Two runs give equal files except for `seconds`. The folder DIR has the layout of
-shared/data beside the project. Series and splits that are absent or not chosen keep the entries that the JSON
-file has.
+shared/data beside the project; each file `series.toml` in it describes a further series. Series and splits
+that are absent or not chosen keep the entries that the JSON file has.
 
 The error of a judged row is the distance of the measured position from that of the program, and the angle
 between their orientations; all rows count, outliers too. For contacts it is the distance from the mean of the
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from public_programs import PROGRAMS, Answer, Program, Task, frames_between
-from public_series import SERIES, SPLITS, Series, cases
+from public_series import SERIES, SPLITS, Series, cases, further_series
 from robots import DATA, ROOT
 
 from dhcal_pin import se3
@@ -105,7 +105,8 @@ def run_series(
     for split in splits:
         found: list[dict | None] = []
         if split == "other":
-            others = [each.read(data) for each in SERIES if each.arm == series.other]
+            every = (*SERIES, *further_series(data))
+            others = [each.read(data) for each in every if each.arm == series.other]
             for other in filter(None, others):
                 task = Task(chain, measured, series.sets, measured.q, split)
                 found.append(judge(program, task, other[1], fits_frames=True))
@@ -132,7 +133,7 @@ def main() -> None:
     for name in args.programs.split(","):
         program, path = PROGRAMS[name], args.out / f"{name}.json"
         document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"series": {}}
-        for series in SERIES:
+        for series in (*SERIES, *further_series(args.data)):
             if args.series not in series.arm:
                 continue
             for split, found in run_series(program, series, args.data, args.splits.split(",")):

@@ -13,9 +13,11 @@ rows with equal joint positions stay together. They depend on nothing but the jo
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from robots import MAPS
@@ -36,7 +38,7 @@ class Series:
     arm: str  # Name of the robot and of the series.
     instrument: str  # What measured it.
     robot: str  # Robot, relative to the folder of the data if it is a file.
-    tip: str | None  # Tip link of a URDF.
+    tip: str | None  # Tip link of a URDF; None for the only one.
     files: str  # Pattern of the measurement files.
     columns: str | None = None  # Column map in tests/maps.
     sets: str = "minimal,base,tool"  # Parameter sets of `dhcal_pin`.
@@ -99,6 +101,25 @@ SERIES = (
         sets="placement,tool",
     ),
 )
+
+
+def further_series(data: Path) -> tuple[Series, ...]:
+    """Read the series that files `series.toml` in a folder describe, with paths relative to each file."""
+    found = []
+    for path in sorted(data.rglob("series.toml")):
+        entries: dict[str, Any] = {"tip": None} | tomllib.loads(path.read_text(encoding="utf-8"))
+        place = path.parent.relative_to(data)
+        needed = {field.name for field in fields(Series) if field.default is MISSING}
+        if wrong := (needed - {*entries}) | ({*entries} - {field.name for field in fields(Series)}):
+            raise SystemExit(
+                f"{path}: {sorted(wrong)[0]} is missing or unknown; expected {', '.join(sorted(needed))}"
+            )
+        if not entries["robot"].startswith("example:"):
+            entries["robot"] = str(place / entries["robot"])
+        if "columns" in entries:
+            entries["columns"] = str(path.parent.resolve() / entries["columns"])
+        found.append(Series(**entries | {"files": str(place / entries["files"])}))
+    return tuple(found)
 
 
 def random_halves(stops: Array) -> list[Array]:

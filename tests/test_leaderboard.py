@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import evidence_pages
@@ -11,10 +12,11 @@ import pytest
 from bench_public import FOLDER, errors, statistics
 from bench_studies import ARMS
 from public_programs import PROGRAMS, Task, by_scipy, frames_between, nominal
-from public_series import SPLITS, cases
+from public_series import SPLITS, cases, further_series
 from robots import ROOT, paper
 
 from dhcal_pin import se3
+from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import PointContact, Pose
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.robot import Chain
@@ -58,6 +60,29 @@ def test_frames_between_two_lists_of_poses_are_found():
     found = frames_between(poses, base @ poses @ tool)
     for each, expected in zip(found, (base, tool), strict=True):
         assert np.allclose(each, expected, atol=1e-9)
+
+
+def test_a_folder_describes_a_further_series(tmp_path, measured):
+    """The paper's robot as somebody else's data set."""
+    _, data = measured
+    folder = tmp_path / "set"
+    folder.mkdir()
+    shutil.copy(ROOT / "urdf/sim_6dof.dh.toml", folder / "arm.dh.toml")
+    chain = Chain.from_dh(paper("sim_6dof"))
+    (folder / "poses.csv").write_text(measurement_text(data, chain))
+    entries = 'arm = "A"\ninstrument = "tracker"\nrobot = "arm.dh.toml"\n'
+    (folder / "series.toml").write_text(entries)
+    with pytest.raises(SystemExit, match="files is missing or unknown"):
+        further_series(tmp_path)
+    (folder / "series.toml").write_text(f'{entries}files = "*.csv"\n')
+    (series,) = further_series(tmp_path)
+    read = series.read(tmp_path)
+    assert read is not None
+    assert isinstance(read[1], Pose)
+    np.testing.assert_allclose(read[1].poses, data.poses, atol=1e-9)
+    with (folder / "series.toml").open("a") as file:
+        file.write('columns = "columns.toml"\n')
+    assert further_series(tmp_path)[0].columns == str(folder.resolve() / "columns.toml")
 
 
 def test_errors_are_those_of_a_known_displacement(measured):
