@@ -28,7 +28,7 @@ def test_planned_poses_decide_the_signs(candidates, seeds, count):
 
     for seed in seeds:
         shot = photograph_plan(seed, choose, is_on_wrist=bool(seed % 2))
-        assert shot.images.n_images >= 0.6 * count, seed
+        assert shot.images.n_images >= 0.5 * count, seed
         decision = decide_signs(shot.nominal, [shot.images])
         assert set(decision.turned) == set(shot.arm.wrong), seed
         assert not decision.open, seed
