@@ -373,12 +373,14 @@ def _regional_errors(fit: Evidence) -> list[Finding]:
     """Advise caution if the samples of one part of joint space agree better by themselves."""
     if fit.stage != robust.REGIONAL or (fit.extension and fit.extension.families):
         return []
-    text = "The samples of one part of joint space agree better by themselves than with the others: the arm "
-    text += (
-        "has errors that the model does not contain, or the other samples are wrong. Those not very far off "
-    )
-    text += "are fitted."
-    return [Finding("caution", f"{text} Measure more poses in all parts that the arm works in.")]
+    return [
+        Finding(
+            "caution",
+            "The samples of one part of joint space agree better by themselves than with the others: the arm "
+            "has errors that the model does not contain, or the other samples are wrong. Those not very far off "
+            "are fitted. Measure more poses in all parts that the arm works in.",
+        )
+    ]
 
 
 def _overfitting(fit: Evidence) -> float:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._typing import Array, Progress
-from ..calibration.cameras import judged_boards
+from ..calibration.cameras import judged_boards, split_sets
 from ..estimation.parameters import LOW_COST
 from ..estimation.priors import Priors
 from ..estimation.uncertainty import Uncertainty
@@ -264,7 +264,7 @@ def plan(
     next(phases)
     limits = limits_with_margin(chain, margin.rotation, margin.position)
     ordered = _in_order_of_tour(replace(predicted, criterion=criterion, curves=curves), pool, limits, rng)
-    if LOW_COST in (parameters or chain.parameters).split(","):
+    if LOW_COST in split_sets(parameters or chain.parameters)[0]:
         ordered = replace(ordered, notes=(*ordered.notes, _signs_note(chain, ordered.q, rng)))
     return ordered
 

@@ -158,7 +158,7 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
 
 
 class _Trial(NamedTuple):
-    """Suspicious samples for which no single hypothesis is decisive."""
+    """Suspicious samples, and the evidence of all single hypotheses."""
 
     chain: Chain
     samples: Sequence[Measurement]
@@ -252,9 +252,9 @@ def _score(
         if changed is not None
     ]
     smallest = min([nominal_misfit(chain, samples), *(misfit for misfit, _, _ in candidates)])
-    scored = []
+    largest, scored = np.clip(_MAX_MISFIT_RATIO * smallest, *_MISFIT_LIMITS), []
     for misfit, hypothesis, changed in candidates:
-        if misfit <= np.clip(_MAX_MISFIT_RATIO * smallest, *_MISFIT_LIMITS):
+        if misfit <= largest:
             after = fit_evidence(chain, changed, sets)
             log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
             scored.append(_Scored(hypothesis, after, log))

@@ -129,7 +129,7 @@ def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Ar
     carried = gain @ model[:, [all_names.index(p.name) for p in origins]] * [p.prior for p in origins]
     is_length = np.array([p.unit == "m" for p in origins], bool)
     lengths, angles = carried[:, is_length], carried[:, ~is_length]
-    # Without loss of definiteness: gain · gainᵀ and the prior, in place of the covariance.
+    # The sum of these two is the covariance. In spite of rounding it has no negative eigenvalue.
     priors = covariance[arm] * weights
     noise = gain @ gain.T + priors @ priors.T
     return noise, gain @ rows[:, layout.scale], lengths @ lengths.T, angles @ angles.T

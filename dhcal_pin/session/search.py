@@ -72,8 +72,6 @@ FINE_CONSTANTS = (np.inf, *np.geomspace(1.4, 0.08, 16))
 MIN_GROSS_EVIDENCE, MIN_GROSS_EFFECT = 60.0, 3.0
 # Gain in the logarithm of the likelihood from which a drift is exponential rather than linear.
 MIN_CURVATURE_GAIN = 3.0
-# Largest rise of the mean logarithm of the noise by a cause that is kept.
-MAX_NOISE_RISE = 0.02
 # Largest number of causes that are tried in vain.
 MAX_REJECTED = 2
 # Largest number of times that steps and time constants of drifts are changed.
@@ -399,11 +397,7 @@ class _Search:
             settled = self._settle()
             rows = self.linearize()
             judged = self._judge(rows, self.solve(rows, self.causes), len(self.causes) - 1)
-            # A fit that has diverged is no evidence for a cause.
-            if (
-                judged.log_evidence >= MIN_LOG_EVIDENCE
-                and self._log_noise(settled) < self._log_noise(fit) + MAX_NOISE_RISE
-            ):
+            if judged.log_evidence >= MIN_LOG_EVIDENCE:
                 fit = settled
                 continue
             self.x, self.changes, self.causes, self.edges = before
