@@ -377,8 +377,8 @@ def _regional_errors(fit: Evidence) -> list[Finding]:
         Finding(
             "caution",
             "The samples of one part of joint space agree better by themselves than with the others: the arm "
-            "has errors that the model does not contain, or the other samples are wrong. Those not very far off "
-            "are fitted. Measure more poses in all parts that the arm works in.",
+            "has errors that the model does not contain, or the other samples are wrong. Those not very far "
+            "off are fitted. Measure more poses in all parts that the arm works in.",
         )
     ]
 
