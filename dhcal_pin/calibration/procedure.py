@@ -45,6 +45,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
@@ -177,6 +178,8 @@ def calibrate(
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     chain = _at_measured_temperature(chain, data)
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    if LOW_COST in robot_sets:
+        chain = replace(chain, parameters=HAND_BUILT)
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     signs = None
     if turned != "auto":
@@ -226,7 +229,7 @@ def calibrate(
     groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress, arm_type(robot_sets))
-        images = calibrate_images(fitting, fit, chain, holdout, exchanges)
+        images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)
         return replace(images, signs=signs, with_auto=with_auto)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):

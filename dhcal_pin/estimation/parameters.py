@@ -227,6 +227,8 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
     if term := family.joint_term or family.link_term:
         has_effect = term.has_effect(chain.loads)
         coefficients = [c for c in coefficients if has_effect[c.owner]]
+    is_low_cost = LOW_COST in chain.parameters and family.low_cost_prior is not None
+    prior = family.low_cost_prior if is_low_cost else family.prior
     nominal = [0.0] * len(coefficients)
     if chain.transmission is not None:
         nominal = chain.transmission.coefficients[[c.entry for c in coefficients]].tolist()
@@ -247,7 +249,7 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
             value,
             frames[c.owner],
             twists[c.owner],
-            family.prior,
+            prior,
             c.entry,
             scale,
         )

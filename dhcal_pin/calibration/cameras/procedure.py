@@ -23,7 +23,6 @@ from ...exceptions import InvalidArgumentError, NotObservableError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
-from ..model_selection import Extension
 from ..result import Result, make_result
 from ..reweighting import Fit, reweight
 from .arm_types import CORNERS, IMAGES, ArmType
@@ -32,6 +31,7 @@ from .board_size import find_board_size
 from .diagnosis import HandEyeFit
 from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
 from .jitter import with_jitter
+from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
 from .seen_ranges import seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
@@ -39,11 +39,12 @@ from .stages import fitted_error
 
 
 def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
-    """Raise an error if families of joint errors shall be selected from images."""
-    if families and extend not in (None, "auto"):
+    """Raise an error if families of joint errors shall be selected that images do not show."""
+    others = [name for name in families if name not in FAMILIES]
+    if others and extend not in (None, "auto"):
         raise InvalidArgumentError(
-            f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
-            f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
+            f"extend {others[0]!r}: only {' and '.join(FAMILIES)} are selected from images; name other families "
+            f"among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{others[0]}', 1)}"
         )
 
 
@@ -112,6 +113,7 @@ def calibrate_images(
     chain: Chain,
     holdout: tuple[Measurement, ...],
     exchanges: Sequence[Exchange],
+    families: Sequence[str],
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     has_arm = fit.problem.errors.has_arm
@@ -122,6 +124,7 @@ def calibrate_images(
     ungated = with_lens_priors(fit)
     gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.arm_type)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
+    gated, extension = add_joint_errors(gated, families, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
     if has_arm:
@@ -129,7 +132,7 @@ def calibrate_images(
         warnings += [warning] if warning else []
     result = replace(
         make_result(gated.fit, 1.0, holdout, "lm"),
-        extension=Extension(temperature=gate.temperature, n_configurations=gate.n_configurations),
+        extension=extension,
         input_warnings=tuple(warnings),
         camera_stages=(*axis_stages(exchanges), *stages),
         arm_type=fitting.arm_type,

@@ -1,0 +1,65 @@
+"""Rows of images as the selection of joint errors needs them: displacements of images beside noise of corners.
+
+All corners of an image share the displacement of the arm that the model lacks (`jitter`). With the whitened
+derivative A = U·diag(σ)·Vᵀ of its corners by the displacement in standard deviations, the components of its
+whitened rows along a column of U have the variance 1 + σ² before they are whitened by the displacement, and all
+others the variance 1 of the noise of the corners. A family of joint errors explains displacements: it scales
+their variance by s², and that of the components to 1 + s²·σ². The share of the noise s in the variance is
+t = σ²/(1 + σ²), see `estimation.noisy_rows`. An image thus counts as six rows however many corners it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..._typing import Array
+from ...estimation.folds import Fold
+from ...estimation.noisy_rows import NoiseClass, NoisyFold, NoisyRows, join_classes
+from ...estimation.problem import Problem
+from ...estimation.qr import TriangularSystem, merge_r_factors
+from ...measurements.camera import CameraCorners
+
+# Smallest displacement σ of the rows in standard deviations of the corners that is told from their noise, and
+# number of classes, each of twice the σ of the one before.
+MIN_DISPLACEMENT, N_CLASSES = 0.5, 10
+
+
+def factor_displacements(
+    problem: Problem, x: Array, folds: Sequence[Fold]
+) -> tuple[NoisyRows, tuple[NoisyFold, ...]]:
+    """Factor the rows of images that have a displacement each; the folds divide all images."""
+    parts = [
+        _split(problem.with_data([item.take(mask) for item, mask in zip(problem.data, fold, strict=True)]), x)
+        for fold in folds
+    ]
+    whole = join_classes(parts)
+    out = []
+    for part in parts:
+        held_out = NoisyRows(tuple(one for one in part.classes if one.share))
+        fitted = join_classes([other for other in parts if other is not part])
+        out.append(NoisyFold(fitted, held_out.at(1.0), held_out.n_scaled))
+    return whole, tuple(out)
+
+
+def _split(problem: Problem, x: Array) -> NoisyRows:
+    """Divide the rows of images into classes of the share of their displacement."""
+    linearization, n_columns = problem.linearize(x), len(x) + 1
+    parts: list[list[Array]] = [[] for _ in range(N_CLASSES + 1)]
+    for chunk in problem.chunks:
+        images, rows = chunk.data, linearization.rows(chunk)
+        assert isinstance(images, CameraCorners)
+        for along, size in images.take_displacements(rows):
+            numbers = np.floor(np.log2(np.fmax(size, 1e-9) / MIN_DISPLACEMENT)).astype(int) + 1
+            numbers = np.clip(numbers, 0, N_CLASSES)
+            for number in np.unique(numbers):
+                parts[number].append(along[:, numbers == number].T)
+        parts[0].append(rows.reshape(n_columns, -1).T)
+    shares = [0.0, *(1 - 1 / (1 + (MIN_DISPLACEMENT * 2.0 ** (k + 0.5)) ** 2) for k in range(N_CLASSES))]
+    return NoisyRows(
+        tuple(
+            NoiseClass(TriangularSystem(merge_r_factors(rows)), sum(map(len, rows)), share)
+            for rows, share in zip([each or [np.zeros((0, n_columns))] for each in parts], shares, strict=True)
+        )
+    )
