@@ -54,12 +54,14 @@ class PaperArm:
         found, truth = self._middles(chain, instruments, is_approach_known)
         return np.linalg.norm(found - truth, axis=1)
 
-    def tool_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
+    def tool_errors(
+        self, chain: Chain, instruments: dict[str, float], *, is_approach_known: bool = False
+    ) -> np.ndarray:
         """Return these distances (k,) [m] for the camera at its best pose: they are errors of the arm alone.
 
         The image centre of a lens that is not known can be exchanged for a rotation of the camera.
         """
-        found, truth = (each - each.mean(0) for each in self._middles(chain, instruments))
+        found, truth = (each - each.mean(0) for each in self._middles(chain, instruments, is_approach_known))
         u, _, v = np.linalg.svd(truth.T @ found)
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
         return np.linalg.norm(found @ rotation.T - truth, axis=1)
