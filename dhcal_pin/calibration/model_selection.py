@@ -729,9 +729,7 @@ def select_families(
         families = {
             name: ps for name, ps in missing.items() if name in (*model.widths, *added, *physical_families)
         }
-        candidates = _Candidates.with_folds(
-            *_with_families(fit.problem, fit.solution.x, families), factor
-        )
+        candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families), factor)
         # From the expected widths: the iteration does not leave a width near zero, which may have been the
         # best one without the families that were added since.
         model = candidates.maximize_evidence(dict.fromkeys(model.widths, 1.0))

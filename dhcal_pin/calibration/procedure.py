@@ -63,7 +63,7 @@ from .cameras import (
     split_sets,
     with_stated_distortion,
 )
-from .cameras.procedure import ImageFitting, calibrate_images, require_no_selection, with_common_start
+from .cameras.procedure import ImageFitting, calibrate_images, require_shown_families, with_common_start
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
@@ -129,8 +129,8 @@ def calibrate(
             Method "gn" always weights all samples equally.
         extend: Families of joint errors that are added where the measurements support them: "auto" for all,
             "none", or names of `estimation.EXTENSIONS`; see `model_selection`. The default is "auto", but
-            "none" for method "gn", without priors, where only base and tool are unknown, and for image
-            coordinates, whose families are named among the parameters.
+            "none" for method "gn", without priors, and where only base and tool are unknown. Image
+            coordinates show backlash and elasticity; other families are named among the parameters.
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
@@ -198,7 +198,7 @@ def calibrate(
     families = _extension_families(extend, errors, method, priors)
     _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
-        require_no_selection(extend, families)
+        require_shown_families(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
     first = first_errors(chain, data) if LOW_COST in robot_sets else {}
     start = partial(

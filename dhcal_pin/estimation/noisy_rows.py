@@ -5,13 +5,13 @@ The whitened rows [J | r] are in classes c. The variance of the rows of a class 
     v_c = 1 - t_c + t_c·s²
 
 with the noise s, which is common to all classes, and the share t_c of the variance that it scales: 1 if
-nothing is known of the noise, 0 if it is known. Corners of an image are between the two: they have the noise of
-their detection and a displacement of the arm, see `calibration.cameras.displacement_rows`.
+nothing is known of the noise, 0 if it is known. Corners of an image are between the two: they have the
+noise of their detection and a displacement of the arm, see `calibration.cameras.displacement_rows`.
 
 With the squared residuals C_c of the n_c rows of a class, γ_c of which the unknowns take up, the noise of
 greatest evidence is the fixed point of
 
-    s² = Σ w_c·(C_c/(n_c - γ_c) - (1 - t_c))/t_c / Σ w_c,    w_c = (n_c - γ_c)·t_c²/v_c².
+    s² = Σ (C_c - (n_c - γ_c)·(1 - t_c))·t_c/v_c² / Σ (n_c - γ_c)·t_c²/v_c².
 
 Shapes: p unknowns.
 """
@@ -60,7 +60,8 @@ class NoisyRows:
 
     def at(self, noise: float) -> TriangularSystem:
         """Return the system of all rows, divided by their standard deviations."""
-        scaled = [one.system.scaled(1 / np.sqrt(one.variance(noise))) for one in self.classes]
+        used = [one for one in self.classes if one.n_rows]
+        scaled = [one.system.scaled(1 / np.sqrt(one.variance(noise))) for one in used]
         if len(scaled) == 1:
             return scaled[0]
         return TriangularSystem(merge_r_factors([one.rows for one in scaled]))
@@ -74,15 +75,16 @@ class NoisyRows:
 
         The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`.
         """
-        total = weight = 0.0
+        total = weight = smallest = 0.0
         for one in self.classes:
-            if one.share:
+            if one.share and one.n_rows:
                 variance = one.variance(noise)
-                freedom = max(one.n_rows - one.system.predicted_variance(root) / variance, 1.0)
-                w = freedom * (one.share / variance) ** 2
-                total += w * (one.system.squared_error(step) / freedom - 1 + one.share) / one.share
-                weight += w
-        return float(np.sqrt(max(total / weight, 0.0)))
+                freedom = one.n_rows - one.system.predicted_variance(root) / variance
+                excess = one.system.squared_error(step) - freedom * (1 - one.share)
+                total += excess * one.share / variance**2
+                weight += freedom * (one.share / variance) ** 2
+                smallest = max(smallest, (one.share / variance) ** 2)
+        return float(np.sqrt(max(total / max(weight, smallest), 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

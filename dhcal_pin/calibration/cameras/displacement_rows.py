@@ -1,10 +1,10 @@
-"""Rows of images as the selection of joint errors needs them: displacements of images beside noise of corners.
+"""Rows of images for the selection of joint errors: displacements of images beside noise of corners.
 
 All corners of an image share the displacement of the arm that the model lacks (`jitter`). With the whitened
 derivative A = U·diag(σ)·Vᵀ of its corners by the displacement in standard deviations, the components of its
-whitened rows along a column of U have the variance 1 + σ² before they are whitened by the displacement, and all
-others the variance 1 of the noise of the corners. A family of joint errors explains displacements: it scales
-their variance by s², and that of the components to 1 + s²·σ². The share of the noise s in the variance is
+rows along a column of U have the variance 1 + σ² before they are whitened by the displacement, and all others
+the variance 1 of the noise of the corners. A family of joint errors explains displacements: it scales their
+variance by s², and that of the components to 1 + s²·σ². The share of the noise s in the variance is
 t = σ²/(1 + σ²), see `estimation.noisy_rows`. An image thus counts as six rows however many corners it has.
 """
 
@@ -57,9 +57,10 @@ def _split(problem: Problem, x: Array) -> NoisyRows:
                 parts[number].append(along[:, numbers == number].T)
         parts[0].append(rows.reshape(n_columns, -1).T)
     shares = [0.0, *(1 - 1 / (1 + (MIN_DISPLACEMENT * 2.0 ** (k + 0.5)) ** 2) for k in range(N_CLASSES))]
+    systems = [merge_r_factors(rows or [np.zeros((1, n_columns))]) for rows in parts]
     return NoisyRows(
         tuple(
-            NoiseClass(TriangularSystem(merge_r_factors(rows)), sum(map(len, rows)), share)
-            for rows, share in zip([each or [np.zeros((0, n_columns))] for each in parts], shares, strict=True)
+            NoiseClass(TriangularSystem(system), sum(map(len, rows)), share)
+            for system, rows, share in zip(systems, parts, shares, strict=True)
         )
     )

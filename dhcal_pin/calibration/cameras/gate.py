@@ -189,7 +189,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
 
 
 def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
-    """Estimate the displacement of images anew for further errors of the arm, and fit at its temperature."""
+    """Estimate the displacement of images anew, fit with it, and return the temperature of the fit."""
     fit, jitter = fit_with_jitter(fit, max_iterations)
     n_configurations = gate.n_configurations if jitter.is_significant else 0
     opened_at = temperature(n_configurations, OPEN_SAMPLES)

@@ -1,8 +1,9 @@
 """Joint errors of an arm in images: families that the displacements of the images support.
 
 They are selected as for other measurements, see `model_selection`. The rows are those of `displacement_rows`:
-the displacements that images have besides the noise of their corners. Families are tried only if the gate lets
-images change the arm. What remains of the displacements is then estimated again.
+the displacements that images have besides the noise of their corners. Families are tried only if the gate
+lets images change the arm. What remains of the displacements is then estimated again. Families that raise the
+error of left-out clusters of joint space are not added.
 """
 
 from __future__ import annotations
@@ -41,19 +42,24 @@ def add_joint_errors(
     judged = fit.without_rejected()
     judged = replace(judged, problem=judged.problem.at_temperature(1.0))
     trials, model, random_ratio, selected = select_families(judged, chosen, factor_displacements)
-    extension = replace(extension, trials=trials)
     if not selected:
-        return gated, extension
-    problem, x, family = with_selected(
-        replace(fit, problem=fit.problem.at_temperature(1.0)), selected, model
-    )
+        return gated, replace(extension, trials=trials)
+    start = replace(fit, problem=fit.problem.at_temperature(1.0))
+    problem, x, family = with_selected(start, selected, model)
     problem = problem.with_prior_weights(prior_weights(problem, family, model.widths))
     solution = minimize(problem, "lm", x, max_iterations, loose=True)
     opened, temperature = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
-    folds = cluster_folds(judged.data)
+    folds = cluster_folds(fit.data)
     errors = [held_out_error(each, folds) for each in (fit, opened)]
     before, after = (error.pixels if error else float("nan") for error in errors)
-    extension = replace(
-        extension, temperature=temperature, random_ratio=random_ratio, region_ratio=after / before
+    if after > before:
+        trials = tuple(replace(trial, is_selected=False) for trial in trials)
+        return gated, replace(extension, trials=trials)
+    extension = Extension(
+        trials,
+        temperature,
+        gate.n_configurations,
+        random_ratio=random_ratio,
+        region_ratio=after / before if before else float("nan"),
     )
     return replace(gated, fit=opened, gate=replace(gate, temperature=temperature)), extension

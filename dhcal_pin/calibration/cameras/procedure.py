@@ -5,7 +5,8 @@ After the first fit these stages follow:
 1. Widths of the priors of lenses and noise of the corners (`lens_priors`, `reweighting`).
 2. Corners of boards as unknowns, where they improve left-out images (`target_points`).
 3. The gate decides how far the arm is corrected (`gate`).
-4. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
+4. Backlash and elasticity are added if the displacements of the images support them (`joint_errors`).
+5. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
    (`board_size`, `diagnosis`).
 """
 
@@ -38,13 +39,13 @@ from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
 
-def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
+def require_shown_families(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
     """Raise an error if families of joint errors shall be selected that images do not show."""
     others = [name for name in families if name not in FAMILIES]
     if others and extend not in (None, "auto"):
         raise InvalidArgumentError(
-            f"extend {others[0]!r}: only {' and '.join(FAMILIES)} are selected from images; name other families "
-            f"among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{others[0]}', 1)}"
+            f"extend {others[0]!r}: only {' and '.join(FAMILIES)} are selected from images; name other "
+            f"families among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{others[0]}', 1)}"
         )
 
 
