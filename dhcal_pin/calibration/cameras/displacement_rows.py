@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..._typing import Array
-from ...estimation.folds import Fold
+from ...estimation.folds import Fold, count_rows
 from ...estimation.noisy_rows import NoiseClass, NoisyFold, NoisyRows, join_classes
 from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, merge_r_factors
@@ -57,10 +57,8 @@ def _split(problem: Problem, x: Array) -> NoisyRows:
                 parts[number].append(along[:, numbers == number].T)
         parts[0].append(rows.reshape(n_columns, -1).T)
     shares = [0.0, *(1 - 1 / (1 + (MIN_DISPLACEMENT * 2.0 ** (k + 0.5)) ** 2) for k in range(N_CLASSES))]
-    systems = [merge_r_factors(rows or [np.zeros((1, n_columns))]) for rows in parts]
-    return NoisyRows(
-        tuple(
-            NoiseClass(TriangularSystem(system), sum(map(len, rows)), share)
-            for system, rows, share in zip(systems, parts, shares, strict=True)
-        )
-    )
+    counts = [sum(map(len, rows)) for rows in parts]
+    # The rows of the corners keep their number when the displacements are taken out of them.
+    counts[0] = count_rows(problem) - sum(counts[1:])
+    systems = [TriangularSystem(merge_r_factors(rows or [np.zeros((1, n_columns))])) for rows in parts]
+    return NoisyRows(tuple(map(NoiseClass, systems, counts, shares)))

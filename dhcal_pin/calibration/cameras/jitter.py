@@ -6,7 +6,7 @@ It is modelled as a random displacement [v, ω] of the tool, v ~ N(0, a²) and �
 `measurements.camera`. The play of a low-cost arm displaces the tool by its n revolute joints, too, with the
 motions J of the tool and c² the variance of each joint: d = [v, ω] + J·δ, δ ~ N(0, c²). The standard
 deviations a, b and c follow by expectation and maximization (Dempster, Laird and Rubin 1977). With the
-whitened derivative A_i of image i by [v, ω, δ], its residuals r_i and D = diag(a², a², a², b², b², b², c², ...):
+whitened derivative A_i of image i by [v, ω, δ], its residuals r_i and D = diag(a², ..., b², ..., c², ...):
 
     C_i = (D⁻¹ + A_iᵀ·A_i)⁻¹,    m_i = C_i·A_iᵀ·r_i,    a² ← mean of m_v² + C_vv,
 
