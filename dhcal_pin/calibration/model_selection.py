@@ -304,7 +304,8 @@ class _Candidates:
         columns = self.columns(widths)
         reduced = self.rows.select(columns)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
-        noise = reduced.noise_after(1.0, np.zeros(len(x)), np.zeros((len(x), len(x))))
+        # Displacements of images that are smaller than the noise of their corners may leave nothing.
+        noise = reduced.noise_after(1.0, np.zeros(len(x)), np.zeros((len(x), len(x)))) or MIN_NOISE_RATIO
         smallest = MIN_NOISE_RATIO * noise
         rounds = 0
         while True:

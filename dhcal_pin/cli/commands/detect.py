@@ -131,6 +131,12 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = corner_columns(rig, camera, detections, joints)
+    used = {image.path for each in detections for image in each.used}
+    if read and read.is_ordered and (left_out := [path for path in paths if path not in used]):
+        notes.append(
+            f"{args.joints}: {os.path.basename(left_out[0])} shows no board; directions of approach by the "
+            "order of the images are wrong for the next one if a joint turned back in between"
+        )
     contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
     if args.overlay:
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
