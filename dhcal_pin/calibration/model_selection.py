@@ -68,8 +68,15 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
-from ..estimation.folds import Fold, count_rows, factor_partition, solve_columns
-from ..estimation.noisy_rows import NoiseClass, NoisyFold, NoisyRows
+from ..estimation.folds import (
+    Fold,
+    NoiseClass,
+    NoisyFold,
+    NoisyRows,
+    count_rows,
+    factor_partition,
+    solve_columns,
+)
 from ..estimation.parameters import EXTENSIONS, LOW_COST, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from dhcal_pin.estimation.noisy_rows import NoiseClass, NoisyRows, join_classes
+from dhcal_pin.estimation.folds import NoiseClass, NoisyRows, join_classes
 from dhcal_pin.estimation.qr import TriangularSystem, merge_r_factors
 
 SHARES, COUNTS, P = (0.0, 0.4, 0.98), (40, 25, 30), 4

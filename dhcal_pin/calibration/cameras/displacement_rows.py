@@ -5,7 +5,7 @@ derivative A = U·diag(σ)·Vᵀ of its corners by the displacement in standard 
 rows along a column of U have the variance 1 + σ² before they are whitened by the displacement, and all others
 the variance 1 of the noise of the corners. A family of joint errors explains displacements: it scales their
 variance by s², and that of the components to 1 + s²·σ². The share of the noise s in the variance is
-t = σ²/(1 + σ²), see `estimation.noisy_rows`. An image thus counts as six rows however many corners it has.
+t = σ²/(1 + σ²), see `estimation.folds`. An image thus counts as six rows however many corners it has.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..._typing import Array
-from ...estimation.folds import Fold, count_rows
-from ...estimation.noisy_rows import NoiseClass, NoisyFold, NoisyRows, join_classes
+from ...estimation.folds import Fold, NoiseClass, NoisyFold, NoisyRows, count_rows, join_classes
 from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, merge_r_factors
 from ...measurements.camera import CameraCorners
