@@ -210,11 +210,10 @@ class _Search:
             flat = (columns * scaled[..., None]).reshape(-1, columns.shape[-1])
             right = (residual * scaled).ravel()
             information = flat.T @ flat
-            information.flat[:: len(information) + 1] += prior**2
-            covariance = inverse(information)
+            covariance = inverse(information + np.diag(prior**2))
             step = covariance @ (flat.T @ right - prior**2 * value)
             after = residual - columns @ step
-            freedom = max(1 - float(np.sum(covariance * (flat.T @ flat))) / is_row.sum(), 0.05)
+            freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
             for label in range(self.groups.max() + 1):
                 chosen = self.groups == label
@@ -285,8 +284,7 @@ class _Search:
             for (_, shapes), blocks in alike.items()
             for cause in self._scores(fit, blocks, shapes, cells, cross)
         ]
-        best = max(found, key=lambda cause: cause.log_evidence, default=None)
-        return best and replace(best, effect=self._effect(fit, best))
+        return max(found, key=lambda cause: cause.log_evidence, default=None)
 
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
@@ -304,9 +302,13 @@ class _Search:
 
     def _products(self, fit: LinearFit) -> tuple[Array, Array]:
         """Return the inner products of each cell: of the rows, and of rows and columns of the fit."""
-        rows = fit.rows.copy()
-        rows[..., -1] *= fit.weights[:, None]
-        return _cell_products(rows, self.edges), _cell_products(rows, self.edges, fit.columns)
+        p = len(self.layout.model)
+        columns = np.concatenate([fit.columns[..., p:], fit.rows], -1)
+        columns[..., -1] *= fit.weights[:, None]
+        q = fit.columns.shape[-1] - p
+        products = _cell_products(columns, self.edges)[:, q:]
+        of_fit = np.concatenate([q + self.layout.model, np.arange(q)])
+        return products[:, :, q:], products[:, :, of_fit]
 
     def _shapes(self, block: Block) -> list[list[Shape]]:
         """Return the functions of time that are tested for a block; those of one list are equally likely."""
@@ -385,7 +387,7 @@ class _Search:
         """Find all causes."""
         fit = self.solve(self.first_rows, [])
         gross = self.best_cause(fit)
-        if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and gross.effect > MIN_GROSS_EFFECT:
+        if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and self._effect(fit, gross) > MIN_GROSS_EFFECT:
             self._add(gross)
         fit = self.iterate()
         while len(self.causes) < MAX_CAUSES:
@@ -763,15 +765,9 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
     return found is not None and found.log_evidence > MIN_SCREENED_EVIDENCE
 
 
-def _cell_products(rows: Array, edges: Array, columns: Array | None = None) -> Array:
-    """Return the inner products of the rows of each cell, (K, c, ·)."""
-    other = rows if columns is None else columns
+def _cell_products(rows: Array, edges: Array) -> Array:
+    """Return the inner products of the columns of each cell, (K, c, c)."""
     if np.ptp(np.diff(edges)) == 0:
-        parts = [each.reshape(len(edges) - 1, -1, each.shape[-1]) for each in (rows, other)]
-        return parts[0].swapaxes(1, 2) @ parts[1]
-    return np.array(
-        [
-            rows[a:b].reshape(-1, rows.shape[-1]).T @ other[a:b].reshape(-1, other.shape[-1])
-            for a, b in pairwise(edges)
-        ]
-    )
+        cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
+        return cells.swapaxes(1, 2) @ cells
+    return np.array([_information(rows[a:b], np.ones((b - a, 1))) for a, b in pairwise(edges)])
