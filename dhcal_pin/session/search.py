@@ -33,7 +33,7 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
+from .facts import Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
@@ -651,10 +651,10 @@ class _Search:
         # The most significant difference of the arm itself.
         is_arm = np.array([names[c].prior < MAX_ARM_PRIOR for c in geometric])
         worst = int(np.argmax(np.where(is_arm, np.abs(difference) / std, 0.0)))
-        (before, line_before), (file, line) = (self.timeline.place(best[1] + i) for i in (-1, 0))
+        before, after = (self.timeline.place(best[1] + i) for i in (-1, 0))
         name, unit = names[geometric[worst]].name, names[geometric[worst]].unit
         size = abs(float(difference[worst]))
-        return Event("robot", name, file, line, before, line_before, size, float(std[worst]), unit)
+        return Event("robot", name, before, after, size, float(std[worst]), unit)
 
 
 def _information(columns: Array, root: Array) -> Array:
@@ -731,18 +731,16 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
     causes = tuple(search.causes)
-    events = describe_events(causes, search.changes, chain, timeline)
     return Session(
         search.changes.without_lag,
         timeline,
         chain,
         is_ordered,
         causes,
-        (other_robot,) if other_robot else events,
-        tuple(describe_drifts(causes, search.changes, chain, timeline)),
-        next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
-        tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
-    )
+        (other_robot,) if other_robot else (),
+        lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
+        scales=tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
+    ).described()
 
 
 def _lag(cause: Cause, timeline: Timeline) -> Lag:
