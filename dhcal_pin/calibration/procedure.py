@@ -50,7 +50,7 @@ from ..plausibility.signs import SignDecision, decide_signs, first_errors, known
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
-from ..session import can_have_session, find_scale, find_session
+from ..session import can_have_session, find_scale, find_session, refine_changes
 from . import model_selection
 from .cameras import (
     arm_type,
@@ -63,6 +63,7 @@ from .cameras import (
     split_sets,
     with_stated_distortion,
 )
+from .cameras.image_session import find_image_session
 from .cameras.procedure import ImageFitting, calibrate_images, require_shown_families, with_common_start
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
@@ -191,8 +192,24 @@ def calibrate(
         signs = decide_signs(chain, data)
     chain = signs.apply(chain) if signs else chain
     data, exchanges = exchange_axes(chain, data)
-    data = with_common_start(chain, data)
     holdout = reorder(holdout, exchanges)
+    of_images = None
+    if session != "off" and method == "lm" and has_images(data):
+        of_poses = partial(
+            calibrate,
+            chain,
+            parameters=list(dict.fromkeys([*robot_sets, "base", "tool"])),
+            priors=priors,
+            extend="none",
+            max_iterations=max_iterations,
+            session=session,
+            turned="none",
+            executor=executor,
+        )
+        of_images = find_image_session(chain, data, holdout, of_poses)
+    if of_images and not of_images.changes.is_empty:
+        data, holdout = of_images.applied(data, holdout)
+    data = with_common_start(chain, data)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
@@ -205,6 +222,10 @@ def calibrate(
         _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
     )
     fit = start(data)
+    if of_images and not of_images.changes.is_empty:
+        of_images = refine_changes(of_images, replace(fit.problem, data=fit.data), fit.solution.x)
+        data, holdout = of_images.applied(fit.data, holdout)
+        fit = start(data)
     # The confirmation of changes and the calibration itself often need the same fits.
     reweighted = cache(
         lambda fit, stages: reweight(fit, stages, _prior_groups(fit, priors), max_iterations, progress)
@@ -230,7 +251,7 @@ def calibrate(
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress, arm_type(robot_sets))
         images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)
-        return replace(images, signs=signs, with_auto=with_auto)
+        return replace(images, signs=signs, with_auto=with_auto, session=of_images)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))

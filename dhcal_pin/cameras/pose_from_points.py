@@ -279,7 +279,10 @@ def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, 
     damping = np.full(len(poses), _DAMPING)
     active = np.arange(len(poses))
     for _ in range(_N_STEPS):
-        normal, gradient = _normal_equations(residuals[active], local[active], presence[active])
+        jacobian = _jacobian(local[active]) * presence[active][..., None]
+        rows = jacobian.reshape(len(active), -1, 6).swapaxes(1, 2)
+        normal = rows @ rows.swapaxes(1, 2)
+        gradient = (rows @ residuals[active].reshape(len(active), -1, 1))[..., 0]
         scale = np.sqrt(np.maximum(np.einsum("cii->ci", normal), 1e-300))
         normal = normal / (scale[:, :, None] * scale[:, None]) + damping[active, None, None] * np.eye(6)
         step = np.linalg.solve(normal, (gradient / scale)[..., None])[..., 0] / scale
@@ -301,12 +304,19 @@ def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, 
     return poses, np.where(is_behind, np.inf, np.sqrt(cost / counts))
 
 
-def _normal_equations(residuals: Array, local: Array, presence: Array) -> tuple[Array, Array]:
-    """Return JᵀJ (c, 6, 6) and Jᵀr (c, 6) of poses that move by twists [v, ω] in camera axes."""
+def _jacobian(local: Array) -> Array:
+    """Return the derivatives (..., m, 2, 6) of points (..., m, 3) by twists [v, ω] in camera axes."""
     depth = np.maximum(local[..., 2], _MIN_DEPTH)
-    by_point = np.zeros((*local.shape[:2], 2, 3))
+    by_point = np.zeros((*local.shape[:-1], 2, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
     by_point[..., 2] = -local[..., :2] / depth[..., None] ** 2
-    jacobian = np.concatenate([by_point, np.cross(local[:, :, None], by_point)], 3) * presence[..., None]
-    rows = jacobian.reshape(len(local), -1, 6)
-    return rows.swapaxes(1, 2) @ rows, (rows.swapaxes(1, 2) @ residuals.reshape(len(local), -1, 1))[..., 0]
+    return np.concatenate([by_point, np.cross(local[..., None, :], by_point)], -1)
+
+
+def pose_information(pose: Array, points: Array) -> Array:
+    """Return the information about a twist [v, ω] in camera axes of a pose (4, 4) of points (m, 3), (6, 6).
+
+    It is for unit noise of the image coordinates X/Z, Y/Z.
+    """
+    rows = _jacobian(points @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 6)
+    return rows.T @ rows

@@ -17,7 +17,7 @@ then in classes c. The variance of the whitened rows of a class is
 
 with the noise s, which is common to all classes, and the share t_c of the variance that it scales: 1 if
 nothing is known of the noise, 0 if it is known. Corners of an image are between the two: they have the
-noise of their detection and a displacement of the arm, see `calibration.cameras.displacement_rows`. With the
+noise of their detection and a displacement of the arm, see `calibration.cameras.joint_errors`. With the
 squared residuals C_c of the n_c rows of a class, γ_c of which the unknowns take up, the noise of greatest
 evidence is the fixed point of
 

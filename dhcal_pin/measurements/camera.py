@@ -47,7 +47,15 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import BoardViews, Corners, estimate_views, first_values, moving_poses
+from .images.camera_start import (
+    BoardViews,
+    Corners,
+    estimate_views,
+    first_values,
+    moving_information,
+    moving_poses,
+)
+from .images.image_pose import ImagePose
 from .images.names import label_images, name_array, whole_images
 from .mounting import MountedRig, mount_rig
 from .pose import Pose
@@ -329,7 +337,8 @@ class CameraCorners(Measurement):
     @property
     def corners(self) -> Corners:
         """Data of the corners for the first values of cameras and boards."""
-        return Corners(self.q, self.values, self.rig, self.camera, self.board, self.corner, self.image)
+        parts = self.rig, self.camera, self.board, self.corner, self.image
+        return Corners(self.conditions(), self.values, *parts)
 
     def photographs(self) -> Array:
         """Return the name of the photograph of each sample, (m,); empty texts without photographs."""
@@ -593,7 +602,18 @@ class CameraCorners(Measurement):
 
     def tool_poses(self) -> Pose:
         """Return the poses of the tool, for some base and some tool, that the images show one by one."""
-        return Pose(*moving_poses(self.corners, self.board_views))
+        samples, poses = moving_poses(self.corners, self.board_views)
+        return Pose(self.q[samples], poses)
+
+    def image_poses(self) -> ImagePose:
+        """Return the same poses with their covariances, lines and conditions."""
+        samples, poses = moving_poses(self.corners, self.board_views)
+        information = moving_information(self.corners, self.board_views, samples)
+        return ImagePose.of(self.q[samples], poses, information).replace(
+            rows=self.rows[samples],
+            source=self.source,
+            recorded=self.recorded and self.recorded[samples],
+        )
 
     # ------------------------------------------------------------------------------------------- files
     def _columns_and_sigmas(self) -> tuple[dict[str, Any], dict[str, Any]]:

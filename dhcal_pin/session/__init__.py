@@ -2,6 +2,7 @@
 
 from .check import Recheck, recheck
 from .facts import History, Session, histories
+from .refinement import refine_changes
 from .scale import find_scale
 from .search import can_have_session, find_session
 
@@ -14,4 +15,5 @@ __all__ = [
     "find_session",
     "histories",
     "recheck",
+    "refine_changes",
 ]

@@ -17,6 +17,7 @@ Shapes: m samples, F functions of time, c columns of a block.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -38,11 +39,12 @@ class Block:
 
     Attributes:
         kind: What changes.
-        of: Name of the joint, or of the axis of a scale; else empty.
+        of: Name of the joint, of the axis of a scale, or of what moved if not base or tool; else empty.
         index: Number of the joint; 0 for other blocks.
         columns: Indices of the columns, (c,).
         sizes: Change of each column that moves the tool by about 1 m, (c,).
         is_constant: Whether it is the same for all samples.
+        origin: Point whose motion is stated, in the frame of base or tool, (3,) [m].
     """
 
     kind: Kind
@@ -51,6 +53,7 @@ class Block:
     columns: Array
     sizes: Array
     is_constant: bool = False
+    origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
 
     @property
     def levers(self) -> Array:

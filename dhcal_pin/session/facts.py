@@ -16,7 +16,7 @@ from ..robot.chain import Chain
 from .causes import Block, Cause, Drift, FreeDrift, Step
 from .linear_model import growing_links
 from .robot_changes import RobotChanges, apply_changes
-from .timeline import Timeline
+from .timeline import Place, Timeline
 
 # A motion is stated as an angle if that moves the tool by more than this multiple of its translation.
 MIN_ANGLE_RATIO = 10.0
@@ -28,11 +28,9 @@ class Event:
 
     Attributes:
         kind: "base", "tool", "joint" or "robot".
-        of: Name of the joint or parameter; else empty.
-        file: File of the first sample after it.
-        line: Line of this sample.
-        file_before: File of the last sample before it.
-        line_before: Line of that sample.
+        of: Name of the joint or parameter, or of what moved if not base or tool; else empty.
+        before: Place of the last sample before it.
+        after: Place of the first sample after it.
         size: Size of the change, in `unit`.
         std: Standard deviation of the size.
         unit: "m" or "rad".
@@ -40,10 +38,8 @@ class Event:
 
     kind: str
     of: str
-    file: str
-    line: int
-    file_before: str
-    line_before: int
+    before: Place
+    after: Place
     size: float
     std: float
     unit: str
@@ -54,12 +50,24 @@ class Event:
         return {key: getattr(self, key) for key in keys}
 
     @property
+    def file(self) -> str:
+        """File of the first sample after it."""
+        return self.after.file
+
+    @property
+    def line(self) -> int:
+        """Line of the first sample after it."""
+        return self.after.line
+
+    @property
     def place(self) -> str:
         """Where it happened, such as "between lines 51 and 52"."""
-        if self.file_before != self.file:
-            return f"between {self.file_before or 'the first'} and {self.file or 'the second set of samples'}"
+        if self.before.photograph and self.after.photograph:
+            return f"between {self.before.photograph} and {self.after.photograph}"
+        if self.before.file != self.file:
+            return f"between {self.before.file or 'the first'} and {self.file or 'the second set of samples'}"
         where = f" of {self.file}" if self.file else ""
-        return f"between lines {self.line_before} and {self.line}{where}"
+        return f"between lines {self.before.last_line} and {self.line}{where}"
 
     @property
     def finding(self) -> str:
@@ -70,7 +78,8 @@ class Event:
             return f"Two robots were measured: from {where} on, {self.of} differs by {size}."
         if self.kind == "joint":
             return f"The zero of joint {self.of} changed by {size} {self.place}."
-        return f"The {self.kind} {'turned' if self.unit == 'rad' else 'moved'} by {size} {self.place}."
+        verb = "turned" if self.unit == "rad" else "moved"
+        return f"The {self.of or self.kind} {verb} by {size} {self.place}."
 
     @property
     def consequence(self) -> str:
@@ -79,7 +88,7 @@ class Event:
             return "Calibrate each robot by itself."
         if self.kind == "joint":
             return "The result is the arm after the change."
-        return f"Both parts were fitted with their own {self.kind} pose."
+        return f"Both parts were fitted with their own {self.of or self.kind} pose."
 
 
 @dataclass(frozen=True)
@@ -87,15 +96,17 @@ class SlowChange:
     """Drift during a session.
 
     Attributes:
-        of: "base", "tool", "links", or the name of a joint.
+        kind: "base", "tool", "links" or "joint".
+        of: Name of the joint, or of what moved; else the kind.
         size: Largest difference from the end, in `unit`.
         std: Standard deviation of the size.
         unit: "m" or "rad".
         shape: "linear", "exponential" or "free".
         time_constant: Time constant of an exponential; else None.
-        time_unit: "row" or "s".
+        time_unit: "row", "image" or "s".
     """
 
+    kind: str
     of: str
     size: float
     std: float
@@ -115,19 +126,19 @@ class SlowChange:
         size = format_quantity(self.size, self.unit, self.std, small=self.unit == "m")
         how = "during the measurement"
         if self.time_constant is not None:
-            unit = "s" if self.time_unit == "s" else "rows"
+            unit = "s" if self.time_unit == "s" else f"{self.time_unit}s"
             how += f", with a time constant of {self.time_constant:.3g} {unit}"
         if self.of == "links":
             by = f"up to {size}" if self.shape == "free" else size
             return f"The lengths of the links changed {how}, which moved the tool by {by}."
-        part = self.of if self.of in ("base", "tool") else f"zero of joint {self.of}"
+        part = f"zero of joint {self.of}" if self.kind == "joint" else self.of
         by = f"irregularly by up to {size}" if self.shape == "free" else f"by {size}"
         return f"The {part} drifted {by} {how}."
 
     @property
     def consequence(self) -> str:
         """What the calibration did."""
-        if self.of in ("base", "tool"):
+        if self.kind in ("base", "tool"):
             return "It was fitted with a pose that changes smoothly."
         return "The result is the arm at the end."
 
@@ -228,6 +239,12 @@ class Session:
         timeline = replace(self.timeline, data=(*data, *holdout))
         return apply_changes(self.changes, self.chain, timeline, None)
 
+    def described(self) -> Session:
+        """Return the session with events and drifts that describe its causes."""
+        parts = self.causes, self.changes, self.chain, self.timeline
+        events = self.events if self.has_two_robots else describe_events(*parts)
+        return replace(self, events=events, drifts=tuple(describe_drifts(*parts)))
+
     @property
     def has_two_robots(self) -> bool:
         """Whether the samples are of two robots."""
@@ -300,10 +317,8 @@ def describe_events(
     events = []
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
-        (file_before, line_before), (file, line) = (timeline.place(shape.number + i) for i in (-1, 0))
-        events.append(
-            Event(cause.block.kind, cause.block.of, file, line, file_before, line_before, size, std, unit)
-        )
+        before, after = (timeline.place(shape.number + i) for i in (-1, 0))
+        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit))
     return tuple(events)
 
 
@@ -311,13 +326,14 @@ def _step_size(cause: Cause, step: Step, changes: RobotChanges, chain: Chain) ->
     """Return the size of a step of base or tool, its standard deviation and its unit."""
     motion = getattr(changes, cause.block.kind)
     before, after = motion.poses[motion.segments(np.array([step.number - 1, step.number]))]
+    origin = np.array([*cause.block.origin, 1.0])
     if cause.block.kind == "base":
-        moved = (after - before)[:3] @ chain.base[:, 3]
-        turned, arm, axes = after @ se3.inverse(before), np.zeros(3), chain.base[:3, :3]
+        before, after = before @ chain.base, after @ chain.base
+        axes, arm = chain.base[:3, :3], origin[:3]
     else:
-        moved = (after - before)[:3, 3]
-        turned, arm, axes = after @ se3.inverse(before), before[:3, 3], np.eye(3)
-    return _motion_size(axes.T @ moved, se3.log3(turned[:3, :3]), arm, cause.block, cause.covariance)
+        axes, arm = np.eye(3), before[:3] @ origin
+    turned = axes.T @ se3.log3((after @ se3.inverse(before))[:3, :3])
+    return _motion_size(axes.T @ (after - before)[:3] @ origin, turned, arm, cause.block, cause.covariance)
 
 
 def _motion_size(
@@ -353,7 +369,8 @@ def cause_size(
         return abs(float(values[0])), float(np.sqrt(covariance[0, 0])), unit
     if block.kind == "links":
         return *_growth_size(values, covariance, chain, timeline), "m"
-    return _motion_size(values[:3], values[3:], np.zeros(3), block, covariance)
+    origin = np.asarray(block.origin)
+    return _motion_size(values[:3] + np.cross(values[3:], origin), values[3:], origin, block, covariance)
 
 
 def describe_drifts(
@@ -366,6 +383,7 @@ def describe_drifts(
             constant = shape.time_constant if isinstance(shape, Drift) else np.inf
             law = "linear" if np.isinf(constant) else "exponential"
             yield SlowChange(
+                cause.block.kind,
                 cause.block.of or cause.block.kind,
                 *cause_size(cause, changes, chain, timeline),
                 law if isinstance(shape, Drift) else "free",

@@ -132,10 +132,11 @@ class Layout:
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
         flat = rows.reshape(-1, rows.shape[-1])
         changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))
-        model = flat[:, self.model]
-        explained = inverse(model.T @ model) @ (model.T @ flat[:, changing])
-        left = flat[:, changing] - model @ explained
-        share = np.sum(left**2, 0) / np.maximum(np.sum(flat[:, changing] ** 2, 0), 1e-300)
+        products = flat.T @ flat
+        of_model = products[np.ix_(self.model, changing)]
+        explained = inverse(products[np.ix_(self.model, self.model)]) @ of_model
+        squares = np.diag(products)[changing]
+        share = 1 - np.sum(of_model * explained, 0) / np.maximum(squares, 1e-300)
         constant_only = set(changing[is_observed[changing] & (share > MAX_UNEXPLAINED)].tolist())
         blocks = [
             replace(block, sizes=np.where(is_observed[block.columns], block.sizes, HELD_SIZE))

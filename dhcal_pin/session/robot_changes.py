@@ -103,6 +103,21 @@ class RobotChanges:
         steps = tuple(new if step == old else step for step in motion.steps)
         return replace(self, **{kind: replace(motion, steps=steps)})
 
+    def carried_to(self, base: Array, tool: Array) -> RobotChanges:
+        """Return the changes of the same robot with the base pose M·B and the tool pose T·N⁻¹.
+
+        Args:
+            base: Motion M, (4, 4) [m].
+            tool: Motion N, (4, 4) [m].
+        """
+        by_tool = se3.adjoint(tool)
+        drifts = tuple((shape, twists @ by_tool.T) for shape, twists in self.tool.drifts)
+        return replace(
+            self,
+            base=replace(self.base, poses=base @ self.base.poses @ se3.inverse(base)),
+            tool=replace(self.tool, poses=tool @ self.tool.poses @ se3.inverse(tool), drifts=drifts),
+        )
+
     def conditions(
         self, conditions: Conditions, chain: Chain, numbers: Array, times: Array, later: Array | None
     ) -> Conditions:

@@ -44,7 +44,7 @@ WIDE = 10.0
 # Smallest relative variance of a correction: redundant parameters have none in some directions.
 MIN_VARIANCE = 1e-6
 # Largest number of samples that are examined.
-MAX_SAMPLES = 200
+MAX_SAMPLES = 100
 
 
 def find_scale(problem: Problem, x: Array) -> Scale | None:

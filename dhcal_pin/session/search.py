@@ -33,7 +33,7 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import Event, Lag, Scale, Session, describe_drifts, describe_events
+from .facts import Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
@@ -210,11 +210,10 @@ class _Search:
             flat = (columns * scaled[..., None]).reshape(-1, columns.shape[-1])
             right = (residual * scaled).ravel()
             information = flat.T @ flat
-            information.flat[:: len(information) + 1] += prior**2
-            covariance = inverse(information)
+            covariance = inverse(information + np.diag(prior**2))
             step = covariance @ (flat.T @ right - prior**2 * value)
             after = residual - columns @ step
-            freedom = max(1 - float(np.sum(covariance * (flat.T @ flat))) / is_row.sum(), 0.05)
+            freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
             for label in range(self.groups.max() + 1):
                 chosen = self.groups == label
@@ -285,8 +284,7 @@ class _Search:
             for (_, shapes), blocks in alike.items()
             for cause in self._scores(fit, blocks, shapes, cells, cross)
         ]
-        best = max(found, key=lambda cause: cause.log_evidence, default=None)
-        return best and replace(best, effect=self._effect(fit, best))
+        return max(found, key=lambda cause: cause.log_evidence, default=None)
 
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
@@ -304,9 +302,13 @@ class _Search:
 
     def _products(self, fit: LinearFit) -> tuple[Array, Array]:
         """Return the inner products of each cell: of the rows, and of rows and columns of the fit."""
-        rows = fit.rows.copy()
-        rows[..., -1] *= fit.weights[:, None]
-        return _cell_products(rows, self.edges), _cell_products(rows, self.edges, fit.columns)
+        p = len(self.layout.model)
+        columns = np.concatenate([fit.columns[..., p:], fit.rows], -1)
+        columns[..., -1] *= fit.weights[:, None]
+        q = fit.columns.shape[-1] - p
+        products = _cell_products(columns, self.edges)[:, q:]
+        of_fit = np.concatenate([q + self.layout.model, np.arange(q)])
+        return products[:, :, q:], products[:, :, of_fit]
 
     def _shapes(self, block: Block) -> list[list[Shape]]:
         """Return the functions of time that are tested for a block; those of one list are equally likely."""
@@ -385,7 +387,7 @@ class _Search:
         """Find all causes."""
         fit = self.solve(self.first_rows, [])
         gross = self.best_cause(fit)
-        if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and gross.effect > MIN_GROSS_EFFECT:
+        if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and self._effect(fit, gross) > MIN_GROSS_EFFECT:
             self._add(gross)
         fit = self.iterate()
         while len(self.causes) < MAX_CAUSES:
@@ -649,10 +651,10 @@ class _Search:
         # The most significant difference of the arm itself.
         is_arm = np.array([names[c].prior < MAX_ARM_PRIOR for c in geometric])
         worst = int(np.argmax(np.where(is_arm, np.abs(difference) / std, 0.0)))
-        (before, line_before), (file, line) = (self.timeline.place(best[1] + i) for i in (-1, 0))
+        before, after = (self.timeline.place(best[1] + i) for i in (-1, 0))
         name, unit = names[geometric[worst]].name, names[geometric[worst]].unit
         size = abs(float(difference[worst]))
-        return Event("robot", name, file, line, before, line_before, size, float(std[worst]), unit)
+        return Event("robot", name, before, after, size, float(std[worst]), unit)
 
 
 def _information(columns: Array, root: Array) -> Array:
@@ -729,18 +731,16 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
     causes = tuple(search.causes)
-    events = describe_events(causes, search.changes, chain, timeline)
     return Session(
         search.changes.without_lag,
         timeline,
         chain,
         is_ordered,
         causes,
-        (other_robot,) if other_robot else events,
-        tuple(describe_drifts(causes, search.changes, chain, timeline)),
-        next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
-        tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
-    )
+        (other_robot,) if other_robot else (),
+        lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
+        scales=tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
+    ).described()
 
 
 def _lag(cause: Cause, timeline: Timeline) -> Lag:
@@ -763,15 +763,9 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
     return found is not None and found.log_evidence > MIN_SCREENED_EVIDENCE
 
 
-def _cell_products(rows: Array, edges: Array, columns: Array | None = None) -> Array:
-    """Return the inner products of the rows of each cell, (K, c, ·)."""
-    other = rows if columns is None else columns
+def _cell_products(rows: Array, edges: Array) -> Array:
+    """Return the inner products of the columns of each cell, (K, c, c)."""
     if np.ptp(np.diff(edges)) == 0:
-        parts = [each.reshape(len(edges) - 1, -1, each.shape[-1]) for each in (rows, other)]
-        return parts[0].swapaxes(1, 2) @ parts[1]
-    return np.array(
-        [
-            rows[a:b].reshape(-1, rows.shape[-1]).T @ other[a:b].reshape(-1, other.shape[-1])
-            for a, b in pairwise(edges)
-        ]
-    )
+        cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
+        return cells.swapaxes(1, 2) @ cells
+    return np.array([_information(rows[a:b], np.ones((b - a, 1))) for a, b in pairwise(edges)])

@@ -14,6 +14,16 @@ from .._typing import Array
 from ..measurements.base import Measurement
 
 
+@dataclass(frozen=True)
+class Place:
+    """Place of a sample: its file, its first and last line, and the name of its photograph, if any."""
+
+    file: str
+    line: int
+    last_line: int
+    photograph: str
+
+
 @dataclass(frozen=True, eq=False)
 class Timeline:
     """Order of the samples of a session of N samples.
@@ -23,7 +33,7 @@ class Timeline:
         n_fitted: Number of fitted measurements.
         numbers: Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
         times: Time of each sample, one array per measurement: in seconds if known, else its number.
-        unit: "s" or "row", the unit of the times.
+        unit: "s", "row" or "image", the unit of the times.
         file_starts: Numbers of the first samples of all files but the first.
     """
 
@@ -64,12 +74,13 @@ class Timeline:
         ]
         return replace(self, data=data, numbers=parts[0], times=parts[1])
 
-    def place(self, number: int) -> tuple[str, int]:
-        """Return file and line of a sample."""
+    def place(self, number: int) -> Place:
+        """Return where a sample stands."""
         for item, numbers in zip(self.data, self.numbers, strict=True):
-            found = np.flatnonzero(numbers == number)
-            if found.size:
-                return item.source, int(item.rows[found[0]])
+            found = numbers == number
+            if found.any():
+                rows = item.rows[found]
+                return Place(item.source, int(rows.min()), int(rows.max()), str(item.photographs()[found][0]))
         raise IndexError(number)
 
 

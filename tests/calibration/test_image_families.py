@@ -9,8 +9,8 @@ from servo_arms import SO101, TIP
 
 from dhcal_pin import read_robot, select_parameters
 from dhcal_pin.calibration import Result, calibrate
-from dhcal_pin.calibration.cameras.displacement_rows import factor_displacements
 from dhcal_pin.calibration.cameras.gate import residual_jitter
+from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor

@@ -297,7 +297,7 @@ def test_files_are_segments_even_without_an_order():
     shuffled = [part.replace(rows=np.arange(2, 52)) for part in shuffled]
     fit = calibrate(simulation.chain, shuffled, extend="none", session="unordered")
     (event,) = session_of(fit).events
-    assert (event.kind, event.file_before, event.file) == ("tool", "a.csv", "b.csv")
+    assert (event.kind, event.before.file, event.file) == ("tool", "a.csv", "b.csv")
     assert "between a.csv and b.csv" in fit.verdict.reasons[0]
     assert simulation.true_error(fit.chain) < 1e-4
     whole = data.take(rng.permutation(100)).replace(rows=np.arange(2, 102))

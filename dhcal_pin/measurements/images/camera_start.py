@@ -27,10 +27,11 @@ from ..._typing import Array
 from ...cameras.boards import Board
 from ...cameras.hand_eye import choose_poses, mean_pose, solve_hand_eye
 from ...cameras.lens_fit import LensFit, fit_camera
-from ...cameras.pose_from_points import agreeing_points
+from ...cameras.pose_from_points import agreeing_points, pose_information
 from ...cameras.rig import Camera
 from ...exceptions import NotObservableError
 from ...robot.chain import Chain
+from ...robot.conditions import Conditions
 from ..mounting import Mount, MountedRig
 
 # Largest RMS distance in the image, X/Z and Y/Z, of a pose that is used, as a multiple of the median one.
@@ -72,7 +73,7 @@ class BoardViews:
 class Corners:
     """Image coordinates of m corners."""
 
-    q: Array  # Joint positions, (m, n) [rad or m]
+    conditions: Conditions  # Joint positions and conditions of each corner
     values: Array  # Image coordinates, (m, 2) [px]
     rig: MountedRig  # Cameras and boards on the chain
     camera: Array  # Number of the camera of each corner, (m,)
@@ -122,7 +123,7 @@ def first_values(
     item: Corners, views: BoardViews, chain: Chain, is_used: Array | None = None
 ) -> dict[str, float]:
     """Estimate the first values of all parameters of cameras and boards."""
-    used = np.ones(len(item.q), bool) if is_used is None else is_used
+    used = np.ones(len(item.values), bool) if is_used is None else is_used
     values: dict[str, float] = {}
     for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):
         if not camera.has_intrinsics:
@@ -145,7 +146,7 @@ def first_values(
 
 
 def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
-    """Return joint values (k, n) and poses (k, 4, 4) of the moving one of camera and board in the other one.
+    """Return samples (k,) and poses (k, 4, 4) of the moving one of camera and board in the other one.
 
     They are those of the pair with the most views, without badly fitting ones: poses of the tool for some
     base and some tool. Both are empty if no camera and board move against each other.
@@ -158,16 +159,37 @@ def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
     is_usable = camera_moves != board_moves
     labels, counts = np.unique(pairs[is_usable], axis=0, return_counts=True)
     if not len(labels):
-        return np.empty((0, item.q.shape[1])), np.empty((0, 4, 4))
+        return np.empty(0, int), np.empty((0, 4, 4))
     of_pair = np.flatnonzero(np.all(pairs == labels[np.argmax(counts)], 1))
     good = _well_fitting(views.rms, of_pair)
     poses = views.poses[good, 0]
-    return item.q[views.sample[good]], se3.inverse(poses) if camera_moves[good[0]] else poses
+    return views.sample[good], se3.inverse(poses) if camera_moves[good[0]] else poses
 
 
 def _well_fitting(rms: Array, of_pair: Array) -> Array:
     """Return the views of a pair of camera and board, by number, without badly fitting ones."""
     return of_pair[rms[of_pair] <= max(_MAX_RATIO * float(np.median(rms[of_pair])), _GOOD_RMS)]
+
+
+def moving_information(item: Corners, views: BoardViews, samples: Array) -> Array:
+    """Return the information about twists of the poses of `moving_poses`, (k, 6, 6).
+
+    The twists are in the frame of the one that stands still. The noise is that of all images.
+    """
+    number = {int(sample): i for i, sample in enumerate(views.sample)}
+    keys = np.column_stack([item.image, item.board])
+    out = []
+    for sample in samples.tolist():
+        pose = views.poses[number[sample], 0]
+        own = np.all(keys == keys[sample], 1)
+        points = item.rig.boards[item.board[sample]].points[item.corner[own]]
+        information = pose_information(pose, points)
+        if item.rig.camera_mounts[item.camera[sample]].moves:
+            by_twist = se3.adjoint(pose)
+            information = by_twist.T @ information @ by_twist
+        out.append(information)
+    # Half of the square of a distance in the image is the variance of a coordinate.
+    return np.array(out) / (0.5 * np.median(views.rms) ** 2)
 
 
 def _stated_poses(entries: Sequence[Camera] | Sequence[Board], mounts: Sequence[Mount]) -> dict[int, Array]:
@@ -200,7 +222,7 @@ def _board_poses(item: Corners, views: BoardViews, chain: Chain, used: Array) ->
     """Collect the views of each pair of camera and board in the used samples, without badly fitting ones."""
     is_chosen = used[views.sample]
     samples, poses, rms = views.sample[is_chosen], views.poses[is_chosen], views.rms[is_chosen]
-    tools = chain.poses(item.q[samples])
+    tools = chain.poses(item.conditions[samples])
     out: _Pairs = {}
     pairs = np.stack([item.camera[samples], item.board[samples]], 1)
     for camera, board in dict.fromkeys(map(tuple, pairs.tolist())):

@@ -1,0 +1,109 @@
+"""What happened while photographs were taken.
+
+Each image shows the pose of the moving one of camera and board in the other one, without the joint values.
+These poses are measurements of the same robot with a base pose B and a tool pose T of their own; a change of
+the base is a motion of the one that stands still, a change of the tool a motion of the one on the robot. The
+images have the base pose B' and the tool pose T'. A motion C of the base and D of the tool are there
+
+    C' = M·C·M⁻¹ with M = B'·B⁻¹,        D' = N·D·N⁻¹ with N = T'⁻¹·T.
+
+The first fit of all corners refines the motions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ... import se3
+from ..._typing import Array
+from ...exceptions import DhcalError
+from ...measurements.base import Measurement
+from ...measurements.camera import CameraCorners
+from ...measurements.pose import Pose
+from ...robot.chain import Chain
+from ...session import Session
+from ...session.causes import Cause
+from ...session.timeline import Timeline, order_samples
+from ..result import Result
+
+
+def find_image_session(
+    chain: Chain,
+    data: Sequence[Measurement],
+    holdout: Sequence[Measurement],
+    calibrated: Callable[[Sequence[Pose]], Result],
+) -> Session | None:
+    """Find what happened while the images of one camera and one board were taken.
+
+    `calibrated` calibrates poses of the tool for some base and some tool. None if nothing can be said.
+    """
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
+    if len(images) < len(data) or len(pairs) != 1 or not all(item.has_joint_values for item in images):
+        return None
+    try:
+        poses = [item.image_poses() for item in images]
+        result = calibrated(poses)
+    except DhcalError:
+        return None
+    found = result.session
+    if found is None:
+        return None
+    base, tool = chain.base @ se3.inverse(result.chain.base), se3.inverse(chain.tool) @ result.chain.tool
+    camera_moves = images[0].rig.camera_mounts[next(iter(pairs))[0]].moves
+    fixed, moving = ("board", "camera") if camera_moves else ("camera", "board")
+    blocks = {
+        "base": {"of": fixed, "origin": se3.inverse(result.chain.base)[:3, 3]},
+        "tool": {"of": moving, "origin": tool[:3, 3]},
+    }
+    causes = [
+        replace(cause, block=replace(cause.block, **blocks.get(cause.block.kind, {})))
+        for cause in found.causes
+        if not cause.block.is_constant
+    ]
+    return replace(
+        found,
+        changes=found.changes.carried_to(base, tool).without_lag,
+        timeline=_timeline_of_images(images, holdout, poses, found.timeline.unit),
+        chain=chain,
+        causes=tuple(_carried_cause(cause, tool) for cause in causes),
+        lag=None,
+        scales=(),
+    ).described()
+
+
+def _carried_cause(cause: Cause, tool: Array) -> Cause:
+    """Return a cause for another tool pose; see `RobotChanges.carried_to`."""
+    if cause.block.kind != "tool":
+        return cause
+    by_tool = np.kron(np.eye(len(cause.amplitudes)), se3.adjoint(tool))
+    covariance = by_tool @ cause.covariance @ by_tool.T
+    return replace(cause, values=by_tool @ cause.values, covariance=covariance)
+
+
+def _timeline_of_images(
+    data: Sequence[CameraCorners], holdout: Sequence[Measurement], poses: Sequence[Pose], unit: str
+) -> Timeline:
+    """Give all corners of an image its number among the images that show a pose."""
+    corners = order_samples(data, holdout)
+    parts = zip(data, poses, corners.numbers, strict=False)
+    first = np.sort(np.concatenate([_first_corners(item, pose, numbers) for item, pose, numbers in parts]))
+    numbers = tuple(
+        np.fmax(np.searchsorted(first, of_item, side="right") - 1, 0) for of_item in corners.numbers
+    )
+    if unit == "s":
+        return replace(corners, numbers=numbers)
+    return replace(
+        corners, numbers=numbers, times=tuple(each.astype(float) for each in numbers), unit="image"
+    )
+
+
+def _first_corners(item: CameraCorners, pose: Pose, numbers: Array) -> Array:
+    """Return the smallest number of the corners of the image of each pose, (k,), from those of all (m,)."""
+    order = np.argsort(item.rows)
+    first = np.full(item.n_images, np.iinfo(np.int64).max)
+    np.minimum.at(first, item.image, numbers)
+    return first[item.image[order[np.searchsorted(item.rows[order], pose.rows)]]]

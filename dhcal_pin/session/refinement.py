@@ -1,0 +1,53 @@
+"""Refinement of changes during a session by further measurements of the same robot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .._typing import Array
+from ..estimation.problem import Problem
+from .facts import Session
+from .linear_model import Layout, inverse, whitened_rows
+from .robot_changes import apply_changes, update
+from .search import HUBER_LIMIT
+
+# Number of Gauss-Newton steps.
+N_STEPS = 4
+
+
+def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
+    """Fit the changes of a session together with the unknowns x (p,) of a problem with the same samples.
+
+    Samples of large residuals have a bounded influence (Huber).
+    """
+    layout, timeline, chain = Layout.of(problem), session.timeline, session.chain
+    fitted = replace(timeline, data=(*problem.data, *timeline.data[timeline.n_fitted :]))
+    numbers, times = timeline.fitted_numbers, timeline.fitted_times
+    causes, changes = session.causes, session.changes
+    prior = np.concatenate([layout.weights, *(1 / cause.sizes for cause in causes)])
+    ends = np.cumsum([len(x), *(len(cause.values) for cause in causes)])
+    covariance = np.zeros((len(prior), len(prior)))
+    for _ in range(N_STEPS):
+        data, _ = apply_changes(changes, chain, fitted, None)
+        rows = whitened_rows(layout, x, data, np.zeros((len(numbers), chain.n_joints)))
+        columns = [rows[..., layout.model], *(cause.columns_of(rows, numbers, times) for cause in causes)]
+        jacobian, residual = np.concatenate(columns, -1), rows[..., -1]
+        size = np.sqrt(np.mean(residual**2, 1))
+        noise = 1.4826 * float(np.median(np.abs(residual)))
+        weights = np.minimum(1.0, HUBER_LIMIT * noise / np.fmax(size, 1e-300))[:, None, None]
+        flat = (jacobian * np.sqrt(weights)).reshape(-1, len(prior)) / noise
+        right = (residual[..., None] * np.sqrt(weights)).ravel() / noise
+        covariance = inverse(flat.T @ flat + np.diag(prior**2))
+        step = covariance @ (flat.T @ right - prior**2 * np.append(x, np.zeros(len(prior) - len(x))))
+        x, steps = x + step[: len(x)], np.split(step[len(x) :], (ends[1:] - len(x))[:-1])
+        causes = tuple(
+            replace(cause, values=cause.values + change) for cause, change in zip(causes, steps, strict=True)
+        )
+        changes = update(changes, causes, steps, chain.base, layout.links)
+    causes = tuple(
+        replace(cause, covariance=covariance[a:b, a:b])
+        for cause, a, b in zip(causes, ends[:-1], ends[1:], strict=True)
+    )
+    return replace(session, causes=causes, changes=changes).described()

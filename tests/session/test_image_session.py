@@ -1,0 +1,139 @@
+"""Cameras and boards that move while photographs are taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from camera_setups import ARMS, random_setup, simulate, visible_corners, wrong_arm
+from slow_cases import some_slow
+
+from dhcal_pin import calibrate, se3
+from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.measurements import CameraCorners, Pose
+from dhcal_pin.measurements.base import whitened_jacobian
+from dhcal_pin.measurements.images import image_pose
+
+NOISE = 0.3
+NONE = np.empty(0)
+
+
+def photograph(seed, is_on_wrist, is_fixed, motion, share=0.5, count=24, arm="ur10"):
+    """Return a nominal arm, the true one and images between which a camera or a board moved."""
+    rng = np.random.default_rng([seed, 77])
+    nominal = ARMS[arm]()
+    truth = wrong_arm(nominal, 1e-3, rng)
+    setup = simulate(nominal, truth, rng, is_on_wrist=is_on_wrist, n_images=count, sigma=NOISE)
+    rig = setup.exact.rig
+    entries = "boards" if is_on_wrist == is_fixed else "cameras"
+    (entry,) = getattr(rig, entries)
+    moved = replace(rig, **{entries: (replace(entry, pose=entry.pose @ se3.exp6(motion)),)})
+    q = setup.exact.q[np.sort(np.unique(setup.exact.image, return_index=True)[1])]
+    first = int(share * len(q))
+    parts = visible_corners(truth, rig, q[:first]), visible_corners(truth, moved, q[first:])
+    rows, camera, board, corner, pixels = (
+        np.concatenate(each) for each in zip(*parts[0], *parts[1], strict=True)
+    )
+    numbers = np.repeat(
+        np.arange(len(parts[0]) + len(parts[1])), [len(each[0]) for each in (*parts[0], *parts[1])]
+    )
+    images = CameraCorners(
+        rows,
+        pixels + NOISE * rng.standard_normal(pixels.shape),
+        corner,
+        setup.images.rig,
+        [f"camera{i}" for i in camera],
+        [f"board{i}" for i in board],
+        image_names=[f"{number}.png" for number in numbers],
+    )
+    return nominal, truth, images, len(parts[0])
+
+
+def arm_error(chain, truth, images):
+    """Return the RMS error of an arm near the photographed configurations [m], with fitted base and tool."""
+    rng = np.random.default_rng(0)
+    q = images.q[rng.integers(len(images.q), size=100)]
+    q = np.clip(q + 0.1 * rng.standard_normal(q.shape), chain.lower, chain.upper)
+    fit = calibrate(chain, Pose(q, truth.poses(q)), "base,tool", extend="none", session="off", loss="linear")
+    return np.sqrt(np.mean(np.sum((fit.chain.poses(q) - truth.poses(q))[:, :3, 3] ** 2, 1)))
+
+
+CASES = [(is_on_wrist, is_fixed, scale, share)
+         for scale in (1.0, 0.4, 20.0) for share in (0.5, 0.2, 0.8)
+         for is_on_wrist in (True, False) for is_fixed in (True, False)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("is_on_wrist", "is_fixed", "scale", "share"), some_slow(CASES, {0, 3}))
+def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, request):
+    is_slow = request.node.get_closest_marker("slow") is not None
+    named, ratios = [], []
+    for seed in range(5 if is_slow else 1):
+        arm = list(ARMS)[seed % 3]
+        motion = scale * np.array([5e-3, 0, 0, 0, 5e-3, 0])
+        nominal, truth, images, first = photograph(seed, is_on_wrist, is_fixed, motion, share, arm=arm)
+        fit = calibrate(nominal, images)
+        assert fit.session is not None
+        of = "board" if is_on_wrist == is_fixed else "camera"
+        named.append(
+            [(e.kind, e.of, e.place) for e in fit.session.events]
+            == [("base" if is_fixed else "tool", of, f"between {first - 1}.png and {first}.png")]
+            and abs(fit.session.events[0].size / (scale * 5e-3) - 1) < 0.2
+        )
+        assert fit.verdict.status == "caution" or not named[-1]
+        # The error without a motion, or at most a quarter of the nominal one.
+        if is_slow:
+            still = photograph(seed, is_on_wrist, is_fixed, np.zeros(6), share, arm=arm)[2]
+            limit = arm_error(calibrate(nominal, still).chain, truth, images)
+        else:
+            limit = 0.25 * arm_error(nominal, truth, images)
+        ratios.append(arm_error(fit.chain, truth, images) / limit)
+    assert np.mean(named) >= (0.8 if is_slow else 1.0)
+    assert np.median(ratios) < (1.5 if is_slow else 1.0)
+
+
+@pytest.mark.parametrize("seeds", some_slow([range(40), range(1)], {1}))
+def test_nothing_moved(seeds):
+    for seed in seeds:
+        setup = random_setup(seed)
+        fit = calibrate(setup.nominal, setup.images)
+        assert fit.session is not None
+        assert not fit.session.found, seed
+
+
+def test_derivatives_of_poses_with_covariance():
+    rng = np.random.default_rng(1)
+    nominal = ARMS["ur10"]()
+    setup = simulate(nominal, nominal, rng, is_on_wrist=True, n_images=8, sigma=NOISE)
+    poses = setup.images.image_poses()
+    base = poses.poses[0] @ se3.inverse(nominal.poses(poses.q[:1])[0])
+    errors = select_parameters(nominal.with_base_and_tool(base, np.eye(4)), "minimal,base,tool")
+    x = 0.01 * rng.standard_normal(len(errors.parameters))
+
+    def residual(x):
+        return poses.residual(errors.at(x).forward_kinematics(poses.conditions()), NONE).ravel()
+
+    model = errors.derivative(x)
+    frames = model[0].forward_kinematics(poses.conditions())
+    rows = whitened_jacobian(poses, model, frames, NONE, poses.residual(frames, NONE)).reshape(len(x), -1)
+    steps = 1e-6 * np.eye(len(x))
+    expected = np.array([(residual(x + step) - residual(x - step)) / 2e-6 for step in steps])
+    np.testing.assert_allclose(-rows, expected, atol=1e-8 * np.abs(rows).max())
+
+
+def test_covariances_of_poses_agree_with_their_scatter(monkeypatch):
+    monkeypatch.setattr(image_pose, "ARM_STD", (1e-6, 1e-6))
+    rng = np.random.default_rng(2)
+    nominal = ARMS["ur10"]()
+    exact = simulate(nominal, nominal, rng, is_on_wrist=True, n_images=4, sigma=NOISE).exact
+    cameras = tuple(replace(camera, intrinsics="fixed") for camera in exact.rig.cameras)
+    exact = exact.with_rig(replace(exact.rig, cameras=cameras))
+    truth, scaled = exact.image_poses().poses, []
+    for _ in range(30):
+        noisy = exact.replace(values=exact.values + NOISE * rng.standard_normal(exact.values.shape))
+        found = noisy.image_poses()
+        turned = found.poses[:, :3, :3] @ truth[:, :3, :3].swapaxes(1, 2)
+        errors = np.concatenate([found.poses[:, :3, 3] - truth[:, :3, 3], se3.log3(turned)], 1)
+        scaled.append(np.einsum("mij,mj->mi", found.roots, errors))
+    spread = np.std(scaled, (0, 1))
+    assert np.all((spread > 0.8) & (spread < 1.2)), spread
