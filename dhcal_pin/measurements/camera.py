@@ -494,10 +494,14 @@ class CameraCorners(Measurement):
         return rows
 
     def take_displacements(self, rows: Array) -> Iterator[tuple[Array, Array]]:
-        """Take the components along the jitter out of whitened rows (c, 2, m).
+        """Take the components along the jitter out of whitened rows.
 
-        They follow for the images of one number of corners, (c, 6·g), each with its standard deviation before
-        it was whitened by the jitter, in standard deviations of the corners, (6·g,).
+        Args:
+            rows: Whitened rows of c columns, (c, 2, m), from which the components are subtracted.
+
+        Returns:
+            For the g images of each number of corners, their components (c, 6·g), and the standard deviations
+            by the jitter that these had before they were whitened, relative to those of the corners, (6·g,).
         """
         for samples, basis, factors in self._jitter_bases:
             part = rows[..., samples].swapaxes(-3, -2)

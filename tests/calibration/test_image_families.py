@@ -105,6 +105,7 @@ def test_arms_without_play_and_sag_keep_the_geometry():
     shot = photograph(7, 25, play=0.0, compliance=0.0).with_approach()
     fit = calibrated(shot)
     assert not families(fit)
+    assert fit.extension
     assert {trial.family for trial in fit.extension.trials} == {"backlash", "compliance"}
     assert tool_errors(shot, fit)[0] < 1e-3
 
