@@ -499,7 +499,7 @@ class CameraCorners(Measurement):
         Args:
             rows: Whitened rows of c columns, (c, 2, m), from which the components are subtracted.
 
-        Returns:
+        Yields:
             For the g images of each number of corners, their components (c, 6·g), and the standard deviations
             by the jitter that these had before they were whitened, relative to those of the corners, (6·g,).
         """

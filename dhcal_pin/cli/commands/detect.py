@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..._typing import PathLike
     from ...cameras import Camera
     from ...detection import BoardDetection
-    from ...io.measurement_files.image_joints import ImageJoints
+    from ...io.measurement_files import ImageJoints
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
 
@@ -167,7 +167,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
 
 def _joints(args: Namespace, paths: Sequence[str]) -> ImageJoints | None:
     """Return the joint values of the images, and notes on them."""
-    from ...io.measurement_files import read_image_joints, read_recorded_joints  # lazy import: slow to load
+    from ...io.measurement_files import read_joint_table, read_recorded_joints  # lazy import: slow to load
     from ...io.measurement_files.bag import is_bag
 
     is_recording = bool(args.joints) and is_bag(args.joints)
@@ -176,7 +176,7 @@ def _joints(args: Namespace, paths: Sequence[str]) -> ImageJoints | None:
     if is_recording:
         recorded = read_recorded_joints(args.joints, paths, args.joint_topic)
         return recorded._replace(notes=[f"{args.joints}: {text}" for text in recorded.notes])
-    return read_image_joints(args.joints, paths) if args.joints else None
+    return read_joint_table(args.joints, paths) if args.joints else None
 
 
 def _overlays(

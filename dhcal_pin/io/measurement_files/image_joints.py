@@ -26,7 +26,12 @@ class ImageJoints(NamedTuple):
     is_ordered: bool = False  # Whether the images are in the order in which they were taken
 
 
-def read_image_joints(path: PathLike, images: Sequence[str]) -> ImageJoints:
+def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Read the joint values that belong to images."""
+    return read_joint_table(path, images).joints
+
+
+def read_joint_table(path: PathLike, images: Sequence[str]) -> ImageJoints:
     """Read the joint values that belong to images, in the order of the table if it is that of measurement."""
     table = read_table(path)
     headers = [header.strip() for header in table.headers]
