@@ -596,6 +596,7 @@ class CameraCorners(Measurement):
             rows=self.rows[samples],
             source=self.source,
             recorded=self.recorded and self.recorded[samples],
+            has_joint_values=self.has_joint_values,
         )
 
     # ------------------------------------------------------------------------------------------- files

@@ -695,7 +695,7 @@ def _bounded_cost(residual: Array) -> Array:
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
     """Return whether all samples show where base and tool are."""
-    return all(item.shows_changes and item.has_joint_values for item in data)
+    return all(item.shows_changes for item in data)
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
