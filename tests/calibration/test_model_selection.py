@@ -112,7 +112,7 @@ def test_hardly_a_family_is_added_to_200_robots_with_geometric_errors(kind):
 @pytest.mark.parametrize("family", some_slow(["compliance", "harmonics", "gain"], {0, 1}))
 def test_simulated_family_is_added(family):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
-    fit, plain = calibrate(arm, data), calibrate(arm, data, extend="none")
+    fit, plain = (calibrate(arm, data, extend=each, session="off") for each in (None, "none"))
     assert fit.extension is not None
     assert family in fit.extension.families
     one = next(trial for trial in fit.extension.trials if trial.family == family)
@@ -218,7 +218,7 @@ def extension_of(arm: Chain, data: Measurement, extend: str | list[str] | None =
     return extension
 
 
-def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense():
+def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense(unsuspected):
     arm, data = simulated("minimal,base,tool,compliance", 4)
     assert set(extension_of(arm, data, "harmonics,compliance").families) == {"compliance", "harmonics"}
     assert extension_of(arm, data, ["gain"]).families in ((), ("gain",))
@@ -233,7 +233,7 @@ def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense():
         calibrate(arm, data, extend="gain", priors="none")
 
 
-def test_command_reports_the_extension(tmp_path, monkeypatch, capsys):
+def test_command_reports_the_extension(tmp_path, monkeypatch, capsys, unsuspected):
     monkeypatch.chdir(tmp_path)
     arm, data = simulated("minimal,base,tool,compliance", 4)
     (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
