@@ -169,7 +169,7 @@ def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, ca
                 capsys.readouterr()
                 words = shlex.split(line, comments=True)[1:]
                 if words[0] == "plan" and "--candidates" not in words:
-                    words += ["--candidates", "200"]  # Fewer than without the option, to save time.
+                    words += ["--candidates", "100"]  # Fewer than without the option, to save time.
                 status = main.main(words)
                 captured = capsys.readouterr()
                 assert status == 0, f"{line}: {captured.err}"

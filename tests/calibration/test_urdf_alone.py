@@ -160,9 +160,7 @@ def test_urdf_alone_of_half_a_real_series(series):
     is_fitted = np.random.default_rng(5).permutation(len(data.rows)) % 2 == 0
     fitted, other = data.take(is_fitted), data.take(~is_fitted)
     # `test_no_real_series_is_refused` examines the sessions.
-    fit, geometry = (
-        dh.calibrate(nominal, fitted, extend=each, session="off") for each in ("auto", "none")
-    )
+    fit, geometry = (dh.calibrate(nominal, fitted, extend=each, session="off") for each in ("auto", "none"))
     assert fit.extension is not None
     assert {"harmonics", "compliance", "curves"} <= set(fit.extension.families)
     assert fit.extension.temperature > 5
