@@ -10,8 +10,7 @@ from collections.abc import Iterator
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
-# Otherwise every process compiles the tests anew, and every command that a test starts the package.
-sys.dont_write_bytecode = False
+# Otherwise every command that a test starts compiles the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
@@ -19,11 +18,13 @@ from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
 from robots import missing, paper
 
 from dhcal_pin import plots
-from dhcal_pin.calibration import evidence, verdict
+from dhcal_pin.calibration import evidence, procedure, verdict
 from dhcal_pin.plausibility.mixups import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 
+# Otherwise every process compiles all tests anew.
+sys.dont_write_bytecode = False
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]
 
@@ -69,9 +70,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def unsuspected() -> Iterator[None]:
-    """Leave out the search for mistakes in measurements, which takes seconds if an arm has large errors."""
+    """Leave out the search for mistakes and events of a measurement, which takes seconds for some arms."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
+        patch.setattr(procedure, "can_have_session", lambda _: False)
         yield
 
 

@@ -27,6 +27,8 @@ from dhcal_pin.measurements import Measurement, Noise, Pose, Position
 from dhcal_pin.robot import Chain, Conditions
 from dhcal_pin.robot.error_families import FAMILIES, ErrorFamily
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def hint(fit) -> str:
     return family_hint(fit.problem, fit.x, fit.weights)
@@ -112,7 +114,7 @@ def test_hardly_a_family_is_added_to_200_robots_with_geometric_errors(kind):
 @pytest.mark.parametrize("family", some_slow(["compliance", "harmonics", "gain"], {0, 1}))
 def test_simulated_family_is_added(family):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
-    fit, plain = (calibrate(arm, data, extend=each, session="off") for each in (None, "none"))
+    fit, plain = (calibrate(arm, data, extend=each) for each in (None, "none"))
     assert fit.extension is not None
     assert family in fit.extension.families
     one = next(trial for trial in fit.extension.trials if trial.family == family)
@@ -218,7 +220,7 @@ def extension_of(arm: Chain, data: Measurement, extend: str | list[str] | None =
     return extension
 
 
-def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense(unsuspected):
+def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense():
     arm, data = simulated("minimal,base,tool,compliance", 4)
     assert set(extension_of(arm, data, "harmonics,compliance").families) == {"compliance", "harmonics"}
     assert extension_of(arm, data, ["gain"]).families in ((), ("gain",))
@@ -233,7 +235,7 @@ def test_extension_can_be_restricted_and_is_off_where_it_makes_no_sense(unsuspec
         calibrate(arm, data, extend="gain", priors="none")
 
 
-def test_command_reports_the_extension(tmp_path, monkeypatch, capsys, unsuspected):
+def test_command_reports_the_extension(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arm, data = simulated("minimal,base,tool,compliance", 4)
     (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
