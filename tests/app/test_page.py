@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import AXE, READY, VIEWPORT
+from pages import AXE, READY, VIEWPORT, listen
 from slow_cases import some_slow
 
 import dhcal_pin.app.server
@@ -33,7 +33,7 @@ def opened(browser: Any, url: str) -> Iterator[Any]:
     page = context.new_page()
     complaints: list[str] = []
     # The pages that it opens, too.
-    context.on("console", lambda message: complaints.append(message.text))
+    listen(context, complaints)
     context.on("weberror", lambda error: complaints.append(str(error.error)))
     context.on(
         "request",
