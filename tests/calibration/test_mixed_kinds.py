@@ -20,8 +20,6 @@ from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.se3 import exp6
 
-pytestmark = pytest.mark.usefixtures("unsuspected")
-
 # Known distances between points need contacts with these points: see `test_kinds`.
 PAIRS = list(combinations([name for name in KINDS if name != "point_distance"], 2))
 FAST = [PAIRS.index(pair) for pair in (("position", "camera"), ("wires", "plane"), ("position", "plane"))]
