@@ -69,7 +69,9 @@ def problem(chain: Chain, sets: str, kind: type[Measurement] = Pose, q=None, m: 
 
 def explain(of: Problem) -> list[str]:
     zero = np.zeros(len(of.weights))
-    return explanations.explain_unobservable(of, zero, linearize_and_factor(of, zero, False))
+    return explanations.explain_unobservable(
+        ObservabilityProbe(of, zero), linearize_and_factor(of, zero, False)
+    )
 
 
 def rank(of: Problem) -> int:
@@ -404,10 +406,10 @@ def test_weakly_observable_curve_of_a_joint_is_one_sentence():
     q = draw_q(arm, 250)
     q[:, 4] = 0.5 + 0.5 * q[:, 4]
     of = problem(arm, "minimal,base,tool,curves", q=q)
-    system = linearize_and_factor(of, np.zeros(len(of.weights)), False)
-    texts = explanations.explain_weakly_observable(
-        of, np.zeros(len(of.weights)), system, of.errors.priors, 0.05
-    )
+    zero = np.zeros(len(of.weights))
+    system = linearize_and_factor(of, zero, False)
+    probe = ObservabilityProbe(of, zero)
+    texts = explanations.explain_weakly_observable(probe, system, of.errors.priors, 0.05)
     about = [text for text in texts if "wrist_2_joint.sin" in text or "wrist_2_joint.cos" in text]
     assert len(about) == 1
     assert re.match(
