@@ -45,6 +45,18 @@ seeds = {seeds}
 robot = "arm.dh.toml"
 poses = [6, 12]
 """
+RIG = """
+[camera.c]
+link = "world"
+width = 640
+height = 480
+[board.b]
+link = "tip"
+type = "checkerboard"
+columns = 7
+rows = 5
+square_mm = {square}
+"""
 # Few samples and no choice of error families: the files are what matters here.
 QUICK = ("--extend", "none", "--loss", "linear")
 CALIBRATE = ("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", *QUICK)
@@ -64,6 +76,34 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("calibrate", "a.fleet.toml", "-o", "f.csv", "--jobs", "1", "--json", "sub/f.json"),
         ("out.urdf", "out.calibration.toml", "r.md", "r.json"),
     ),
+    "bundle": ((*CALIBRATE, "--bundle", "b.dhcal.zip"), ("out.urdf", "out.calibration.toml", "b.dhcal.zip")),
+    "validate": (
+        ("validate", "arm.urdf", "data.csv", "--json", "sub/v.json", "--report", "v.html"),
+        ("v.html", "sub/v.json"),
+    ),
+    "convert": (("convert", "arm.dh.toml", "c.urdf", "--json", "sub/c.json"), ("sub/c.json", "c.urdf")),
+    "simulate": (
+        ("simulate", "arm.dh.toml", "-n", "5", "--kind", "camera", "-o", "c.csv", "--json", "sub/c.json"),
+        ("c.csv", "c.rig.toml", "sub/c.json"),
+    ),
+    "plan": (
+        ("plan", "arm.dh.toml", "-n", "15", "--candidates", "60", "-o", "p.csv")
+        + ("--export", "p.trajectory.csv", "--json", "sub/p.json"),
+        ("p.csv", "p.trajectory.csv", "sub/p.json"),
+    ),
+    "compensate": (
+        ("compensate", "arm.urdf", "arm.dh.toml", "t.csv", "-o", "c.csv", "--json", "sub/c.json")
+        + ("--export", "c.trajectory.csv"),
+        ("c.csv", "c.trajectory.csv", "sub/c.json"),
+    ),
+    "export": (("export", "arm.dh.toml", "-o", "m.h", "--json", "sub/m.json"), ("m.h", "sub/m.json")),
+    "view": (("view", "arm.dh.toml", "--html", "v.html", "--json", "sub/v.json"), ("v.html", "sub/v.json")),
+    "inspect": (("inspect", "data.csv", "--json", "i.json"), ("i.json",)),
+    "diff": (
+        ("diff", "arm.urdf", "arm.dh.toml", "--json", "sub/d.json", "--report", "d.html"),
+        ("d.html", "sub/d.json"),
+    ),
+    "board": (("board", "rig.toml", "-o", "b.pdf", "--json", "sub/b.json"), ("b.pdf", "sub/b.json")),
 }
 # Files that a command may leave for the next run, which continues with them.
 JOURNALS = {"study": "s.csv.part"}
@@ -98,13 +138,15 @@ class Interruption:
         assert self.old != self.new
 
     def _make_inputs(self, old: bool) -> None:
-        for name in ("arm.urdf", "arm.dh.toml"):
-            if name not in self.names or old:
-                shutil.copy(URDF / name.replace("arm", "experiment"), name)
+        if "arm.urdf" not in self.names or old:
+            shutil.copy(URDF / "experiment.urdf", "arm.urdf")
+        shutil.copy(URDF / f"experiment{'' if old else '_published'}.dh.toml", "arm.dh.toml")
         (self.root / "sub").mkdir(exist_ok=True)
         Path("data.csv").write_text(positions_csv(12, seed=0 if old else 5))
         Path("s.study.toml").write_text(STUDY.format(seeds=2 if old else 3))
         Path("a.fleet.toml").write_text(FLEET)
+        Path("t.csv").write_text("x[mm],y[mm],z[mm]\n400,100,300\n300,-200,400\n")
+        Path("rig.toml").write_text(RIG.format(square=20 if old else 25))
 
     def _run_alone(self) -> None:
         status = self._in_child(lambda: dhcal(self.words))

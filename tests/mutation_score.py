@@ -29,6 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from importlib.util import cache_from_source
 from pathlib import Path
 
 from coverage import CoverageData
@@ -209,7 +210,7 @@ def main() -> None:
         for name in ("dhcal_pin", "tests", "urdf", "docs", "pyproject.toml"):
             copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
             copied(ROOT / name, Path(folder) / name)
-        environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = os.environ | {"PYTHONPATH": folder}
         pytest = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider"]
         chosen_tests = Path(folder) / "chosen_tests"
         for path, line, number in chosen:
@@ -222,6 +223,8 @@ def main() -> None:
                 continue
             copied = Path(folder) / path.relative_to(ROOT)
             copied.write_text(changed)
+            compiled = Path(cache_from_source(str(copied)))
+            compiled.unlink(missing_ok=True)
             tests = executed.tests_of(path, line)
             # Without a name, pytest would run the whole suite.
             chosen_tests.write_text("\n".join(tests or ["--collect-only"]))
@@ -230,6 +233,7 @@ def main() -> None:
                 words, cwd=folder, env=environment, capture_output=True, text=True, check=False
             )
             copied.write_text(source)
+            compiled.unlink(missing_ok=True)
             outcome = OUTCOMES.get(done.returncode, "killed")
             decided[mutant] = outcome
             by = re.findall(r"^(?:FAILED|ERROR).*", done.stdout + done.stderr, re.MULTILINE)[:1]
