@@ -60,6 +60,7 @@ square_mm = {square}
 # Few samples and no choice of error families: the files are what matters here.
 QUICK = ("--extend", "none", "--loss", "linear")
 CALIBRATE = ("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", *QUICK)
+PROGRAM = ("--export", "x.trajectory.csv", "--json", "sub/x.json")
 # Words of each command, and the names of its outputs.
 COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "calibrate": (CALIBRATE, ("out.urdf", "out.calibration.toml")),
@@ -87,14 +88,12 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("c.csv", "c.rig.toml", "sub/c.json"),
     ),
     "plan": (
-        ("plan", "arm.dh.toml", "-n", "15", "--candidates", "60", "-o", "p.csv")
-        + ("--export", "p.trajectory.csv", "--json", "sub/p.json"),
-        ("p.csv", "p.trajectory.csv", "sub/p.json"),
+        ("plan", "arm.dh.toml", "-n", "15", "--candidates", "60", "-o", "p.csv", *PROGRAM),
+        ("p.csv", "x.trajectory.csv", "sub/x.json"),
     ),
     "compensate": (
-        ("compensate", "arm.urdf", "arm.dh.toml", "t.csv", "-o", "c.csv", "--json", "sub/c.json")
-        + ("--export", "c.trajectory.csv"),
-        ("c.csv", "c.trajectory.csv", "sub/c.json"),
+        ("compensate", "arm.urdf", "arm.dh.toml", "t.csv", "-o", "c.csv", *PROGRAM),
+        ("c.csv", "x.trajectory.csv", "sub/x.json"),
     ),
     "export": (("export", "arm.dh.toml", "-o", "m.h", "--json", "sub/m.json"), ("m.h", "sub/m.json")),
     "view": (("view", "arm.dh.toml", "--html", "v.html", "--json", "sub/v.json"), ("v.html", "sub/v.json")),

@@ -15,7 +15,7 @@ from dhcal_pin.calibration.cameras import procedure
 from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import subsample
-from dhcal_pin.exceptions import InvalidArgumentError, NotObservableError
+from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.se3 import exp6
@@ -127,6 +127,21 @@ def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_t
     assert result.verdict.status == "ok"
     assert result.validate(left_out)["position_rms_m"] < 1.4 * np.sqrt(3) * 5e-5
     assert result.validate(images)["residual_rms"] < 1.2 * np.sqrt(2) * 1e3 * image_noise
+
+
+def test_poses_in_the_rig_that_are_far_from_the_true_ones_are_named():
+    """The rig states the cameras in the measuring frame; without positions its place is not known."""
+    rng = np.random.default_rng(9)
+    arm = read_robot("example:ur10", tip="tool0")
+    images = images_that_keep_the_orientation_of_the_tool(placed(small_errors(arm, rng)), Noise(1e-4), rng)
+    assert images.rig is not None
+    boards = tuple(replace(board, pose=np.eye(4)) for board in images.rig.boards)
+    cameras = tuple(replace(camera, intrinsics="free") for camera in images.rig.cameras)
+    images = images.with_rig(replace(images.rig, cameras=cameras))
+    stated = images.with_rig(replace(images.rig, cameras=cameras, boards=boards))
+    with pytest.raises(ConvergenceError, match=r"check the poses .* or omit those of the cameras"):
+        calibrate(arm, stated, extend="none", session="off")
+    assert calibrate(arm, images, extend="none", session="off").converged
 
 
 def test_whole_images_are_drawn_for_the_start(sim_6dof):

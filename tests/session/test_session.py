@@ -287,6 +287,16 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
+def test_a_coordinate_in_another_unit_is_no_scale():
+    """No scale is stated that `--mend` would not undo; the unit is named as a mistake."""
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position)
+    data = data.replace(values=data.positions() * [1, 1, 1e-3])
+    fit = calibrate(simulation.chain, data, extend="none")
+    assert not session_of(fit).scales
+    assert any("--mend z:m-not-mm" in reason for reason in fit.verdict.reasons)
+
+
 def test_files_are_segments_even_without_an_order():
     simulation = Simulation("ur10", 100, 7)
     changes = Changes("tool", 5e-3)
