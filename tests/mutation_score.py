@@ -81,8 +81,11 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
         yield new
 
 
-def _is_annotation_or_text(parent: ast.AST, field: str) -> bool:
-    return field in ("annotation", "returns", "decorator_list") or isinstance(parent, ast.JoinedStr)
+def _is_ignored(parent: ast.AST, field: str) -> bool:
+    """Return whether a field holds an annotation, a decorator, a part of a text, or what `zip` checks."""
+    is_check = isinstance(parent, ast.keyword) and parent.arg == "strict"
+    is_text = isinstance(parent, ast.JoinedStr)
+    return field in ("annotation", "returns", "decorator_list") or is_check or is_text
 
 
 def mutants(source: str) -> list[tuple[int, int]]:
@@ -92,14 +95,14 @@ def mutants(source: str) -> list[tuple[int, int]]:
 
 def _places(tree: ast.AST) -> Iterator[tuple[int, ast.AST, str, int | None, ast.AST]]:
     """Yield line, parent, field, index in the field and new node of each mutant, in a fixed order."""
-    for parent in ast.walk(tree):
-        for field, value in ast.iter_fields(parent):
-            if _is_annotation_or_text(parent, field):
-                continue
-            for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
-                if isinstance(node, ast.AST):
-                    for new in _changes(node):
-                        yield getattr(node, "lineno", 0), parent, field, index, new
+    for field, value in ast.iter_fields(tree):
+        if _is_ignored(tree, field):
+            continue
+        for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+            if isinstance(node, ast.AST):
+                for new in _changes(node):
+                    yield getattr(node, "lineno", 0), tree, field, index, new
+                yield from _places(node)
 
 
 def mutate(source: str, number: int) -> tuple[str, str]:
@@ -152,7 +155,7 @@ class ExecutedLines:
         chosen, total = [], 0.0
         for name in sorted(names, key=lambda name: (self.seconds.get(name, 0.0), name)):
             total += self.seconds.get(name, 0.0)
-            if total > MAX_DURATION:
+            if chosen and total > MAX_DURATION:
                 break
             chosen.append(name)
         return chosen

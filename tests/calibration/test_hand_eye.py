@@ -10,6 +10,8 @@ from hand_eye_setups import SIGMA, faulty_setup
 from slow_cases import some_slow
 
 import dhcal_pin as dh
+from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
@@ -239,3 +241,16 @@ def test_a_shift_of_flange_poses_is_named():
     assert fit.hand_eye is not None
     assert "belongs to the flange poses one row" in fit.hand_eye.likely
     assert "Correct the table of flange poses." in fit.hand_eye.likely
+
+
+def test_shifted_joint_values_lie_between_those_of_two_images():
+    chain, images, _ = faulty_setup("ur10", "focal", 27, is_on_wrist=True, n_images=9)
+    sequence = file_sequence([images])
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, sequence)
+    number = np.argmax((images.q[:, None] == sequence).all(-1), 1)
+    for shift in (-1.25, -1.0, 0.4, 2.0):
+        found = apply_causes(hand_eye, Causes(shift=shift), images)
+        place = number + shift
+        inside = (place >= 0) & (place <= 8)
+        expected = [np.interp(place[inside], np.arange(9), column) for column in sequence.T]
+        np.testing.assert_allclose(found.q, np.transpose(expected), atol=1e-12)

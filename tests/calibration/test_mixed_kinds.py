@@ -12,7 +12,7 @@ from slow_cases import some_slow
 from dhcal_pin import read_robot
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.cameras import procedure
-from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood
+from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood, _maximize_likelihood
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import subsample
 from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
@@ -164,6 +164,16 @@ def test_images_without_weight_are_refused(sim_6dof, monkeypatch):
     monkeypatch.setattr(procedure, "reweight", lambda fit, *_: replace(fit, weights=rejected))
     with pytest.raises(InvalidArgumentError, match=r"images: no image agrees .* base and tool"):
         calibrate(sim_6dof, [positions, images], session="off")
+
+
+def test_displacements_are_as_large_as_those_of_which_the_fit_absorbed_a_half():
+    rng, m = np.random.default_rng(11), 2000
+    derivatives = 3e4 * rng.normal(size=(m, 12, 6))
+    displacements = rng.normal(size=(m, 6)) * ([7e-4] * 3 + [3e-4] * 3) * (rng.random((m, 6)) < 0.5)
+    residuals = np.einsum("mij,mj->mi", derivatives, displacements) + rng.normal(size=(m, 12))
+    images = list(zip(residuals, derivatives, strict=True))
+    found = _maximize_likelihood(images, 1.0, n_determined=3 * m)
+    np.testing.assert_allclose([found.position, found.rotation], [7e-4, 3e-4], rtol=0.04)
 
 
 def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():
