@@ -17,6 +17,7 @@ import shutil
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -171,6 +172,8 @@ class Interruption:
             except KeyboardInterrupt:
                 # After the end of the command; one that does not handle an interrupt leaves status 99.
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
+            except Exception:
+                traceback.print_exc()
             finally:
                 sys.stderr.flush()
                 os._exit(status)
@@ -251,6 +254,8 @@ class Interruption:
         found = self.read()
         left = "old" if found == self.old else "new" if found == self.new else "mixed"
         details = (status, left, said, [path.name for path in self.files()])
+        # No file is partial, however the run ended.
+        assert all(content in (self.old[name], self.new[name]) for name, content in found.items()), details
         if number == signal.SIGINT:
             # The files of an interrupted run are complete, and the message names them.
             assert left != "mixed", details

@@ -10,7 +10,9 @@ from hand_eye_setups import SIGMA, faulty_setup
 from slow_cases import some_slow
 
 import dhcal_pin as dh
+from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence
+from dhcal_pin.calibration.cameras.diagnosis import _without_rigid_motion
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
@@ -254,3 +256,10 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
         inside = (place >= 0) & (place <= 8)
         expected = [np.interp(place[inside], np.arange(9), column) for column in sequence.T]
         np.testing.assert_allclose(found.q, np.transpose(expected), atol=1e-12)
+
+
+def test_a_rigid_motion_does_not_bend_a_board():
+    rng = np.random.default_rng(0)
+    stated = rng.uniform(-0.1, 0.1, (12, 3)) + np.array([0.3, 0.1, 0.2])
+    moved = stated @ se3.exp3(np.array([0.2, -0.1, 0.4])).T + [0.5, -0.2, 0.1]
+    np.testing.assert_allclose(_without_rigid_motion(moved, stated), 0.0, atol=1e-12)

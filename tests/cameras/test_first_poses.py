@@ -11,6 +11,7 @@ from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
 from dhcal_pin.cameras.intrinsics import intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
 from dhcal_pin.exceptions import NotObservableError
+from dhcal_pin.measurements.images.camera_start import _well_fitting
 
 CAMERA = Camera("c", "world", 1280, 720, np.array([np.nan] * 4 + [0.0] * 5))
 CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
@@ -210,3 +211,18 @@ def test_intrinsics_need_three_views():
     _, seen = views(np.random.default_rng(1), 2)
     with pytest.raises(NotObservableError, match=r"2 images of a board .* expected at least 3"):
         intrinsics_candidates(seen, CAMERA)
+
+
+def test_wrong_corners_of_a_target_that_is_not_flat_are_left_out():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-0.05, 0.05, (20, 3))
+    local = points @ se3.exp3(np.array([0.4, -0.3, 0.2])).T + [0.02, 0.01, 0.5]
+    image = local[:, :2] / local[:, 2:]
+    image[[3, 11]] += [[0.06, -0.05], [-0.07, 0.06]]
+    np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), [3, 11])
+
+
+def test_views_that_fit_badly_are_not_used():
+    rms = np.array([0.01] * 6 + [0.04, 0.06])
+    np.testing.assert_array_equal(_well_fitting(rms, np.arange(1, 8)), range(1, 7))
+    np.testing.assert_array_equal(_well_fitting(1e-3 * rms, np.arange(1, 8)), range(1, 8))
