@@ -243,6 +243,8 @@ def test_a_shift_of_flange_poses_is_named():
     assert fit.hand_eye is not None
     assert "belongs to the flange poses one row" in fit.hand_eye.likely
     assert "Correct the table of flange poses." in fit.hand_eye.likely
+    with pytest.raises(dh.DhcalError, match="'minimal': need joint values"):
+        dh.calibrate(chain, images.replace(has_joint_values=False), "minimal,camera,board")
 
 
 def test_shifted_joint_values_lie_between_those_of_two_images():

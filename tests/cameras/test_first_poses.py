@@ -8,7 +8,7 @@ import pytest
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import intrinsics_candidates
+from dhcal_pin.cameras.intrinsics import _without_centre, intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
 from dhcal_pin.exceptions import NotObservableError
 from dhcal_pin.measurements.images.camera_start import _well_fitting
@@ -226,3 +226,10 @@ def test_views_that_fit_badly_are_not_used():
     rms = np.array([0.01] * 6 + [0.04, 0.06])
     np.testing.assert_array_equal(_well_fitting(rms, np.arange(1, 8)), range(1, 7))
     np.testing.assert_array_equal(_well_fitting(1e-3 * rms, np.arange(1, 8)), range(1, 8))
+
+
+def test_focal_length_with_the_centre_in_the_middle():
+    rng = np.random.default_rng(6)
+    turns = se3.exp3(rng.uniform(-0.6, 0.6, (4, 3)))
+    views = [np.diag([1.3, 1.3, 1]) @ np.column_stack([r[:, 0], r[:, 1], [0.1, 0.2, 2.0]]) for r in turns]
+    np.testing.assert_allclose(_without_centre(views), [1.3, 1.3, 0, 0], atol=1e-9)
