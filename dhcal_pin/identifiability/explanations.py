@@ -310,7 +310,7 @@ class Explainer:
                 suggestion = f"measure a point beside that axis, or {suggestion}"
             return reason, suggestion
         if self._is_scaling(group):
-            return SCALE_UNKNOWN, self._suggest_measurement(group)
+            return SCALE_UNKNOWN, _size_advice(self.probe.problem)
         return "the measurements do not change", self._suggest_measurement(group)
 
     def _explain_angles(self, group: UnobservableGroup) -> str:
@@ -472,13 +472,16 @@ def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
     if probe.is_scale_unobservable(r) and not any(SCALE_UNKNOWN in text for text in sentences):
-        advice = (
-            "add a known distance between contact points"
-            if any(item.is_contact for item in problem.data)
-            else "measure the position of the tool in a fixed frame"
-        )
-        sentences.insert(0, f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {advice}")
+        text = f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {_size_advice(problem)}"
+        sentences.insert(0, text)
     return sentences
+
+
+def _size_advice(problem: Problem) -> str:
+    """Return the measurement that determines the size of a robot."""
+    if any(item.is_contact for item in problem.data):
+        return "add a known distance between contact points"
+    return "measure the position of the tool in a fixed frame"
 
 
 def label_unobservable(sentence: str) -> str:

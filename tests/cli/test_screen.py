@@ -46,6 +46,8 @@ def test_calibrations_of_all_kinds(run, robot_folder, kind):
     lines = err.splitlines()
     assert any(line.startswith("verdict: ") for line in lines)
     assert f"k.csv: {len(Path('k.csv').read_text().splitlines()) - 2} rows, {kind}" in unfolded(err)
+    if kind in ("position", "pose", "point"):
+        assert ("do not determine the size of the robot" in unfolded(err)) == (kind == "point")
 
 
 @pytest.mark.parametrize("arm", some_slow([path.name for path in sorted(URDF.glob("*.urdf"))[:6]], {0, 3}))
