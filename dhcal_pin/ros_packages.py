@@ -94,17 +94,22 @@ def validated_package_dirs(folders: Iterable[PathLike]) -> tuple[str, ...]:
     return paths
 
 
-def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
-    """Return whether a mesh is larger than `MAX_MESH_BYTES`.
-
-    Pinocchio takes about 25 times the size of a mesh in memory.
-    """
+def mesh_files(mesh: str, folders: Iterable[PathLike]) -> list[str]:
+    """List the files that a mesh of a URDF may be."""
     path = mesh.rpartition("://")[2]
     variables = "ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"
     more = [folder for name in variables for folder in os.environ.get(name, "").split(os.pathsep) if folder]
     places = [*folders, *more, *(os.path.join(folder, "share") for folder in more)]
     found = (file for file in (path, *(os.path.join(folder, path) for folder in places)))
-    return any(os.path.isfile(file) and os.path.getsize(file) > MAX_MESH_BYTES for file in found)
+    return list(filter(os.path.isfile, found))
+
+
+def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
+    """Return whether a mesh is larger than `MAX_MESH_BYTES`.
+
+    Pinocchio takes about 25 times the size of a mesh in memory.
+    """
+    return any(os.path.getsize(file) > MAX_MESH_BYTES for file in mesh_files(mesh, folders))
 
 
 def mesh_remedy(mesh: str) -> str:

@@ -44,9 +44,11 @@ def tasks(folder: Path) -> dict[str, Callable[[], object]]:
         "forward kinematics of 1,000 poses": lambda: chain.poses(poses.q),
         "read 1,000 poses": lambda: read_measurements(file, chain),
         "calibrate 1,000 poses, geometry, linear": lambda: calibrate(
-            chain, poses, sets, extend="none", loss="linear"
+            chain, poses, sets, extend="none", loss="linear", session="off"
         ),
-        "calibrate 1,000 poses, geometry": lambda: calibrate(chain, poses, sets, extend="none"),
+        "calibrate 1,000 poses, geometry": lambda: calibrate(
+            chain, poses, sets, extend="none", session="off"
+        ),
         "calibrate 1,000 poses": lambda: calibrate(chain, poses, sets),
         "plan 20 poses of 500 candidates": lambda: plan(chain, 20, noise=Noise(1e-4, 1e-4), candidates=500),
     }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import sys
 from collections.abc import Iterator
 
 # The workers of pytest share the processors, and NumPy reads this when it is loaded.
@@ -17,11 +19,13 @@ from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
 from robots import missing, paper
 
 from dhcal_pin import plots
-from dhcal_pin.calibration import evidence, verdict
+from dhcal_pin.calibration import evidence, procedure, verdict
 from dhcal_pin.plausibility.mixups import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 
+# Otherwise every process compiles all tests anew.
+sys.dont_write_bytecode = False
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]
 
@@ -31,6 +35,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.path.suffix == ".ipynb" and item.path.stem != "01_paper":
             item.add_marker(pytest.mark.slow)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the thousands of collected tests, which stay to the end."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
@@ -67,9 +76,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def unsuspected() -> Iterator[None]:
-    """Leave out the search for mistakes in measurements, which takes seconds if an arm has large errors."""
+    """Leave out the search for mistakes and events of a measurement, which takes seconds for some arms."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
+        patch.setattr(procedure, "can_have_session", lambda _: False)
         yield
 
 

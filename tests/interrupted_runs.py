@@ -17,6 +17,7 @@ import shutil
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,9 +46,22 @@ seeds = {seeds}
 robot = "arm.dh.toml"
 poses = [6, 12]
 """
+RIG = """
+[camera.c]
+link = "world"
+width = 640
+height = 480
+[board.b]
+link = "tip"
+type = "checkerboard"
+columns = 7
+rows = 5
+square_mm = {square}
+"""
 # Few samples and no choice of error families: the files are what matters here.
 QUICK = ("--extend", "none", "--loss", "linear")
 CALIBRATE = ("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", *QUICK)
+PROGRAM = ("--export", "x.trajectory.csv", "--json", "sub/x.json")
 # Words of each command, and the names of its outputs.
 COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "calibrate": (CALIBRATE, ("out.urdf", "out.calibration.toml")),
@@ -64,6 +78,32 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("calibrate", "a.fleet.toml", "-o", "f.csv", "--jobs", "1", "--json", "sub/f.json"),
         ("out.urdf", "out.calibration.toml", "r.md", "r.json"),
     ),
+    "bundle": ((*CALIBRATE, "--bundle", "b.dhcal.zip"), ("out.urdf", "out.calibration.toml", "b.dhcal.zip")),
+    "validate": (
+        ("validate", "arm.urdf", "data.csv", "--json", "sub/v.json", "--report", "v.html"),
+        ("v.html", "sub/v.json"),
+    ),
+    "convert": (("convert", "arm.dh.toml", "c.urdf", "--json", "sub/c.json"), ("sub/c.json", "c.urdf")),
+    "simulate": (
+        ("simulate", "arm.dh.toml", "-n", "5", "--kind", "camera", "-o", "c.csv", "--json", "sub/c.json"),
+        ("c.csv", "c.rig.toml", "sub/c.json"),
+    ),
+    "plan": (
+        ("plan", "arm.dh.toml", "-n", "15", "--candidates", "60", "-o", "p.csv", *PROGRAM),
+        ("p.csv", "x.trajectory.csv", "sub/x.json"),
+    ),
+    "compensate": (
+        ("compensate", "arm.urdf", "arm.dh.toml", "t.csv", "-o", "c.csv", *PROGRAM),
+        ("c.csv", "x.trajectory.csv", "sub/x.json"),
+    ),
+    "export": (("export", "arm.dh.toml", "-o", "m.h", "--json", "sub/m.json"), ("m.h", "sub/m.json")),
+    "view": (("view", "arm.dh.toml", "--html", "v.html", "--json", "sub/v.json"), ("v.html", "sub/v.json")),
+    "inspect": (("inspect", "data.csv", "--json", "i.json"), ("i.json",)),
+    "diff": (
+        ("diff", "arm.urdf", "arm.dh.toml", "--json", "sub/d.json", "--report", "d.html"),
+        ("d.html", "sub/d.json"),
+    ),
+    "board": (("board", "rig.toml", "-o", "b.pdf", "--json", "sub/b.json"), ("b.pdf", "sub/b.json")),
 }
 # Files that a command may leave for the next run, which continues with them.
 JOURNALS = {"study": "s.csv.part"}
@@ -98,13 +138,15 @@ class Interruption:
         assert self.old != self.new
 
     def _make_inputs(self, old: bool) -> None:
-        for name in ("arm.urdf", "arm.dh.toml"):
-            if name not in self.names or old:
-                shutil.copy(URDF / name.replace("arm", "experiment"), name)
+        if "arm.urdf" not in self.names or old:
+            shutil.copy(URDF / "experiment.urdf", "arm.urdf")
+        shutil.copy(URDF / f"experiment{'' if old else '_published'}.dh.toml", "arm.dh.toml")
         (self.root / "sub").mkdir(exist_ok=True)
         Path("data.csv").write_text(positions_csv(12, seed=0 if old else 5))
         Path("s.study.toml").write_text(STUDY.format(seeds=2 if old else 3))
         Path("a.fleet.toml").write_text(FLEET)
+        Path("t.csv").write_text("x[mm],y[mm],z[mm]\n400,100,300\n300,-200,400\n")
+        Path("rig.toml").write_text(RIG.format(square=20 if old else 25))
 
     def _run_alone(self) -> None:
         status = self._in_child(lambda: dhcal(self.words))
@@ -130,6 +172,8 @@ class Interruption:
             except KeyboardInterrupt:
                 # After the end of the command; one that does not handle an interrupt leaves status 99.
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
+            except Exception:
+                traceback.print_exc()
             finally:
                 sys.stderr.flush()
                 os._exit(status)
@@ -210,6 +254,8 @@ class Interruption:
         found = self.read()
         left = "old" if found == self.old else "new" if found == self.new else "mixed"
         details = (status, left, said, [path.name for path in self.files()])
+        # No file is partial, however the run ended.
+        assert all(content in (self.old[name], self.new[name]) for name, content in found.items()), details
         if number == signal.SIGINT:
             # The files of an interrupted run are complete, and the message names them.
             assert left != "mixed", details

@@ -5,11 +5,13 @@ it until the first one fails, the fast ones first. A mutant that survives is pri
 test is missing, or the change has no effect that matters.
 
     python tests/mutation_score.py --mutants 400 --minutes 60 --seed 0 --results score.jsonl
+    python tests/mutation_score.py --modules session io/bundle.py --tests session cli/test_bundle.py ...
 
 The run is long and not part of continuous integration. It starts with one run of the tests that records which
 lines each of them executes (`score.lines` and `score.times`). Each outcome is appended to the file of
 results; a run with the same file and seed goes on where the last one has ended. Mutants are drawn at random
-from the modules of `PACKAGES`, weighted by their numbers of expressions.
+from the modules, weighted by their numbers of expressions. Coverage makes the tests several times slower when
+their lines are recorded: name the tests that concern the modules.
 """
 
 from __future__ import annotations
@@ -27,19 +29,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from importlib.util import cache_from_source
 from pathlib import Path
 
 from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[1]
-# Packages whose modules are changed.
+# Packages whose modules are changed, unless others are named.
 PACKAGES = ("estimation", "identifiability", "calibration", "measurements", "robot", "io", "_kernels")
-# Tests that execute much of the package within this process, apart from the files of `tests` itself.
-FOLDERS = (*PACKAGES, "cameras", "diagnostics", "paper", "planning", "plausibility")
-# Largest sum of the durations of the tests that run on a mutant [s].
+# Tests that execute much of the package within this process, unless others are named.
+TESTS = (
+    *PACKAGES, "cameras", "diagnostics", "paper", "planning", "plausibility", "session",
+    *(path.name for path in ROOT.glob("tests/test_*.py")),
+)  # fmt: skip
+# Largest sum of the recorded durations of the tests that run on a mutant [s].
 MAX_DURATION = 120
 # Seconds after which a run of tests ends, and its exit status then. Such a mutant does not count.
-TIMEOUT, OUT_OF_TIME = 600, 124
+TIMEOUT, OUT_OF_TIME = 2 * MAX_DURATION, 124
 # Outcome by the exit status of the tests; with any other status the mutant is killed.
 OUTCOMES = {0: "survived", OUT_OF_TIME: "out of time"}
 COMPARISONS = {
@@ -75,8 +81,11 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
         yield new
 
 
-def _is_annotation_or_text(parent: ast.AST, field: str) -> bool:
-    return field in ("annotation", "returns", "decorator_list") or isinstance(parent, ast.JoinedStr)
+def _is_ignored(parent: ast.AST, field: str) -> bool:
+    """Return whether a field holds an annotation, a decorator, a part of a text, or what `zip` checks."""
+    is_check = isinstance(parent, ast.keyword) and parent.arg == "strict"
+    is_text = isinstance(parent, ast.JoinedStr)
+    return field in ("annotation", "returns", "decorator_list") or is_check or is_text
 
 
 def mutants(source: str) -> list[tuple[int, int]]:
@@ -86,14 +95,14 @@ def mutants(source: str) -> list[tuple[int, int]]:
 
 def _places(tree: ast.AST) -> Iterator[tuple[int, ast.AST, str, int | None, ast.AST]]:
     """Yield line, parent, field, index in the field and new node of each mutant, in a fixed order."""
-    for parent in ast.walk(tree):
-        for field, value in ast.iter_fields(parent):
-            if _is_annotation_or_text(parent, field):
-                continue
-            for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
-                if isinstance(node, ast.AST):
-                    for new in _changes(node):
-                        yield getattr(node, "lineno", 0), parent, field, index, new
+    for field, value in ast.iter_fields(tree):
+        if _is_ignored(tree, field):
+            continue
+        for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+            if isinstance(node, ast.AST):
+                for new in _changes(node):
+                    yield getattr(node, "lineno", 0), tree, field, index, new
+                yield from _places(node)
 
 
 def mutate(source: str, number: int) -> tuple[str, str]:
@@ -118,16 +127,19 @@ class ExecutedLines:
     Attributes:
         lines: Data of the package coverage, with one context per test.
         seconds: Duration of each test [s].
+        failing: Tests that fail without a mutant.
     """
 
-    def __init__(self, results: Path):
+    def __init__(self, results: Path, tests: list[str]):
         lines, times = results.with_suffix(".lines"), results.with_suffix(".times")
         if not times.exists():
-            _record(lines, times)
+            _record(lines, times, tests)
         self.lines = CoverageData(str(lines))
         self.lines.read()
-        found = re.findall(r"^([\d.]+)s call +(tests/.*?) *$", times.read_text(), re.MULTILINE)
+        text = times.read_text()
+        found = re.findall(r"^([\d.]+)s call +(tests/.*?) *$", text, re.MULTILINE)
         self.seconds = {test: float(duration) for duration, test in found}
+        self.failing = set(re.findall(r"^(?:FAILED|ERROR) (tests/.*?)(?: - .*)?$", text, re.MULTILINE))
 
     def tests_of(self, module: Path, line: int) -> list[str]:
         """Return the tests that execute a line, the fast ones first, up to `MAX_DURATION`.
@@ -139,25 +151,23 @@ class ExecutedLines:
         tests = set().union(*executed) - {""}
         if any("" in each for each in executed) or not tests:
             tests = set().union(*tests_by_line.values()) - {""}
-        names = {test.rsplit("|", 1)[0] for test in tests}
+        names = {test.rsplit("|", 1)[0] for test in tests} - self.failing
         chosen, total = [], 0.0
         for name in sorted(names, key=lambda name: (self.seconds.get(name, 0.0), name)):
             total += self.seconds.get(name, 0.0)
-            if total > MAX_DURATION:
+            if chosen and total > MAX_DURATION:
                 break
             chosen.append(name)
         return chosen
 
 
-def _record(lines: Path, times: Path) -> None:
+def _record(lines: Path, times: Path, tests: list[str]) -> None:
     """Run the tests once, and write the lines that each of them executes and their durations."""
-    tests = [f"tests/{name}" for name in FOLDERS] + [
-        str(path.relative_to(ROOT)) for path in ROOT.glob("tests/test_*.py")
-    ]
     options = ["-q", "-vv", "-m", "not slow", "--durations=0", "-p", "no:cacheprovider"]
-    options += ["--cov=dhcal_pin", "--cov-context=test", "--cov-report="]
+    # With another value of --dist, pytest-cov stores no names of tests.
+    options += ["--dist=no", "--cov=dhcal_pin", "--cov-context=test", "--cov-report="]
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", *options, *tests],
+        [sys.executable, "-m", "pytest", *options, *(f"tests/{name}" for name in tests)],
         cwd=ROOT,
         env=os.environ | {"COVERAGE_FILE": str(lines.resolve())},
         capture_output=True,
@@ -188,20 +198,22 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=400)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--modules", nargs="+", default=PACKAGES, help="modules and packages of dhcal_pin")
+    parser.add_argument("--tests", nargs="+", default=TESTS, help="files and folders of tests")
     parser.add_argument("--results", type=Path, required=True)
     options = parser.parse_args()
     known = [json.loads(line) for line in _lines(options.results)]
     decided = {each["mutant"]: each["outcome"] for each in known}
-    modules = [path for name in PACKAGES for path in (ROOT / "dhcal_pin" / name).rglob("*.py")]
+    modules = [path for name in options.modules for path in _modules(ROOT / "dhcal_pin" / name)]
     population = [(path, *each) for path in modules for each in mutants(path.read_text())]
     chosen = random.Random(options.seed).sample(population, min(options.mutants, len(population)))
-    executed = ExecutedLines(options.results)
+    executed = ExecutedLines(options.results, options.tests)
     end = time.monotonic() + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("dhcal_pin", "tests", "urdf", "pyproject.toml"):
+        for name in ("dhcal_pin", "tests", "urdf", "docs", "pyproject.toml"):
             copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
             copied(ROOT / name, Path(folder) / name)
-        environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
+        environment = os.environ | {"PYTHONPATH": folder}
         pytest = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider"]
         chosen_tests = Path(folder) / "chosen_tests"
         for path, line, number in chosen:
@@ -214,22 +226,33 @@ def main() -> None:
                 continue
             copied = Path(folder) / path.relative_to(ROOT)
             copied.write_text(changed)
-            chosen_tests.write_text("\n".join(executed.tests_of(path, line)))
+            compiled = Path(cache_from_source(str(copied)))
+            compiled.unlink(missing_ok=True)
+            tests = executed.tests_of(path, line)
+            # Without a name, pytest would run the whole suite.
+            chosen_tests.write_text("\n".join(tests or ["--collect-only"]))
             words = ["timeout", str(TIMEOUT), *pytest, f"@{chosen_tests}"]
-            status = subprocess.run(
-                words, cwd=folder, env=environment, capture_output=True, check=False
-            ).returncode
+            done = subprocess.run(
+                words, cwd=folder, env=environment, capture_output=True, text=True, check=False
+            )
             copied.write_text(source)
-            outcome = OUTCOMES.get(status, "killed")
+            compiled.unlink(missing_ok=True)
+            outcome = OUTCOMES.get(done.returncode, "killed")
             decided[mutant] = outcome
+            by = re.findall(r"^(?:FAILED|ERROR).*", done.stdout + done.stderr, re.MULTILINE)[:1]
             with options.results.open("a") as file:
-                file.write(json.dumps({"mutant": mutant, "outcome": outcome}) + "\n")
+                file.write(json.dumps({"mutant": mutant, "outcome": outcome, "by": by}) + "\n")
     outcomes = list(decided.values())
     for mutant, outcome in decided.items():
         if outcome != "killed":
             print(f"{outcome}: {mutant}")
     total = len(outcomes) - outcomes.count(OUTCOMES[OUT_OF_TIME])
     print(f"{outcomes.count('killed')} of {total} mutants killed, {len(population)} possible")
+
+
+def _modules(path: Path) -> list[Path]:
+    """Return the modules of a package, or a module itself."""
+    return sorted(path.rglob("*.py")) if path.is_dir() else [path]
 
 
 def _lines(path: Path) -> list[str]:

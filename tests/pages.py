@@ -17,11 +17,14 @@ CHROMIUM = shutil.which("chromium")
 # The checker of accessibility, as the package ships it.
 AXE = resources.files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
 # Software rendering, which works without a graphics card and in a container. Smooth edges, and pages that are
-# drawn like scenes, would take most of the time.
+# drawn and put together like scenes, would take most of the time.
 ARGUMENTS = (
     "--no-sandbox --disable-dev-shm-usage --use-gl=angle --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --hide-scrollbars --webgl-antialiasing-mode=none --disable-gpu-rasterization"
+    "--enable-unsafe-swiftshader --hide-scrollbars --webgl-antialiasing-mode=none "
+    "--disable-gpu-rasterization --disable-gpu-compositing"
 ).split()
+# What the driver, not the page, says when it copies a picture of a scene into the page.
+COPIED = "GPU stall due to ReadPixels"
 VIEWPORT = {"width": 700, "height": 400}
 SLIDE = "it.value = it.max; it.dispatchEvent(new Event('input'))"
 CLICK = "it.click()"
@@ -120,12 +123,17 @@ class Browser:
         return page
 
 
+def listen(source: Any, complaints: list[str]) -> None:
+    """Collect what a page, or the pages of a context, write to the console."""
+    source.on("console", lambda message: COPIED in message.text or complaints.append(message.text))
+
+
 @contextmanager
 def window_of(browser: Browser) -> Iterator[Window]:
     """A page that must stay silent and ask no host for anything."""
     page = browser.new_page(viewport=VIEWPORT)
     out = Window(page, [], [])
-    page.on("console", lambda message: out.complaints.append(message.text))
+    listen(page, out.complaints)
     page.on("pageerror", lambda error: out.complaints.append(str(error)))
     page.on("request", lambda request: out.requests.append(request.url))
     yield out

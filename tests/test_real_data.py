@@ -221,17 +221,16 @@ def hold_out_errors(dhcal, folder, arm, places, left, *more):
     return [[1e3 * one[key] for key in ("position_rms_m", "residual_rms")] for one in found]
 
 
-@pytest.mark.parametrize(
-    ("step", "most", "farthest"), some_slow([(1, 0.34, 0.2), (2, 0.34, 0.2), (4, 0.4, 0.25)], {2})
-)
-def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path, step, most, farthest):
+@pytest.mark.slow
+def test_contacts_of_a_panda_with_sockets_at_eight_places(dhcal, tmp_path):
+    """The tutorial without an instrument is the smaller twin."""
     fitted, nominal = np.array(
-        [hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2[::step]]
+        [hold_out_errors(dhcal, tmp_path, "panda_2_clean", PANDA_2, left) for left in PANDA_2]
     ).swapaxes(0, 1)
     assert 7 < np.sqrt(np.mean(nominal[:, 0] ** 2)) < 11
     consistency, distance = fitted.mean(0)
-    assert consistency <= most
-    assert distance <= farthest
+    assert consistency <= 0.34
+    assert distance <= 0.2
 
 
 @pytest.mark.slow

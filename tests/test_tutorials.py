@@ -145,6 +145,8 @@ def check_03_09(n: Any) -> None:
 def check_03_11(n: Any) -> None:
     assert n.consistency[:, 1].mean() < 0.34
     assert n.distance[:, 1].mean() < 0.2
+    nominal = np.concatenate([np.concatenate(one[0][0]) for one in n.judged.values()])
+    assert 7 < np.sqrt(np.mean(np.sum(nominal**2, 1))) < 11
     assert np.all(n.consistency[:, 1] < 0.2 * n.consistency[:, 0])
 
 
@@ -253,6 +255,9 @@ SMALLER = {
         'tool", holdout=held)\nprint': 'tool", holdout=held, session="off")\nprint',
         'tool", holdout=held)\nfit': 'tool", holdout=held, session="off")\nfit',
         'holdout=held, extend="none")': 'holdout=held, extend="none", session="off")',
+    },
+    "03_without_an_instrument": {
+        "pair in touches.items():\n    chain": "pair in list(touches.items())[::2]:\n    chain"
     },
     "04_plan_and_trust": {
         **{"in range(40)": "in range(12)", "uniform(-1, 1, 40)": "uniform(-1, 1, 12)"},

@@ -15,6 +15,7 @@ from ..estimation.initialization import fit_frames
 from ..estimation.problem import Problem, UnfactoredSystem, uses_normal_equations
 from ..estimation.solver import remaining_change
 from ..identifiability import explanations
+from ..identifiability.null_space import ObservabilityProbe
 from ..io.origins_file import without_negligible_moves
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
@@ -44,14 +45,18 @@ class Result(Evidence, ResultPlots):
     @cached_property
     def unobservable(self) -> list[str]:
         """One sentence per group of parameters that the data cannot distinguish, with the reason."""
-        return explanations.explain_unobservable(self.problem, self.x, self.solution.system)
+        return explanations.explain_unobservable(self._probe, self.solution.system)
 
     @cached_property
     def weakly_observable(self) -> list[str]:
         """One sentence per group of parameters that are hardly better known than before the measurement."""
         return explanations.explain_weakly_observable(
-            self.problem, self.x, self.solution.system, self.prior_std, self._sigma_scale
+            self._probe, self.solution.system, self.prior_std, self._sigma_scale
         )
+
+    @cached_property
+    def _probe(self) -> ObservabilityProbe:
+        return ObservabilityProbe(self.problem, self.x)
 
     @property
     def verdict(self) -> Verdict:

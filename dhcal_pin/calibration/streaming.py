@@ -26,6 +26,7 @@ from ..estimation.solver import IterationCallback, SolverResult, minimize
 from ..estimation.uncertainty import UNBOUNDED_TOL
 from ..exceptions import InvalidArgumentError
 from ..identifiability import explanations
+from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files import Part
 from ..measurements.arguments import require_chain
 from ..measurements.base import Measurement
@@ -102,7 +103,9 @@ class StreamResult:
     @property
     def unobservable(self) -> list[str]:
         """One sentence per group of parameters that the data cannot distinguish, with the reason."""
-        return explanations.explain_unobservable(self.problem, self.x, self.solution.system)
+        return explanations.explain_unobservable(
+            ObservabilityProbe(self.problem, self.x), self.solution.system
+        )
 
     @cached_property
     def std(self) -> Array:

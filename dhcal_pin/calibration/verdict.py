@@ -171,8 +171,9 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
     if (len(names) > 2 and 2 * len(unmoved) > len(names)) or sum(moved) < 2:
         text += ", so the measurements do not show the errors of the robot."
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
-    text += ": the calibration holds only where they stand."
-    return [Finding("caution", f"{text} Move them, too.")]
+    text += ": the calibration holds only where "
+    text += "they stand. Move them, too." if len(unmoved) > 1 else "it stands. Move it, too."
+    return [Finding("caution", text)]
 
 
 def _few_images(fit: Evidence) -> list[Finding]:

@@ -109,7 +109,8 @@ def _require_two_axes(rotations: Array, where: str) -> None:
         raise NotObservableError(
             f"{where}: the images differ by rotations about one axis only (second axis "
             f"{np.rad2deg(spread[1]):.2g} deg); expected at least two rotations about non-parallel axes: "
-            "turn the wrist about different axes between the images"
+            "turn the wrist about different axes between the images, or state the pose of the camera or of "
+            "the board in the rig file (xyz_m, rotvec_rad)"
         )
 
 

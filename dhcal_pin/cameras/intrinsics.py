@@ -187,7 +187,7 @@ def _without_centre(homographies: Sequence[Array]) -> tuple[float, float, float,
     """Solve for one focal length with the centre in the middle of the image; None if it is not positive."""
     rows = _rows(homographies)
     # ω = diag(1, 1, f²)/f².
-    square = -float(rows[:, 4] @ rows[:, 4]) / float(rows[:, 4] @ (rows[:, 0] + rows[:, 1]))
+    square = -float(rows[:, 4] @ (rows[:, 0] + rows[:, 1])) / float(rows[:, 4] @ rows[:, 4])
     if not (np.isfinite(square) and square > 0):
         return None
     focal = float(np.sqrt(square))

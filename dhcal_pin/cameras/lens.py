@@ -43,6 +43,8 @@ _NEAR_AXIS = 1e-8
 _N_INVERSIONS = 20
 # Largest step that ends it, in image coordinates X/Z, Y/Z.
 _INVERSION_TOLERANCE = 1e-14
+# Number of pixels that are normalized together.
+_BLOCK = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +91,12 @@ class Lens:
     def normalize(self, pixels: Array, values: Array) -> Array:
         """Compute undistorted image coordinates X/Z, Y/Z of pixels by Newton's method, shape (2, m).
 
-        They are those of the undistorted lens where the distortion has no inverse.
+        They are those of the undistorted lens where the distortion has no inverse. All pixels of an image are
+        computed in blocks that stay in the cache.
         """
+        if pixels.shape[1] > _BLOCK:
+            starts = range(0, pixels.shape[1], _BLOCK)
+            return np.concatenate([self.normalize(pixels[:, k : k + _BLOCK], values) for k in starts], 1)
         distorted = (pixels - values[2:4, None]) / values[:2, None]
         plane = distorted.copy()
         with np.errstate(all="ignore"):
@@ -114,25 +120,20 @@ def _distort_brown(plane: Array, coefficients: Array) -> tuple[Array, Array, Arr
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     # Derivative of the radial factor by r².
     slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)
-    distorted = np.stack(
-        [
-            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
-        ]
-    )
     mixed = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
-    by_plane = np.stack(
-        [
-            np.stack([radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a, mixed]),
-            np.stack([mixed, radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a]),
-        ]
-    )
-    by_coefficients = np.stack(
-        [
-            np.stack([a * r2, a * r2**2, 2 * a * b, r2 + 2 * a * a, a * r2**3]),
-            np.stack([b * r2, b * r2**2, r2 + 2 * b * b, 2 * a * b, b * r2**3]),
-        ]
-    )
+    distorted, by_plane, by_coefficients = (np.empty((*n, len(a))) for n in ((2,), (2, 2), (2, 5)))
+    distorted[0] = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+    distorted[1] = b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
+    by_plane[0, 0] = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
+    by_plane[0, 1] = by_plane[1, 0] = mixed
+    by_plane[1, 1] = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
+    r4, r6 = r2**2, r2**3
+    by_coefficients[:, 0] = plane * r2
+    by_coefficients[:, 1] = plane * r4
+    by_coefficients[0, 2] = by_coefficients[1, 3] = 2 * a * b
+    by_coefficients[0, 3] = r2 + 2 * a * a
+    by_coefficients[1, 2] = r2 + 2 * b * b
+    by_coefficients[:, 4] = plane * r6
     return distorted, by_plane, by_coefficients
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
+from types import FrameType
 from typing import Any, NamedTuple, NoReturn
 
 from ..exceptions import DhcalError
@@ -116,28 +119,53 @@ def _parser_options(command: Command) -> dict[str, Any]:
     return {"module": command.module, "description": f"{command.help[0].upper()}{command.help[1:]}."}
 
 
+class _NotedInterrupt:
+    """Context that notes SIGINT: libraries may turn `KeyboardInterrupt` into another exception.
+
+    NumPy raises `TypeError` if it is interrupted while it compares structured arrays.
+    """
+
+    is_received = False
+
+    def __enter__(self) -> None:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            with suppress(ValueError):  # only the main thread may install a handler
+                signal.signal(signal.SIGINT, self._receive)
+
+    def __exit__(self, *_: object) -> None:
+        if signal.getsignal(signal.SIGINT) == self._receive:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.is_received = True
+        signal.default_int_handler(number, frame)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command."""
+    interrupt = _NotedInterrupt()
     try:
-        if (outputs := _outputs_module()) is not None:
-            outputs.forget_written_files()
-        args = build_parser().parse_args(argv)
-        # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            os.environ.setdefault(name, "1")
-        return args.run(args)
-    except DhcalError as error:
-        print(f"dhcal: {message_line(error)}", file=sys.stderr)
-        return 2
-    except MemoryError:
-        print("dhcal: not enough memory; use fewer samples", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        outputs = _outputs_module()
-        written = ", ".join(outputs.written_files()) if outputs is not None else ""
-        what = f"these files are written: {written}" if written else "nothing written"
-        print(f"dhcal: interrupted; {message_line(what)}", file=sys.stderr)
-        return 130
+        with interrupt:
+            if (outputs := _outputs_module()) is not None:
+                outputs.forget_written_files()
+            args = build_parser().parse_args(argv)
+            # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
+            for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+                os.environ.setdefault(name, "1")
+            return args.run(args)
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) or interrupt.is_received:
+            outputs = _outputs_module()
+            written = ", ".join(outputs.written_files()) if outputs is not None else ""
+            what = f"these files are written: {written}" if written else "nothing written"
+            print(f"dhcal: interrupted; {message_line(what)}", file=sys.stderr)
+            return 130
+        if isinstance(error, DhcalError | MemoryError):
+            is_known = isinstance(error, DhcalError)
+            text = message_line(error) if is_known else "not enough memory; use fewer samples"
+            print(f"dhcal: {text}", file=sys.stderr)
+            return 2
+        raise
 
 
 def _outputs_module() -> Any:

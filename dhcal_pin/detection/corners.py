@@ -32,6 +32,8 @@ MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS = 64 << 20, 50_000_000
 _NO_IMAGE = "cannot be read as an image; expected PNG, JPEG or TIFF"
 # Problem of an image without a board.
 NO_BOARD = "no board found"
+# Outlines of markers, and their numbers (t, 1); None without markers.
+Markers = tuple[Sequence[Array], Array | None]
 # Smallest number of corners of an image that is used.
 MIN_CORNERS = 4
 # Sharpness below which an image is blurred: standard deviation of the Laplacian over that of the brightness.
@@ -79,6 +81,17 @@ def read_image(path: PathLike) -> Array:
     return image
 
 
+def read_image_of_size(path: PathLike, size: tuple[int, int]) -> Array:
+    """Read an image as grey values; its width and height must be those of the rig file."""
+    image = read_image(path)
+    if image.shape[::-1] != size:
+        raise FileFormatError(
+            f"{os.fspath(path)}: has {image.shape[1]} x {image.shape[0]} px; the rig file states "
+            f"{size[0]} x {size[1]} px"
+        )
+    return image
+
+
 def _require_few_pixels(path: PathLike) -> None:
     """Require an image that fits into the memory. A small file can hold many pixels of one colour."""
     from PIL import Image  # lazy import: an optional extra
@@ -122,19 +135,15 @@ def find_layout(board: Board, images: Sequence[Array]) -> Layout:
     layouts = layouts_of(board)
     if len(layouts) == 1:
         return layouts[0]
-    counts = [sum(len(_find(board, layout, image)[0]) for image in images) for layout in layouts]
+    seen = [(image, _find_markers(board, image)) for image in images]
+    counts = [sum(len(_find(board, layout, *each)[0]) for each in seen) for layout in layouts]
     return layouts[int(np.argmax(counts))]
 
 
 def detect_corners(board: Board, layout: Layout, path: str, size: tuple[int, int]) -> DetectedImage:
     """Find the corners of a board in an image file."""
-    image = read_image(path)
-    if image.shape[::-1] != size:
-        raise FileFormatError(
-            f"{path}: has {image.shape[1]} x {image.shape[0]} px; the rig file states {size[0]} x {size[1]} "
-            "px"
-        )
-    corner, pixels = _find(board, layout, image)
+    image = read_image_of_size(path, size)
+    corner, pixels = _find(board, layout, image, _find_markers(board, image))
     problem = ""
     if not len(corner):
         problem = NO_BOARD
@@ -159,8 +168,18 @@ def _quality_problem(image: Array, pixels: Array) -> str:
     return ""
 
 
-def _find(board: Board, layout: Layout, image: Array) -> tuple[Array, Array]:
-    """Return the numbers (c,) and image coordinates (c, 2) of the corners of a board in an image."""
+def _find_markers(board: Board, image: Array) -> Markers:
+    """Return outlines and numbers of the markers of a board in an image; none of a board without markers."""
+    if board.type not in ("charuco", "aprilgrid"):
+        return (), None
+    return require_opencv().aruco.ArucoDetector(marker_dictionary(board)).detectMarkers(image)[:2]
+
+
+def _find(board: Board, layout: Layout, image: Array, markers: Markers) -> tuple[Array, Array]:
+    """Return the numbers (c,) and image coordinates (c, 2) of the corners of a board in an image.
+
+    The markers of a board are the same in all layouts.
+    """
     columns, rows = (board.columns, board.rows)
     if layout.is_exchanged:
         columns, rows = rows, columns
@@ -170,7 +189,7 @@ def _find(board: Board, layout: Layout, image: Array) -> tuple[Array, Array]:
             f"{board.where}: the type {board.type!r} cannot be detected; choose from {', '.join(finders)}"
         )
     printed = replace(board, columns=columns, rows=rows, is_legacy=layout.is_legacy)
-    corner, pixels = finders[board.type](printed, image)
+    corner, pixels = finders[board.type](printed, image, markers)
     if layout.is_exchanged and len(corner):
         corner = _numbers_on_the_rig(board, printed, corner)
     return corner, pixels
@@ -222,9 +241,13 @@ def _found(corner: Any, pixels: Any) -> tuple[Array, Array]:
     return np.asarray(corner, int).ravel(), np.asarray(pixels, float).reshape(-1, 2)
 
 
-def _find_charuco(board: Board, image: Array) -> tuple[Array, Array]:
+def _find_charuco(board: Board, image: Array, markers: Markers) -> tuple[Array, Array]:
     """Find the inner corners of a ChArUco board."""
-    found, numbers, _, _ = require_opencv().aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
+    outlines, tags = markers
+    if tags is None:
+        return _found(None, None)
+    detector = require_opencv().aruco.CharucoDetector(charuco_board(board))
+    found, numbers, _, _ = detector.detectBoard(image, markerCorners=outlines, markerIds=tags)
     corner, pixels = _found(numbers, found)
     # Corners are placed between the markers, also where something covers them.
     gap = 0.5 * (board.square - board.marker) / board.square
@@ -232,7 +255,7 @@ def _find_charuco(board: Board, image: Array) -> tuple[Array, Array]:
     return corner[is_visible], pixels[is_visible]
 
 
-def _find_checkerboard(board: Board, image: Array) -> tuple[Array, Array]:
+def _find_checkerboard(board: Board, image: Array, _: Markers) -> tuple[Array, Array]:
     """Find all inner corners of a checkerboard."""
     cv2 = require_opencv()
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -259,18 +282,17 @@ def _first_square_is_white(board: Board, image: Array, corners: Array) -> bool:
     return bool(grey[is_black].mean() > grey[~is_black].mean())
 
 
-def _find_aprilgrid(board: Board, image: Array) -> tuple[Array, Array]:
+def _find_aprilgrid(board: Board, image: Array, markers: Markers) -> tuple[Array, Array]:
     """Find the four corners of each tag of an AprilGrid that is wholly visible."""
-    aruco = require_opencv().aruco
-    dictionary = marker_dictionary(board)
-    found, tags, _ = aruco.ArucoDetector(dictionary).detectMarkers(image)
+    outlines, tags = markers
     if tags is None:
         return _found(None, None)
+    size = marker_dictionary(board).markerSize + 2
     corner, pixels = [], []
-    for tag, outline in zip(tags.ravel().tolist(), found, strict=True):
+    for tag, outline in zip(tags.ravel().tolist(), outlines, strict=True):
         if tag >= board.columns * board.rows:
             continue
-        refined = refine_by_edges(image, outline.reshape(4, 2).astype(float), dictionary.markerSize + 2)
+        refined = refine_by_edges(image, outline.reshape(4, 2).astype(float), size)
         if refined is not None:
             corner += range(4 * tag, 4 * tag + 4)
             pixels.append(refined)

@@ -15,10 +15,10 @@ from .._typing import PathLike
 from ..cameras.boards import Board
 from ..cameras.rig import Camera, Rig
 from ..exceptions import FileFormatError, InvalidArgumentError
-from .corners import NO_BOARD, DetectedImage, Layout, detect_corners, find_layout, read_image
+from .corners import NO_BOARD, DetectedImage, Layout, detect_corners, find_layout, read_image_of_size
 from .opencv import silent_opencv_log
 
-# Number of images in which the layouts of a board are compared.
+# Largest number of images in which the layouts of a board are compared.
 N_LAYOUT_IMAGES = 8
 # Endings of image files in a folder.
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
@@ -74,8 +74,8 @@ def detect_boards(
             "printed board"
         )
     size, out, n_done = (camera.width, camera.height), [], 0
-    step = max(1, len(paths) // N_LAYOUT_IMAGES)
-    some = [read_image(path) for path in paths[::step]]
+    step = -(-len(paths) // N_LAYOUT_IMAGES)
+    some = [read_image_of_size(path, size) for path in paths[::step]]
     with silent_opencv_log(), ThreadPoolExecutor(jobs or os.cpu_count()) as threads:
         for board in boards:
             layout = find_layout(board, some)

@@ -42,9 +42,9 @@ class _Print:
     y: Array  # Edges along y, increasing [m]
     grey: Array  # Grey values between them, shape (len(y) + 1, len(x) + 1); NaN outside the paper
 
-    def at(self, x: Array, y: Array) -> Array:
-        """Return the grey values of points of the board's plane [m]."""
-        return self.grey[np.searchsorted(self.y, y), np.searchsorted(self.x, x)]
+    def cells(self, x: Array, y: Array) -> Array:
+        """Return the numbers of the cells, in the order of `grey`, of points of the board's plane [m]."""
+        return np.searchsorted(self.y, y) * self.grey.shape[1] + np.searchsorted(self.x, x)
 
 
 def _print_of(board: Board) -> _Print:
@@ -99,11 +99,10 @@ def _ideal_image(sight: Array, boards: Sequence[tuple[Board, Array]], n: int) ->
     sheets = [(_print_of(board), se3.inverse(pose)) for board, pose in boards]
     for sheet, inverse in sheets:
         depth, points = _hits(flat, inverse)
-        cells = np.stack([np.searchsorted(sheet.y, points[1]), np.searchsorted(sheet.x, points[0])])
-        cells = np.where(np.isfinite(depth), cells, 0).reshape(2, *sight.shape[1:])
-        corners = np.stack([cells[:, :-1, :-1], cells[:, 1:, :-1], cells[:, :-1, 1:], cells[:, 1:, 1:]])
-        has_edges |= np.any(corners.min(0) != corners.max(0), 0)
-        grey = sheet.grey[corners[0, 0], corners[0, 1]]
+        cells = np.where(np.isfinite(depth), sheet.cells(*points), 0).reshape(sight.shape[1:])
+        first = cells[:-1, :-1]
+        has_edges |= (cells[1:, :-1] != first) | (cells[:-1, 1:] != first) | (cells[1:, 1:] != first)
+        grey = sheet.grey.ravel()[first]
         depth = depth.reshape(sight.shape[1:])[:-1, :-1]
         is_seen = np.isfinite(grey) & (depth < nearest)
         image[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
@@ -137,7 +136,7 @@ def _grey_values(sight: Array, sheets: Sequence[tuple[_Print, Array]]) -> Array:
     out, nearest = np.full(sight.shape[1], BACKGROUND), np.full(sight.shape[1], np.inf)
     for sheet, inverse in sheets:
         depth, points = _hits(sight, inverse)
-        grey = sheet.at(points[0], points[1])
+        grey = sheet.grey.ravel()[sheet.cells(*points)]
         is_seen = np.isfinite(grey) & (depth < nearest)
         out[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
     return out

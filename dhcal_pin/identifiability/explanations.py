@@ -310,7 +310,7 @@ class Explainer:
                 suggestion = f"measure a point beside that axis, or {suggestion}"
             return reason, suggestion
         if self._is_scaling(group):
-            return SCALE_UNKNOWN, self._suggest_measurement(group)
+            return SCALE_UNKNOWN, _size_advice(self.probe.problem)
         return "the measurements do not change", self._suggest_measurement(group)
 
     def _explain_angles(self, group: UnobservableGroup) -> str:
@@ -396,17 +396,17 @@ class Explainer:
         return "the poses are too similar", f"measure poses over the full range of {joints}"
 
 
-def explain_unobservable(problem: Problem, x: Array, system: TriangularSystem) -> list[str]:
+def explain_unobservable(probe: ObservabilityProbe, system: TriangularSystem) -> list[str]:
     """Explain which parameters are not identifiable, why, and what to measure."""
-    if qr.rank(system.r) == len(x):
+    if qr.rank(system.r) == len(probe.x):
         return []
-    curve_joints = _curve_joints(problem)
+    curve_joints = _curve_joints(probe.problem)
     if (curve_joints < 0).all():
-        return _explain_null_space(problem, x)
+        return _explain_null_space(probe)
     kept = np.flatnonzero(curve_joints < 0)
     is_explained = qr.rank(system.r[:, kept]) == len(kept)
-    sentences = [] if is_explained else _explain_null_space(*_with_known_curves(problem, x, kept))
-    return [*sentences, *_explain_curves(ObservabilityProbe(problem, x), system.r, curve_joints)]
+    sentences = [] if is_explained else _explain_null_space(_with_known_curves(probe, kept))
+    return [*sentences, *_explain_curves(probe, system.r, curve_joints)]
 
 
 def _curve_joints(problem: Problem) -> Array:
@@ -420,14 +420,15 @@ def _curve_joints(problem: Problem) -> Array:
     return np.concatenate([np.where(is_curve, indices % n, -1), others])
 
 
-def _with_known_curves(problem: Problem, x: Array, kept: Array) -> tuple[Problem, Array]:
-    """Return a problem in which only some unknowns remain, and their values; the others stay as in x."""
-    errors, n_robot = problem.errors, len(problem.errors.parameters)
-    known = x.copy()
+def _with_known_curves(probe: ObservabilityProbe, kept: Array) -> ObservabilityProbe:
+    """Return a probe in which only some unknowns remain; the others stay as in x."""
+    problem, errors, n_robot = probe.problem, probe.problem.errors, len(probe.problem.errors.parameters)
+    known = probe.x.copy()
     known[kept] = 0.0
     parameters = tuple(errors.parameters[i] for i in kept if i < n_robot)
     reduced = replace(errors, chain=errors.at(known[:n_robot]), parameters=parameters)
-    return replace(problem, errors=reduced, weights=problem.weights[kept], bounds=None), x[kept]
+    reduced_problem = replace(problem, errors=reduced, weights=problem.weights[kept], bounds=None)
+    return ObservabilityProbe(reduced_problem, probe.x[kept])
 
 
 def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) -> list[str]:
@@ -449,7 +450,7 @@ def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) ->
     if qr.rank(r) == probe.n_equations:
         reason = f"{probe.n_equations} equations for {len(others)} parameters"
         advice = f"measure at least {-(-count * samples // probe.n_equations)} more poses"
-    elif n_open(probe.hypothetical_r_factor(range(probe.chain.n_joints))) < count:
+    elif n_open(probe.full_range) < count:
         reason, advice = "the poses are too similar", "measure poses over the full range of the joints"
     else:
         reason, advice = "the ranges of the joints are too small", "only the priors determine them"
@@ -459,9 +460,9 @@ def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) ->
     ]
 
 
-def _explain_null_space(problem: Problem, x: Array) -> list[str]:
-    """Explain all unobservable directions of a problem at x (p,)."""
-    probe = ObservabilityProbe(problem, x)
+def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
+    """Explain all unobservable directions of a problem."""
+    problem, x = probe.problem, probe.x
     # Even a small last step rotates the null space by more than the tolerance, so take the Jacobian at x.
     r = linearize_and_factor(problem, x, small_angle=False).r
     layers = probe.null_space_layers(r)
@@ -471,13 +472,16 @@ def _explain_null_space(problem: Problem, x: Array) -> list[str]:
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
     if probe.is_scale_unobservable(r) and not any(SCALE_UNKNOWN in text for text in sentences):
-        advice = (
-            "add a known distance between contact points"
-            if any(item.is_contact for item in problem.data)
-            else "measure the position of the tool in a fixed frame"
-        )
-        sentences.insert(0, f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {advice}")
+        text = f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {_size_advice(problem)}"
+        sentences.insert(0, text)
     return sentences
+
+
+def _size_advice(problem: Problem) -> str:
+    """Return the measurement that determines the size of a robot."""
+    if any(item.is_contact for item in problem.data):
+        return "add a known distance between contact points"
+    return "measure the position of the tool in a fixed frame"
 
 
 def label_unobservable(sentence: str) -> str:
@@ -504,7 +508,7 @@ def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
 
 
 def explain_weakly_observable(
-    problem: Problem, x: Array, system: TriangularSystem, prior_std: Array, noise: float
+    probe: ObservabilityProbe, system: TriangularSystem, prior_std: Array, noise: float
 ) -> list[str]:
     """Explain which parameters are observable but hardly better known than before the measurement."""
     if np.isnan(noise):
@@ -515,13 +519,11 @@ def explain_weakly_observable(
     directions, std_ratios = observability.weakly_observable(system.r, prior_std, noise)
     if not len(std_ratios):
         return []
+    problem, n_robot = probe.problem, len(probe.problem.errors.parameters)
     names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
-    plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
-    probe = ObservabilityProbe(problem, x)
+    plain_errors = PlainErrors.from_model(problem.errors, probe.x[:n_robot])
     # R factor of as many poses over the full range of the joints.
-    full_range = probe.hypothetical_r_factor(range(plain_errors.chain.n_joints)) / np.sqrt(
-        probe.n_repetitions
-    )
+    full_range = probe.full_range / np.sqrt(probe.n_repetitions)
     scaled = directions / prior_std[:, None]
     # The curve of a joint is explained as a whole.
     curve_joints = _curve_joints(problem)

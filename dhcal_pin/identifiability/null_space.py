@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -141,6 +142,11 @@ class ObservabilityProbe:
             )
         return linearize_and_factor(replace(self.problem, data=tuple(data)), self.x, small_angle=False).r
 
+    @cached_property
+    def full_range(self) -> Array:
+        """R factor of hypothetical measurements with all joints drawn anew, shape (p, p)."""
+        return self.hypothetical_r_factor(range(self.chain.n_joints))
+
     def unmoved_joints(self) -> list[int]:
         """Find the independent joints that have the same position in all measurements."""
         q = [item.configurations() for item in self.problem.data if item.configurations_per_row]
@@ -162,7 +168,7 @@ class ObservabilityProbe:
         data = qr.null_space(r)
         unmoved = self.unmoved_joints()
         poses = _unobservable_part(data, self.hypothetical_r_factor(unmoved)) if unmoved else data
-        instrument = _unobservable_part(poses, self.hypothetical_r_factor(all_joints))
+        instrument = _unobservable_part(poses, self.full_range)
         structure = _unobservable_part(instrument, self.hypothetical_r_factor(all_joints, Pose))
         return [("structure", structure), ("instrument", instrument), ("poses", poses), ("unmoved", data)]
 

@@ -551,8 +551,9 @@ class CameraCorners(Measurement):
         found = self._project(frames, u)
         pixels = self.values - found.pixels.T
         by_local = found.by_local.transpose(2, 0, 1)
-        products = by_local @ by_local.swapaxes(1, 2)
-        board = by_local.swapaxes(1, 2) @ np.linalg.solve(products, pixels[..., None])
+        board = (
+            by_local.swapaxes(1, 2) @ _solve_symmetric(by_local @ by_local.swapaxes(1, 2), pixels)[..., None]
+        )
         return {"pixels": pixels, "board": board[..., 0]}
 
     def displacement_derivative(self, frames: FrameBatch, u: Array) -> Array:
@@ -617,6 +618,7 @@ class CameraCorners(Measurement):
             rows=self.rows[samples],
             source=self.source,
             recorded=self.recorded and self.recorded[samples],
+            has_joint_values=self.has_joint_values,
         )
 
     # ------------------------------------------------------------------------------------------- files
@@ -695,6 +697,14 @@ def exp_and_jacobian(rotvec: Array) -> tuple[Array, Array]:
     k = se3.skew(rotvec)
     square = k @ k
     return np.eye(3) + first * k + second * square, np.eye(3) + second * k + third * square
+
+
+def _solve_symmetric(matrices: Array, right: Array) -> Array:
+    """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2)."""
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    determinant = np.maximum(a * c - b * b, np.finfo(float).eps * a * c)
+    x, y = right.T
+    return np.stack([c * x - b * y, a * y - b * x], 1) / determinant[:, None]
 
 
 def _samples_of(numbers: Array, number: int) -> slice | Array:

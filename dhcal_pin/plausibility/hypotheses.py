@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from typing import Literal, Protocol
 
 import numpy as np
@@ -27,6 +27,7 @@ from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
 from ..robot.joint_path import joint_path
+from ..session.facts import MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
@@ -37,8 +38,8 @@ JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
 _AND = "+"
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
-# Largest lag [rows or s] and change of a scale that can be undone.
-MAX_LAG, MAX_SCALE_CHANGE = 100.0, 0.5
+# Largest lag that can be undone [rows or s].
+MAX_LAG = 100.0
 # Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
 _MAX_SMALL_ROTATION = np.pi / ANGLES["deg"]
 
@@ -338,6 +339,9 @@ class Hypothesis:
         if isinstance(self.change, BothChanges):
             first, second = self.change.first, self.change.second
             return first.log_jacobian(data) + second.log_jacobian(first.apply(data) or data)
+        if isinstance(self.change, AxisScale):
+            n_values = sum(len(item.rows) for item in data if self.change.apply(item) is not None)
+            return float(max(0, n_values - 1) * -np.log(self.change.factor))
         if not isinstance(self.change, LengthChange):
             return 0.0
         n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
@@ -380,6 +384,7 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
     yield from _joint_hypotheses(chain)
     yield from _order_hypotheses(chain)
     yield from _unit_hypotheses(chain)
+    yield from _axis_unit_hypotheses(data)
     for step, side in ((1, "above"), (-1, "below")):
         yield Hypothesis(
             f"rows:{side}", f"each row holds the joint values of the row {side}", RowShift(-step)
@@ -488,6 +493,17 @@ def _unit_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(LENGTHS[read] / LENGTHS[true]))
     text = "measured rotation vectors are in rad, but were read as deg"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
+
+
+def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
+    """Yield another unit of one measured coordinate, if it spreads far less or far more than the others."""
+    spreads = np.sum([item.positions().std(0) for item in data if len(item.positions())] or [np.ones(3)], 0)
+    for (i, axis), (true, read) in product(enumerate("xyz"), (("m", "mm"), ("mm", "m"))):
+        factor = LENGTHS[true] / LENGTHS[read]
+        expected = max(np.delete(spreads, i)) * np.sqrt(factor)
+        if (spreads[i] < expected) if factor < 1 else (spreads[i] > expected):
+            text = f"measured {axis} is in {true}, but was read as {read}"
+            yield Hypothesis(f"{axis}:{true}-not-{read}", text, AxisScale(i, factor))
 
 
 def _pose_hypotheses() -> Iterator[Hypothesis]:

@@ -26,6 +26,7 @@ from ..robot.chain import Chain
 from .evidence import MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
+    AxisScale,
     BothChanges,
     Hypothesis,
     JointChange,
@@ -218,7 +219,7 @@ def _closest_pairs(
     others = [
         each
         for each in hypotheses
-        if not isinstance(each.change, JointChange | RowShift | LengthChange | AxisChange)
+        if not isinstance(each.change, JointChange | RowShift | LengthChange | AxisChange | AxisScale)
     ]
     pairs = [*permutations(of_joints, 2), *product(others, of_joints), *permutations(others, 2)]
     found = []

@@ -20,6 +20,8 @@ from .timeline import Place, Timeline
 
 # A motion is stated as an angle if that moves the tool by more than this multiple of its translation.
 MIN_ANGLE_RATIO = 10.0
+# Largest change of a scale that is stated and can be undone: beyond it another mistake imitates a scale.
+MAX_SCALE_CHANGE = 0.5
 
 
 @dataclass(frozen=True)

@@ -97,11 +97,13 @@ class Layout:
             np.array([names.index(q.name) for q in parameters]) for parameters in (base(chain), tool(chain))
         )
         blocks = [Block("base", "", 0, of_base, of_frame), Block("tool", "", 0, of_tool, of_frame)]
-        for j, name in enumerate(chain.joint_names):
+        # Joint values that only reproduce poses of the tip have no zeros, and their links do not grow.
+        has_joints = all(item.has_joint_values for item in problem.data)
+        for j, name in enumerate(chain.joint_names if has_joints else ()):
             unit = 1.0 if chain.is_prismatic[j] else 1 / size
             blocks.append(Block("joint", name, j, joints[j : j + 1], np.array([unit])))
         # All links by one factor, or each by its own.
-        if grows.any():
+        if has_joints and grows.any():
             blocks.append(Block("links", "", 0, np.array([all_links]), np.array([1 / size])))
             blocks.append(Block("links", "", 0, links[grows], np.full(grows.sum(), 1 / size)))
         blocks += [

@@ -26,7 +26,7 @@ from .._typing import Array
 from ..estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, base, placement, tool
 from ..estimation.problem import Problem
 from ..robot.chain import BASE_FRAME
-from .facts import Scale
+from .facts import MAX_SCALE_CHANGE, Scale
 from .linear_model import Layout, inverse, measures_positions, whitened_rows
 
 # Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
@@ -83,7 +83,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     best = np.unravel_index(np.argmax(weights), weights.shape)
     n_lengths = float(np.trace(np.linalg.solve(covariances[best], lengths[best[0]])))
     if (
-        abs(change) < MIN_CHANGE
+        not MIN_CHANGE <= abs(change) <= MAX_SCALE_CHANGE
         or n_lengths < MIN_LENGTHS
         or max(weights[-1].sum(), weights[:, -1].sum()) > EDGE
     ):

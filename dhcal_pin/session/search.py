@@ -33,7 +33,7 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import Event, Lag, Scale, Session
+from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
@@ -695,7 +695,7 @@ def _bounded_cost(residual: Array) -> Array:
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
     """Return whether all samples show where base and tool are."""
-    return all(item.shows_changes and item.has_joint_values for item in data)
+    return all(item.shows_changes for item in data)
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
@@ -739,7 +739,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         causes,
         (other_robot,) if other_robot else (),
         lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
-        scales=tuple(_scale(cause) for cause in causes if cause.block.kind == "scale"),
+        scales=tuple(scale for scale in _scales(causes) if abs(scale.factor - 1) <= MAX_SCALE_CHANGE),
     ).described()
 
 
@@ -748,9 +748,11 @@ def _lag(cause: Cause, timeline: Timeline) -> Lag:
     return Lag(float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), timeline.unit)
 
 
-def _scale(cause: Cause) -> Scale:
-    """Describe the scale of one axis."""
-    return Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
+def _scales(causes: Sequence[Cause]) -> Iterator[Scale]:
+    """Describe the scales of single axes."""
+    for cause in causes:
+        if cause.block.kind == "scale":
+            yield Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:

@@ -17,7 +17,8 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
 
@@ -31,7 +32,7 @@ from ..native_output import discard_native_messages
 from ..robot.chain import Chain
 from ..robot.collision import FLOOR, Obstacle
 from ..robot.dh_urdf import MATERIALS
-from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_remedy
+from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_files, mesh_remedy
 
 # Steps of the grid of vertices along the longest side of a mesh: 0.1 mm on most links.
 GRID = 8000
@@ -61,34 +62,35 @@ def visuals_of(
     )
     # Pinocchio separates numbers by spaces only, but XML allows any white space.
     text = chain.urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
-    model = _build_model(text)
-    objects, missing = _load_visuals(model, text, folders)
-    if not len(objects) and not missing:
+    names = {mesh.get("filename", "") for mesh in ElementTree.fromstring(text).iter("mesh")}
+    files = [file for name in sorted(names) for file in mesh_files(name, folders)]
+    stamps = tuple((file, os.path.getmtime(file), os.path.getsize(file)) for file in files)
+    model, objects, missing = _read_objects(_Source(text, stamps, tuple(folders)))
+    if not objects and not missing:
         shapes = _skeleton(bodies, set(range(len(bodies))))
         return Visuals(shapes, [], "Drawn as a skeleton: the URDF has no visual geometry.")
     numbers: dict[tuple[bytes, ...], int] = {}
     meshes: list[Mesh] = []
     shapes = []
     for item in objects:
-        if any(np.allclose(item.meshColor, color, atol=1e-6) for color in AXIS_COLORS):
+        if any(np.allclose(item.color, color, atol=1e-6) for color in AXIS_COLORS):
             # The page has its own layer for the tool frame.
             continue
-        shape = _primitive(item.geometry)
-        if shape is None:
-            mesh = Mesh.from_geometry(item.geometry)
+        shape = item.shape
+        if isinstance(shape, Mesh):
             # Equal meshes, such as those of five equal motors, are stored once.
-            number = numbers.setdefault(mesh.key, len(meshes))
+            number = numbers.setdefault(shape.key, len(meshes))
             if number == len(meshes):
-                meshes.append(mesh)
+                meshes.append(shape)
             shape = {"mesh": number}
-        body, placement = _parent_body(model, chain, item.parentFrame, item.placement)
+        body, placement = _parent_body(model, chain, item.frame, item.placement)
         shapes.append({"body": body, "placement": rows(np.round(placement, 9)), **shape})
     bodies_without_mesh = {
         _parent_body(model, chain, model.getFrameId(link, pin.FrameType.BODY), pin.SE3.Identity())[0]
         for link in missing
     }
     limits = allocate_triangles([len(mesh.triangles) for mesh in meshes], triangles)
-    simplified = [mesh.simplify(limit) for mesh, limit in zip(meshes, limits, strict=True)]
+    simplified = [_simplified(mesh, limit) for mesh, limit in zip(meshes, limits, strict=True)]
     shapes += _skeleton(bodies, bodies_without_mesh)
     return Visuals(shapes, simplified, _missing_meshes_note(missing))
 
@@ -99,6 +101,46 @@ def rows(pose: Array) -> list[float]:
 
 
 # --- the URDF's visual geometry --------------------------------------------------------------------
+@dataclass(frozen=True)
+class _Source:
+    """A URDF and its meshes, which the stamps of their files tell from others."""
+
+    text: str
+    stamps: tuple[tuple[str, float, int], ...]  # Path, time of the last change, size
+    folders: tuple[str, ...] = field(compare=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _Object:
+    """Visual object of a link."""
+
+    frame: int  # Frame of the link
+    placement: pin.SE3  # Pose in this frame
+    color: Array  # Red, green, blue and opacity
+    shape: dict[str, Any] | Mesh  # Keys of a primitive, or a mesh
+
+
+# A job draws its robot several times, such as in the report and in the scene.
+@lru_cache(maxsize=4)
+def _read_objects(source: _Source) -> tuple[pin.Model, list[_Object], dict[str, list[str]]]:
+    """Return the model, its visual objects, and by link the file names of meshes that cannot be used."""
+    model = _build_model(source.text)
+    objects, missing = _load_visuals(model, source.text, source.folders)
+    return (
+        model,
+        [
+            _Object(
+                item.parentFrame,
+                pin.SE3(item.placement),
+                np.array(item.meshColor),
+                _primitive(item.geometry) or Mesh.from_geometry(item.geometry),
+            )
+            for item in objects
+        ],
+        missing,
+    )
+
+
 def _load_visuals(
     model: pin.Model, text: str, folders: Sequence[str]
 ) -> tuple[Sequence[pin.GeometryObject], dict[str, list[str]]]:
@@ -273,6 +315,12 @@ class Mesh:
             "corners": base64.b64encode(self.corners.tobytes()).decode(),
             "triangles": base64.b64encode(self.triangles.astype(f"<u{width}").tobytes()).decode(),
         }
+
+
+@lru_cache(maxsize=64)
+def _simplified(mesh: Mesh, limit: int) -> Mesh:
+    """Return a mesh with fewer triangles; the meshes of a robot are simplified once for all its scenes."""
+    return mesh.simplify(limit)
 
 
 def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pages import AXE, READY, VIEWPORT
+from pages import AXE, READY, VIEWPORT, listen
 from slow_cases import some_slow
 
 import dhcal_pin.app.server
@@ -33,7 +33,7 @@ def opened(browser: Any, url: str) -> Iterator[Any]:
     page = context.new_page()
     complaints: list[str] = []
     # The pages that it opens, too.
-    context.on("console", lambda message: complaints.append(message.text))
+    listen(context, complaints)
     context.on("weberror", lambda error: complaints.append(str(error.error)))
     context.on(
         "request",
@@ -45,14 +45,30 @@ def opened(browser: Any, url: str) -> Iterator[Any]:
     assert complaints == []
 
 
-@pytest.fixture
-def page(app, browser):
+@pytest.fixture(scope="module")
+def shared_page(app, browser):
     with opened(browser, app.url) as page:
         yield page
 
 
+@pytest.fixture
+def page(shared_page):
+    """The page as it is when it is opened; another process of the browser would take half a second."""
+    shared_page.set_viewport_size(VIEWPORT)
+    shared_page.emulate_media(color_scheme="light")
+    shared_page.reload()
+    return shared_page
+
+
 def drop(page: Any, *files: tuple[str, str]) -> None:
     page.evaluate(DROP, [list(files)])
+
+
+def drop_with_tip(page: Any, *files: tuple[str, str]) -> None:
+    """Name the tip first; a page with files checks them again after each change."""
+    page.fill("#tip", "tool0")
+    page.locator("#tip").blur()
+    drop(page, *files)
 
 
 def example_files(example: Path) -> list[tuple[str, str]]:
@@ -76,8 +92,7 @@ def wrong_sign(example: Path) -> str:
 
 
 def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
-    drop(page, *example_files(example))
-    page.fill("#tip", "tool0")
+    drop_with_tip(page, *example_files(example))
     page.wait_for_selector("#check .card.ok")
     assert "position, 100 rows, 100 configurations" in page.inner_text("#check")
     assert page.eval_on_selector_all("#links option", "them => them.map(it => it.value)").count("tool0") == 1
@@ -105,8 +120,7 @@ def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
 
 def test_refusal_shows_the_remedy_and_applies_it(page, example):
     urdf, _ = example_files(example)
-    drop(page, urdf, ("laser.csv", wrong_sign(example)))
-    page.fill("#tip", "tool0")
+    drop_with_tip(page, urdf, ("laser.csv", wrong_sign(example)))
     page.click("#calibrate")
     page.wait_for_selector("#result .refused")
     assert "The sign of joint elbow_joint is wrong" in page.inner_text("#result")
@@ -125,11 +139,10 @@ def test_a_proposed_column_map_is_used(page, example):
     header = "A1;A2;A3;A4;A5;A6;X pos;Y pos;Z pos"
     rows = [";".join(line.split(",")[:9]).replace(".", ",") for line in lines[1:]]
     urdf, _ = example_files(example)
-    drop(page, urdf, ("tracker.csv", "\n".join([header, *rows])))
+    drop_with_tip(page, urdf, ("tracker.csv", "\n".join([header, *rows])))
     page.wait_for_selector("#check .card.problem")
     page.click("text=Use this column map")
     page.wait_for_selector("#check .card.ok")
-    page.fill("#tip", "tool0")
     page.click("#calibrate")
     page.wait_for_selector("#result:not([hidden])")
     assert "Verdict: ok" in page.inner_text("#result")
@@ -174,8 +187,7 @@ def test_errors_are_shown_as_one_line(page, example):
 def test_two_browsers_work_at_once_and_one_cancels(app, browser, example):
     with opened(browser, app.url) as one, opened(browser, app.url) as other:
         for page in (one, other):
-            drop(page, *example_files(example))
-            page.fill("#tip", "tool0")
+            drop_with_tip(page, *example_files(example))
             page.wait_for_selector("#check .card.ok")
         other.select_option("#parameters", "offset,base,tool")
         one.click("#calibrate")
@@ -239,8 +251,7 @@ def test_every_state_is_accessible_at_every_width(page, example, looks):
 
     check(looks[0])
     urdf, data = example_files(example)
-    drop(page, urdf, ("laser.csv", wrong_sign(example)))
-    page.fill("#tip", "tool0")
+    drop_with_tip(page, urdf, ("laser.csv", wrong_sign(example)))
     page.wait_for_selector("#check .card.warning")
     page.click("#check summary")
     page.click("#calibrate")

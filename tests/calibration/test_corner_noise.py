@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from camera_setups import ARMS, simulate
 
-from dhcal_pin.calibration.cameras.corner_noise import estimate_corner_variances
+from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration.cameras.corner_noise import _with_corner_noise, estimate_corner_variances
+from dhcal_pin.measurements import KINDS, CameraCorners, Noise
 from dhcal_pin.se3 import transform
 
 N_ROWS, N_SEEDS = 2000, 20
@@ -65,3 +67,14 @@ def test_derivative_by_the_corner_agrees_with_differences():
             shifted.append(-images.errors(frames, moved)["pixels"])
         difference = (shifted[0] - shifted[1]) / 2e-5
         np.testing.assert_allclose(slopes[:, :, axis], difference, atol=1e-6 * np.abs(slopes).max())
+
+
+def test_stated_noise_of_corners_is_kept(sim_6dof):
+    """Corners without displacements have the stated standard deviation of 0.3 px."""
+    rng = np.random.default_rng(3)
+    images = KINDS["camera"].simulate(sim_6dof, rng.uniform(-2, 2, (30, 6)), Noise(3e-4), rng)
+    fit = calibrate(sim_6dof, images, "camera,board").hand_eye_fit
+    assert fit is not None
+    (found,) = _with_corner_noise(fit.fit)
+    assert isinstance(found, CameraCorners)
+    np.testing.assert_allclose(np.mean(found.sigma**2), 0.3**2, rtol=0.1)

@@ -12,10 +12,10 @@ from slow_cases import some_slow
 from dhcal_pin import read_robot
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.cameras import procedure
-from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood
+from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood, _maximize_likelihood
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import subsample
-from dhcal_pin.exceptions import InvalidArgumentError, NotObservableError
+from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.se3 import exp6
@@ -129,6 +129,21 @@ def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_t
     assert result.validate(images)["residual_rms"] < 1.2 * np.sqrt(2) * 1e3 * image_noise
 
 
+def test_poses_in_the_rig_that_are_far_from_the_true_ones_are_named():
+    """The rig states the cameras in the measuring frame; without positions its place is not known."""
+    rng = np.random.default_rng(9)
+    arm = read_robot("example:ur10", tip="tool0")
+    images = images_that_keep_the_orientation_of_the_tool(placed(small_errors(arm, rng)), Noise(1e-4), rng)
+    assert images.rig is not None
+    boards = tuple(replace(board, pose=np.eye(4)) for board in images.rig.boards)
+    cameras = tuple(replace(camera, intrinsics="free") for camera in images.rig.cameras)
+    images = images.with_rig(replace(images.rig, cameras=cameras))
+    stated = images.with_rig(replace(images.rig, cameras=cameras, boards=boards))
+    with pytest.raises(ConvergenceError, match=r"check the poses .* or omit those of the cameras"):
+        calibrate(arm, stated, extend="none", session="off")
+    assert calibrate(arm, images, extend="none", session="off").converged
+
+
 def test_whole_images_are_drawn_for_the_start(sim_6dof):
     """The frames are found from a part of the samples; single corners would not show where a board is."""
     rng = np.random.default_rng(10)
@@ -149,6 +164,16 @@ def test_images_without_weight_are_refused(sim_6dof, monkeypatch):
     monkeypatch.setattr(procedure, "reweight", lambda fit, *_: replace(fit, weights=rejected))
     with pytest.raises(InvalidArgumentError, match=r"images: no image agrees .* base and tool"):
         calibrate(sim_6dof, [positions, images], session="off")
+
+
+def test_displacements_are_as_large_as_those_of_which_the_fit_absorbed_a_half():
+    rng, m = np.random.default_rng(11), 2000
+    derivatives = 3e4 * rng.normal(size=(m, 12, 6))
+    displacements = rng.normal(size=(m, 6)) * ([7e-4] * 3 + [3e-4] * 3) * (rng.random((m, 6)) < 0.5)
+    residuals = np.einsum("mij,mj->mi", derivatives, displacements) + rng.normal(size=(m, 12))
+    images = list(zip(residuals, derivatives, strict=True))
+    found = _maximize_likelihood(images, 1.0, n_determined=3 * m)
+    np.testing.assert_allclose([found.position, found.rotation], [7e-4, 3e-4], rtol=0.04)
 
 
 def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():

@@ -27,6 +27,8 @@ from dhcal_pin.measurements import Measurement, Noise, Pose, Position
 from dhcal_pin.robot import Chain, Conditions
 from dhcal_pin.robot.error_families import FAMILIES, ErrorFamily
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def hint(fit) -> str:
     return family_hint(fit.problem, fit.x, fit.weights)
@@ -112,7 +114,7 @@ def test_hardly_a_family_is_added_to_200_robots_with_geometric_errors(kind):
 @pytest.mark.parametrize("family", some_slow(["compliance", "harmonics", "gain"], {0, 1}))
 def test_simulated_family_is_added(family):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
-    fit, plain = calibrate(arm, data), calibrate(arm, data, extend="none")
+    fit, plain = (calibrate(arm, data, extend=each) for each in (None, "none"))
     assert fit.extension is not None
     assert family in fit.extension.families
     one = next(trial for trial in fit.extension.trials if trial.family == family)

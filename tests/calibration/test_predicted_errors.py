@@ -14,6 +14,8 @@ from dhcal_pin.io import read_measurements
 from dhcal_pin.measurements import Measurement, Pose
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 SETS = "minimal,base,tool"
 # Noise of positions [m]; of rotations it is twice that [rad].
 NOISE = 5e-5

@@ -20,6 +20,8 @@ from dhcal_pin.io import read_measurements, read_robot
 from dhcal_pin.measurements import Measurement
 from dhcal_pin.robot import Chain, Transmission
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 UR5 = "ur_description/urdf/ur5_robot.urdf"
 # Largest ratio of the error of the URDF alone to that of a calibration without joint errors.
 MAX_RATIO = 1.02
@@ -159,10 +161,14 @@ def test_urdf_alone_of_half_a_real_series(series):
     data = read_measurements(DATA / f"ipa_ur10/{series}.csv", nominal, columns=MAPS / "ipa_ur10.toml")
     is_fitted = np.random.default_rng(5).permutation(len(data.rows)) % 2 == 0
     fitted, other = data.take(is_fitted), data.take(~is_fitted)
-    fit, geometry = dh.calibrate(nominal, fitted), dh.calibrate(nominal, fitted, extend="none")
+    # `test_no_real_series_is_refused` examines the sessions.
+    fit, geometry = (dh.calibrate(nominal, fitted, extend=each) for each in ("auto", "none"))
+    assert fit.extension is not None
+    assert {"harmonics", "compliance", "curves"} <= set(fit.extension.families)
+    assert fit.extension.temperature > 5
     alone = error_of(fit.chain.urdf_alone, other)
     assert alone <= MAX_RATIO * error_of(geometry.chain, other)
-    assert error_of(fit.chain, other) < 0.4 * alone
+    assert error_of(fit.chain, other) < min(0.4 * alone, 0.17e-3)
 
 
 @pytest.mark.slow

@@ -8,9 +8,10 @@ import pytest
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import intrinsics_candidates
+from dhcal_pin.cameras.intrinsics import _without_centre, intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
 from dhcal_pin.exceptions import NotObservableError
+from dhcal_pin.measurements.images.camera_start import _well_fitting
 
 CAMERA = Camera("c", "world", 1280, 720, np.array([np.nan] * 4 + [0.0] * 5))
 CHECKERBOARD = Board("b", "world", "checkerboard", columns=8, rows=6, square=0.03).points
@@ -135,7 +136,9 @@ def test_points_that_are_millimetres_off_still_give_a_pose(depth, error):
 def test_rotations_about_one_axis_are_refused():
     rng = np.random.default_rng(0)
     links = se3.transform(se3.exp3(np.outer(rng.uniform(-1, 1, 8), [0, 0, 1])), rng.uniform(-1, 1, (8, 3)))
-    with pytest.raises(NotObservableError, match=r"one axis only.*non-parallel axes"):
+    with pytest.raises(
+        NotObservableError, match=r"one axis only.*non-parallel axes.*state the pose of the camera"
+    ):
         solve_hand_eye(links, links, "camera 'c' and board 'b'")
 
 
@@ -208,3 +211,27 @@ def test_intrinsics_need_three_views():
     _, seen = views(np.random.default_rng(1), 2)
     with pytest.raises(NotObservableError, match=r"2 images of a board .* expected at least 3"):
         intrinsics_candidates(seen, CAMERA)
+
+
+def test_wrong_corners_of_a_target_that_is_not_flat_are_left_out():
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-0.05, 0.05, (20, 3))
+    local = points @ se3.exp3(np.array([0.4, -0.3, 0.2])).T + [0.02, 0.01, 0.5]
+    image = local[:, :2] / local[:, 2:]
+    image[[3, 11]] += [[0.06, -0.05], [-0.07, 0.06]]
+    np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), [3, 11])
+
+
+def test_views_that_fit_badly_are_not_used():
+    rms = np.array([0.01] * 6 + [0.04, 0.06])
+    np.testing.assert_array_equal(_well_fitting(rms, np.arange(1, 8)), range(1, 7))
+    np.testing.assert_array_equal(_well_fitting(1e-3 * rms, np.arange(1, 8)), range(1, 8))
+
+
+def test_focal_length_with_the_centre_in_the_middle():
+    rng = np.random.default_rng(6)
+    turns = se3.exp3(rng.uniform(-0.6, 0.6, (4, 3)))
+    views = [np.diag([1.3, 1.3, 1]) @ np.column_stack([r[:, 0], r[:, 1], [0.1, 0.2, 2.0]]) for r in turns]
+    values = _without_centre(views)
+    assert values is not None
+    np.testing.assert_allclose(values, [1.3, 1.3, 0, 0], atol=1e-9)

@@ -83,12 +83,14 @@ def changed(source, target, name, data):
         ("inputs/laser.csv", b"x", "was changed"),
         ("manifest.json", b"x", "no manifest"),
         ("manifest.json", b"[" * 10**5, "no manifest"),
+        ("manifest.json", b"[]", "no manifest"),
+        ("manifest.json", b"[1]", "no manifest"),
         ("inputs/more.csv", b"x", "was changed"),
         ("../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("/tmp/out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("inputs/../../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
     ],
-    ids=range(7),
+    ids=range(9),
 )
 def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, data, message):
     path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, data)

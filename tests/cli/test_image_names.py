@@ -75,7 +75,9 @@ def test_photographs_are_named(run, corners, undrawn):
     assert images == corners[1][1:]
 
 
+@pytest.mark.slow
 def test_without_the_column_images_are_counted(run, corners):
+    """The smaller twin is `test_images_with_wrong_joint_values_are_counted`."""
     Path("corners.csv").write_text("\n".join(corners[0]))
     screen, result = calibrate(run)
     (outliers,) = [text for text in result["verdict"]["reasons"] if "are outliers" in text]

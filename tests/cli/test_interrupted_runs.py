@@ -24,13 +24,13 @@ COMMANDS = [("report", "SIGKILL"), ("in place", "SIGINT"), ("study", "SIGINT")]
 
 @pytest.mark.parametrize(("command", "name"), COMMANDS)
 def test_interrupted_commands_leave_old_or_new_files(tmp_path, command, name):
-    assert sum(outcomes(tmp_path, command, name, 2, 1).values()) == 3
+    assert sum(outcomes(tmp_path, command, name, 1, 1).values()) == 2
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGINT", "SIGTERM"])
 @pytest.mark.parametrize("command", interrupted_runs.COMMANDS)
 def test_hundreds_of_interrupted_commands_leave_old_or_new_files(tmp_path, command, name):
-    left = outcomes(tmp_path, command, name, 100, 100)
-    assert sum(left.values()) == 200
+    left = outcomes(tmp_path, command, name, 25, 20)
+    assert sum(left.values()) == 45
     assert min(left["old"], left["new"]) > 0

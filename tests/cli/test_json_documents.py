@@ -29,6 +29,7 @@ COMMANDS = {
         {"output": "c.csv", "export": "c.trajectory.csv"},
         ["arm.dh.toml", "t.csv"],
     ),
+    "export": (["arm.dh.toml", "-o", "m.py"], {"output": "m.py"}, ["arm.dh.toml"]),
     "board": (["rig.toml", "-o", "b.pdf"], {"output": "b.pdf"}, ["rig.toml"]),
     "study": (["s.study.toml", "-o", "r.csv"], {"output": "r.csv"}, ["s.study.toml"]),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -58,14 +59,26 @@ def test_installed_command(robot_folder):
     assert "no.csv" in bad.stderr
 
 
-def test_interrupt_writes_nothing(run, robot_folder, monkeypatch):
+def interrupted_in_a_library():
+    """Do what NumPy does if it is interrupted while it compares structured arrays."""
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise TypeError("Cannot compare structured arrays") from None
+
+
+@pytest.mark.parametrize("is_library", [False, True])
+def test_interrupt_writes_nothing(run, robot_folder, monkeypatch, is_library):
     def interrupt(*_, **__):
+        if is_library:
+            interrupted_in_a_library()
         raise KeyboardInterrupt
 
     before = folder_contents(robot_folder)
     monkeypatch.setattr(model_selection, "extend", interrupt)
     assert run(*CALIBRATE, "--json", "-") == (130, "", "dhcal: interrupted; nothing written\n")
     assert folder_contents(robot_folder) == before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_lack_of_memory_is_one_line(assert_refused, monkeypatch):

@@ -29,7 +29,7 @@ def rig_folder(tmp_path, monkeypatch):
 
 
 def test_planned_poses_have_the_board_in_view(run):
-    options = ("-n", 12, "--candidates", 150, "--distance", "250:500mm", "--angle", "40deg")
+    options = ("-n", 12, "--candidates", 60, "--distance", "250:500mm", "--angle", "40deg")
     pages = ("--html", "scene.html", "--report", "report.html", "--json", "plan.json")
     status, _, err = run(*PLAN, *options, *pages)
     assert status == 0, err

@@ -16,6 +16,8 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 
 

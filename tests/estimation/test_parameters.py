@@ -16,6 +16,8 @@ from dhcal_pin.exceptions import DhcalError, InvalidArgumentError, UnknownNameEr
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def rank(chain: Chain, sets: str, kind: type = Pose, m: int = 60) -> int:
     """Return the number of observable directions with exact measurements at random configurations."""

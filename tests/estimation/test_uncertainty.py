@@ -26,6 +26,8 @@ from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot import Transmission
 from dhcal_pin.robot.chain import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 AWAY = se3.exp6(np.array([2.0, -1.0, 0.5, 0.3, -0.2, 2.0]))
 
 

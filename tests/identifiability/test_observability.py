@@ -11,6 +11,8 @@ from dhcal_pin.identifiability import observability
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 
 

@@ -21,6 +21,8 @@ from dhcal_pin.estimation.problem import linearize_and_factor
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.measurements.base import whitened_jacobian
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = 1e-4
 LEVEL = dh.Noise(1e-4, NOISE)
 SENSOR = se3.exp3([0.3, -0.2, 0.4])

@@ -17,6 +17,8 @@ from dhcal_pin.io import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements import Noise, Wires
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def wires(chain, m, seed=0):
     """Return lengths of a three-wire device, and its true anchors by name."""

@@ -26,6 +26,8 @@ from dhcal_pin.robot import Chain, joint_coverage
 from dhcal_pin.robot.coverage import BIN_CENTRES
 from dhcal_pin.robot.error_families import CURVE_ORDERS
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"
 

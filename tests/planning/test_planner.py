@@ -27,6 +27,8 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.sampling import ConfigurationSampler, WorkspaceConstraints, shortest_tour
 from dhcal_pin.robot.urdf import parse_urdf
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"
 ARMS = {

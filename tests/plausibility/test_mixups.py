@@ -137,6 +137,8 @@ POSE_MIXUPS = [
     (lambda d: with_positions(d, lambda p: p[:, [1, 0, 2]]), "axes:y,x,z"),
     (lambda d: with_positions(d, lambda p: p / 1e3), "lengths:m-not-mm"),
     (lambda d: with_positions(d, lambda p: p * 25.4), "lengths:mm-not-in"),
+    (lambda d: with_positions(d, lambda p: p / [1, 1, 1e3]), "z:m-not-mm"),
+    (lambda d: with_positions(d, lambda p: p * [1, 1e3, 1]), "y:mm-not-m"),
 ]
 
 
@@ -147,6 +149,13 @@ def test_mixed_up_poses_are_named_and_mended(ur10, mixup, key):
     found = diagnose_mixups(ur10, [wrong])
     assert key in [hypothesis.key for hypothesis in found.hypotheses]
     np.testing.assert_allclose(mend(ur10, wrong, key).poses, data.poses, atol=1e-9)
+
+
+def test_a_sign_and_the_unit_of_one_coordinate_are_named(ur10):
+    data = with_positions(measured(Position), lambda p: p / [1, 1, 1e3])
+    wrong = mend(ur10, data, "sign:elbow_joint")
+    (found,) = diagnose_mixups(ur10, [wrong]).hypotheses
+    assert found.key == "sign:elbow_joint+z:m-not-mm"
 
 
 @pytest.mark.parametrize("change", [lambda p: p[:, [1, 0, 2]], lambda p: p * [1, -1, 1]])

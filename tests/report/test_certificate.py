@@ -9,8 +9,9 @@ from html import escape, unescape
 from pathlib import Path
 
 import pytest
-from pages import AXE
+from pages import AXE, listen
 from robots import URDF
+from slow_cases import some_slow
 
 from dhcal_pin.cli.main import main
 from dhcal_pin.report import write_certificate
@@ -99,11 +100,11 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
     assert str(tmp_path) not in shown
 
 
-@pytest.mark.parametrize("width", [390, 1200])
+@pytest.mark.parametrize("width", some_slow([390, 1200], {0}))
 def test_it_is_accessible_and_prints_on_two_pages_at_most(browser, path, width):
     page = browser.new_page(viewport={"width": width, "height": 800}, bypass_csp=True)
     complaints = []
-    page.on("console", lambda message: complaints.append(message.text))
+    listen(page, complaints)
     page.goto(path.as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") == width
     page.evaluate(AXE)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pages import AXE, READY, wait_for
+from pages import AXE, READY, listen, wait_for
 from robots import URDF, with_small_errors
 from slow_cases import some_slow
 
@@ -170,7 +170,7 @@ def page_file(fit, tmp_path_factory) -> Path:
 def test_the_page_needs_no_network_and_its_scene_is_ready(browser, page_file):
     page = browser.new_page()
     messages, requests = [], []
-    page.on("console", lambda message: messages.append(message.text))
+    listen(page, messages)
     page.on("pageerror", lambda error: messages.append(str(error)))
     page.on("request", lambda request: requests.append(request.url))
     page.goto(page_file.as_uri())

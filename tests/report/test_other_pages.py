@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pages import listen
 from robots import URDF
 
 from dhcal_pin.cli.main import main
@@ -30,7 +31,7 @@ def check_in_browser(browser: Any, path: Path, headings: list[str], tool: np.nda
     """Compare the headings of a page, and select its first sample: its tool must be at `tool` [m]."""
     page = browser.new_page(viewport={"width": 1200, "height": 800})
     complaints, requests = [], []
-    page.on("console", lambda message: complaints.append(message.text))
+    listen(page, complaints)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("request", lambda request: requests.append(request.url))
     page.goto(path.as_uri())

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from pages import AXE, wait_for
+from pages import AXE, listen, wait_for
 from robots import robot_file
 from slow_cases import some_slow
 
@@ -56,7 +56,7 @@ def open_page(browser, path) -> Iterator[Callable[..., Any]]:
     def open_with(**options: Any) -> Any:
         page = browser.new_page(**({"viewport": {"width": 1200, "height": 800}} | options))
         pages.append(page)
-        page.on("console", lambda message: complaints.append(message.text))
+        listen(page, complaints)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", lambda request: requests.append(request.url))
         page.goto(path.as_uri())

@@ -21,6 +21,8 @@ from dhcal_pin.paper import crosscheck
 from dhcal_pin.paper.jacobian_check import kernel_jacobian, regressor_jacobian
 from dhcal_pin.robot import Chain, Conditions, extract_dh_table, read_urdf
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 ARMS = {
     "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
     "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),

@@ -88,9 +88,9 @@ def shares(arms, seeds, kind: type[Measurement], is_stated: bool) -> dict[str, f
     return {what: right[what] / count for what in CHANGES}
 
 
-@pytest.mark.parametrize("kind", [Position, Pose])
-def test_changes_are_named(kind):
-    found = shares(["ur10"], range(2), kind, True)
+@pytest.mark.parametrize(("kind", "is_stated"), [(Position, True), (Pose, True), (Pose, False)])
+def test_changes_are_named(kind, is_stated):
+    found = shares(["ur10"], range(2), kind, is_stated)
     assert sum(found.values()) >= 3.5, found
 
 

@@ -23,6 +23,7 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.linear_model import Layout, whitened_rows
+from dhcal_pin.session.timeline import _file_numbers
 
 DEGREE = np.deg2rad(1.0)
 KINDS = (Position, Pose)
@@ -287,6 +288,16 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
+def test_a_coordinate_in_another_unit_is_no_scale():
+    """No scale is stated that `--mend` would not undo; the unit is named as a mistake."""
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position)
+    data = data.replace(values=data.positions() * [1, 1, 1e-3])
+    fit = calibrate(simulation.chain, data, extend="none")
+    assert not session_of(fit).scales
+    assert any("--mend z:m-not-mm" in reason for reason in fit.verdict.reasons)
+
+
 def test_files_are_segments_even_without_an_order():
     simulation = Simulation("ur10", 100, 7)
     changes = Changes("tool", 5e-3)
@@ -376,3 +387,13 @@ def test_impossible_changes_are_refused(tmp_path, capsys, key):
     assert main(words) == 2
     assert key in capsys.readouterr().err
     assert not (tmp_path / "out.urdf").exists()
+
+
+def test_held_out_samples_without_a_file_belong_to_the_measurements_beside_them():
+    data = Simulation("ur10", 30, 1).measure(Position).replace(source="")
+    first, second, apart = (data.take(np.s_[a:b]) for a, b in ((0, 10), (10, 20), (20, 30)))
+    assert _file_numbers([first, second], [apart, apart]) == [0, 1, 0, 1]
+    # Rows that were fitted, too, and further measurements are those of other files.
+    assert _file_numbers([first, second], [first, apart, apart]) == [0, 1, 2, 1, 4]
+    named = data.replace(source="a.csv")
+    assert _file_numbers([named, first, named], [named, apart]) == [0, 1, 0, 0, 1]

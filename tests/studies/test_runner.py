@@ -113,8 +113,7 @@ poses = 16
 def test_planned_poses_have_the_predicted_error(tmp_path):
     """The same arms with poses at random and with those of `plan`, however the work is shared out."""
     one = table_of(tmp_path, "one", text=PLANNED)
-    assert one == table_of(tmp_path, "two", "--jobs", "2", text=PLANNED)
-    assert one == killed_and_resumed(tmp_path, PLANNED, 3)
+    assert one == killed_and_resumed(tmp_path, PLANNED, 3, "--jobs", "2")
     random, planned = (float(row["position_rms[m]"]) for row in csv.DictReader(one.splitlines()))
     arm = read_robot(URDF / "sim_6dof.dh.toml")
     options = {"kind": "position", "noise": Noise(1e-4, np.deg2rad(0.01)), "parameters": "minimal,base,tool"}

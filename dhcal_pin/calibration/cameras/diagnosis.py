@@ -63,6 +63,8 @@ MAX_NOISE_RATIO = 1.5
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
 # up to this ratio of their errors.
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
+# Rotation about a second axis that is none [rad].
+NO_ROTATION = 1e-4
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
 # explain images that are paired with wrong joint values.
 MAX_LINKS_ERROR = 0.05
@@ -162,11 +164,13 @@ class HandEyeDiagnosis:
         """What is wrong with the choice of the images, one finding each."""
         out = []
         if self.has_few_rotations:
+            turns = self.rotation > NO_ROTATION
+            angle = f"by {np.degrees(self.rotation):.2g}° (RMS)" if turns else "never"
+            size = f"by up to {1 / self.rotation:.2g} mm" if turns else "by metres"
             out.append(
-                f"Too few rotations: the tool turned by {np.degrees(self.rotation):.2g}° (RMS) about a "
-                "second axis. An error of the arm of 1 mm displaces the camera by up to "
-                f"{1 / self.rotation:.2g} mm, and the images do not show it. Add images that are turned by "
-                "30° or more about two axes that are not parallel."
+                f"Too few rotations: the tool turned {angle} about a second axis. An error of the arm of "
+                f"1 mm displaces the camera {size}, and the images do not show it. Add images that are "
+                "turned by 30° or more about two axes that are not parallel."
             )
         names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:

@@ -42,7 +42,7 @@ def find_image_session(
     """
     images = [item for item in data if isinstance(item, CameraCorners)]
     pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
-    if len(images) < len(data) or len(pairs) != 1 or not all(item.has_joint_values for item in images):
+    if len(images) < len(data) or len(pairs) != 1:
         return None
     try:
         poses = [item.image_poses() for item in images]

@@ -40,6 +40,8 @@ MIN_STD = 1e-7
 _N_ITERATIONS, _RTOL = 200, 1e-3
 # Smallest noise of a detected corner, relative to the placeholder of 1 px.
 MIN_NOISE = 0.1
+# Largest whitened residual: boards behind a camera have image coordinates without limit.
+MAX_RESIDUAL = 1e5
 # Logarithm of the ratio of the likelihoods from which images show a displacement.
 MIN_LOG_LIKELIHOOD_RATIO = 5.5
 
@@ -87,7 +89,11 @@ def estimate_jitter(
         is_stated = is_stated and item.has_stated_sigma
         for number in range(label.max() + 1):
             samples = label == number
-            images.append((residual.T[samples].ravel(), derivative[samples].reshape(-1, derivative.shape[2])))
+            if np.abs(residual[:, samples]).max() < MAX_RESIDUAL:
+                of_image = derivative[samples].reshape(-1, derivative.shape[2])
+                images.append((residual.T[samples].ravel(), of_image))
+    if not images:
+        return Jitter(1.0, *FIRST_STD)
     noise = 1.0 if is_stated else _scatter(images)
     scaled = [(r / noise, a / noise) for r, a in images]
     jitter = _maximize_likelihood(scaled, noise, n_determined)

@@ -20,7 +20,7 @@ import numpy as np
 from ..._typing import Progress
 from ...estimation.priors import PriorGroups
 from ...estimation.robust import KEPT
-from ...exceptions import InvalidArgumentError, NotObservableError
+from ...exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
@@ -117,6 +117,11 @@ def calibrate_images(
     families: Sequence[str],
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
+    if not (fit.solution.converged or fit.solution.iterations):
+        raise ConvergenceError(
+            "images: no step from the first values brings the model nearer to the corners; check the poses "
+            "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards"
+        )
     has_arm = fit.problem.errors.has_arm
     fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
     points = judge_target_points(fit, fitting.max_iterations)

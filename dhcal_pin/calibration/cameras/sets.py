@@ -77,7 +77,7 @@ def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> N
             f"expected {HAND_EYE_SETS}, or joint values"
         )
     others = sorted({item.kind for item in data if item.rig is None})
-    if others:
+    if others and has_images(data):
         raise InvalidArgumentError(
             f"measurements of kind {others[0]} beside images with poses of the tip: they need joint values; "
             "expected images alone, or joint values"

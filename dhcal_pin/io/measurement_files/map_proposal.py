@@ -104,10 +104,11 @@ def _is_axis(header: str, axis: str) -> bool:
     return bool(re.search(rf"(?<![a-z]){axis}(?![a-z])", header)) and not re.search(_NOT_MEASURED, header)
 
 
-# Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes.
+# Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes, W, P, R of FANUC.
 _EULER_NOTATIONS: Mapping[tuple[str, ...], tuple[str, str]] = {
     ("a", "b", "c"): ("ZYX", "intrinsic"),
     ("roll", "pitch", "yaw"): ("XYZ", "extrinsic"),
+    ("w", "p", "r"): ("XYZ", "extrinsic"),
 }
 
 
