@@ -20,11 +20,12 @@ from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.measurements.mounting import MountedRig, mount_rig
 from dhcal_pin.plausibility.signs import with_wide_limits
+from dhcal_pin.robot import Conditions
 from dhcal_pin.se3 import inverse, transform
 
 WIDTH, HEIGHT = 1280, 720
-# Compliance of each joint [rad/(N·m)]: the stretched arm sags by some millimetres.
-COMPLIANCE = 0.012
+# Play [deg] and compliance [rad/(N·m)] of each joint: the stretched arm sags by some millimetres.
+PLAY, COMPLIANCE = 0.5, 0.012
 # Corners of the board on the table and of that on the gripper: columns, rows and size of a square [m].
 ON_TABLE, ON_GRIPPER = (10, 7, 0.025), (7, 5, 0.012)
 
@@ -39,26 +40,39 @@ class PaperArm:
     held_out: tuple[
         np.ndarray, np.ndarray
     ]  # Joint values as read (k, 5), true poses of the board in the camera
+    # Directions of approach of the photographs (m, 5) and of the held-out poses (k, 5).
+    approach: tuple[np.ndarray, np.ndarray]
 
-    def held_out_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
+    def with_approach(self) -> PaperArm:
+        """Return the same photographs with stated directions of approach."""
+        return replace(self, images=self.images.with_conditions(approach=self.approach[0]))
+
+    def held_out_errors(
+        self, chain: Chain, instruments: dict[str, float], *, is_approach_known: bool = False
+    ) -> np.ndarray:
         """Return the distances of the middle of the board in the camera from the truth, (k,) [m]."""
-        found, truth = self._middles(chain, instruments)
+        found, truth = self._middles(chain, instruments, is_approach_known)
         return np.linalg.norm(found - truth, axis=1)
 
-    def tool_errors(self, chain: Chain, instruments: dict[str, float]) -> np.ndarray:
+    def tool_errors(
+        self, chain: Chain, instruments: dict[str, float], *, is_approach_known: bool = False
+    ) -> np.ndarray:
         """Return these distances (k,) [m] for the camera at its best pose: they are errors of the arm alone.
 
         The image centre of a lens that is not known can be exchanged for a rotation of the camera.
         """
-        found, truth = (each - each.mean(0) for each in self._middles(chain, instruments))
+        found, truth = (each - each.mean(0) for each in self._middles(chain, instruments, is_approach_known))
         u, _, v = np.linalg.svd(truth.T @ found)
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
         return np.linalg.norm(found @ rotation.T - truth, axis=1)
 
-    def _middles(self, chain: Chain, instruments: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    def _middles(
+        self, chain: Chain, instruments: dict[str, float], is_approach_known: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the computed and the true middle of the board in the camera, (k, 3) each [m]."""
         q, truth = self.held_out
-        rig, tools = self.images.rig, chain.poses(q)
+        conditions = Conditions(q, approach=self.approach[1]) if is_approach_known else q
+        rig, tools = self.images.rig, chain.poses(conditions)
         camera, board = (_pose(instruments, name) for name in ("camera_cam", "board_paper"))
         if rig.camera_mounts[0].moves:
             found = inverse(tools @ camera) @ board
@@ -80,21 +94,33 @@ def nominal_arm() -> Chain:
 
 
 def photograph(
-    seed: int, n_images: int = 25, *, is_on_wrist: bool | None = None, wrong: int | None = None
+    seed: int,
+    n_images: int = 25,
+    *,
+    is_on_wrist: bool | None = None,
+    wrong: int | None = None,
+    play: float = PLAY,
+    compliance: float = COMPLIANCE,
 ) -> PaperArm:
     """Simulate the photographs of an arm; a seed gives another arm, camera and board."""
     rng = np.random.default_rng(seed)
-    scene = _Scene.random(rng, is_on_wrist, wrong)
+    scene = replace(_Scene.random(rng, is_on_wrist, wrong), play=play, compliance=compliance)
     q = scene.arm.configurations(rng, 4000, 0.8)
-    play = rng.choice([-1.0, 1.0], q.shape)
+    sides = rng.choice([-1.0, 1.0], q.shape)
     scene = scene.placed(rng)
-    shown = scene.show(q, play)
+    shown = scene.show(q, sides)
     good = shown.good()
     if len(good) < 2 * n_images:
-        return photograph(seed + 10_000, n_images, is_on_wrist=scene.camera.link == "tip", wrong=wrong)
-    others = good[n_images:]
-    images = scene.detect(shown, good[:n_images], rng)
-    return PaperArm(scene.arm, nominal_arm(), images, (shown.read[others], shown.local[others]))
+        return photograph(
+            seed + 10_000,
+            n_images,
+            is_on_wrist=scene.camera.link == "tip",
+            wrong=wrong,
+            play=play,
+            compliance=compliance,
+        )
+    images, approach = scene.detect(shown, good[:n_images], rng)
+    return shown.paper_arm(scene.arm, images, approach, good[n_images:])
 
 
 def photograph_plan(
@@ -118,7 +144,8 @@ def photograph_plan(
     q = choose(nominal, mount_rig(rig, nominal))
     q = q + rng.normal(0, np.deg2rad(3), q.shape)
     shown = scene.show(q, rng.choice([-1.0, 1.0], q.shape))
-    return PaperArm(scene.arm, nominal, scene.detect(shown, shown.good(8), rng), (shown.read, shown.local))
+    images, approach = scene.detect(shown, shown.good(8), rng)
+    return shown.paper_arm(scene.arm, images, approach, np.arange(len(q)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +156,18 @@ class _Shown:
     local: np.ndarray  # Poses in the camera, (m, 4, 4)
     pixels: np.ndarray  # Corners in the image, (m, c, 2)
     is_seen: np.ndarray  # Which corners are found, (m, c)
+    approach: np.ndarray  # Directions in which the joints moved last, as read, (m, 5)
 
     def good(self, n_corners: int = 12) -> np.ndarray:
         """Numbers of the configurations with enough corners."""
         return np.flatnonzero(self.is_seen.sum(1) >= n_corners)
+
+    def paper_arm(
+        self, arm: ServoArm, images: CameraCorners, approach: np.ndarray, others: np.ndarray
+    ) -> PaperArm:
+        """Return photographs with other configurations to judge a calibration by."""
+        held_out = self.read[others], self.local[others]
+        return PaperArm(arm, nominal_arm(), images, held_out, (approach, self.approach[others]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +180,8 @@ class _Scene:
     lens: np.ndarray
     camera_pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     board_pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    play: float = PLAY
+    compliance: float = COMPLIANCE
 
     @classmethod
     def random(cls, rng: np.random.Generator, is_on_wrist: bool | None, wrong: int | None) -> _Scene:
@@ -175,9 +212,10 @@ class _Scene:
         half_turn = transform(pin.exp3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
         return replace(self, board_pose=self.board_pose @ middle @ half_turn @ inverse(middle))
 
-    def show(self, q: np.ndarray, play: np.ndarray) -> _Shown:
+    def show(self, q: np.ndarray, sides: np.ndarray) -> _Shown:
         """Photograph the board at true joint values (m, 5), on side 1 or -1 of the play of each joint."""
-        tools = self.arm.poses(_sagged(self.arm.model, q + np.deg2rad(0.5) / 2 * play))
+        bent = _sagged(self.arm.model, q + np.deg2rad(self.play) / 2 * sides, self.compliance)
+        tools = self.arm.poses(bent)
         if self.camera.link == "tip":
             local = inverse(tools @ self.camera_pose) @ self.board_pose
         else:
@@ -193,17 +231,21 @@ class _Scene:
         is_seen &= (np.abs(facing) > 0.5)[:, None]
         middles = np.array([sum(RANGES[name]) / 2 for name in JOINTS])
         read = np.deg2rad(360.0 * (self.arm.counts(q) - middles) / 4095.0)
-        return _Shown(read, local, pixels, is_seen)
+        # A joint lags behind its motion.
+        return _Shown(read, local, pixels, is_seen, -self.arm.signs * sides)
 
-    def detect(self, shown: _Shown, chosen: np.ndarray, rng: np.random.Generator) -> CameraCorners:
-        """Return the corners of some images with noise."""
+    def detect(
+        self, shown: _Shown, chosen: np.ndarray, rng: np.random.Generator
+    ) -> tuple[CameraCorners, np.ndarray]:
+        """Return the corners of some images with noise, and their directions of approach."""
         image, corner = np.nonzero(shown.is_seen[chosen])
         values = shown.pixels[chosen][image, corner] + rng.normal(0, 0.3, (len(image), 2))
         rig = mount_rig(Rig({"cam": self.camera}, {"paper": self.board}), nominal_arm())
-        return CameraCorners(shown.read[chosen][image], values, corner, rig)
+        images = CameraCorners(shown.read[chosen][image], values, corner, rig)
+        return images, shown.approach[chosen][image]
 
 
-def _sagged(model: pin.Model, q: np.ndarray) -> np.ndarray:
+def _sagged(model: pin.Model, q: np.ndarray, compliance: float) -> np.ndarray:
     """Return joint values (m, 5) with the deflection by gravity."""
     indices = [model.joints[model.getJointId(name)] for name in JOINTS]
     data, out = model.createData(), q.copy()
@@ -211,7 +253,7 @@ def _sagged(model: pin.Model, q: np.ndarray) -> np.ndarray:
         values = pin.neutral(model)
         values[[j.idx_q for j in indices]] = row
         torque = pin.computeGeneralizedGravity(model, data, values)
-        bent -= COMPLIANCE * torque[[j.idx_v for j in indices]]
+        bent -= compliance * torque[[j.idx_v for j in indices]]
     return out
 
 

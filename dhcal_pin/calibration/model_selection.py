@@ -59,7 +59,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -68,11 +68,18 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
-from ..estimation.folds import FoldSystems, count_rows, factor_partition, solve_columns
+from ..estimation.folds import (
+    Fold,
+    NoiseClass,
+    NoisyFold,
+    NoisyRows,
+    count_rows,
+    factor_partition,
+    solve_columns,
+)
 from ..estimation.parameters import EXTENSIONS, LOW_COST, PARAMETER_SETS
 from ..estimation.priors import PriorGroups, effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
-from ..estimation.qr import TriangularSystem
 from ..estimation.solver import minimize
 from ..estimation.uncertainty import FamilyGain
 from ..exceptions import UnknownNameError
@@ -124,6 +131,9 @@ MIN_ROWS_PER_PARAMETER = 5
 MAX_HINT_SAMPLES = 500
 # Negative logarithm of the largest p-value for which a hint is given: one in a million.
 HINT_LOG_P = 14
+
+# Function that factors the rows of a problem at x, all of them and random folds.
+FactorFolds = Callable[[Problem, Array, Sequence[Fold]], tuple[NoisyRows, tuple[NoisyFold, ...]]]
 
 # All parameters that positions and poses can determine, wherever instrument and target are.
 FULL_SET = "minimal,base,tool"
@@ -249,7 +259,7 @@ def _percent(ratio: float) -> str:
 
 
 @dataclass(frozen=True)
-class _Model:
+class Model:
     """Selected families, with the hyperparameters of greatest evidence.
 
     Attributes:
@@ -273,48 +283,45 @@ class _Candidates:
         problem: Problem with the parameters and the expected priors of all families.
         x: Point of the linearization, (p,).
         family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
-        system: Triangular system of all data.
-        folds: Triangular systems of random folds of whole configurations; empty if nothing is selected.
+        rows: Rows of all data.
+        folds: Rows of random folds of whole configurations; empty if nothing is selected.
     """
 
     problem: Problem
     x: Array
     family: Array
-    system: TriangularSystem
-    folds: tuple[FoldSystems, ...] = ()
+    rows: NoisyRows
+    folds: tuple[NoisyFold, ...] = ()
 
     @classmethod
-    def with_folds(cls, problem: Problem, x: Array, family: Array) -> _Candidates:
+    def with_folds(cls, problem: Problem, x: Array, family: Array, factor: FactorFolds) -> _Candidates:
         """Factor the data in random folds."""
-        folds = factor_partition(problem, x, k_fold(problem.data, N_FOLDS))
-        system = folds[0].fitted.merged(folds[0].held_out)
-        return cls(problem, x, family, system, folds)
+        return cls(problem, x, family, *factor(problem, x, k_fold(problem.data, N_FOLDS)))
 
     def weights(self, widths: Mapping[str, float]) -> Array:
         """Return the weights of the priors (p,) for prior widths as fractions of the expected ones."""
-        return _prior_weights(self.problem, self.family, widths)
+        return prior_weights(self.problem, self.family, widths)
 
     def columns(self, widths: Mapping[str, float]) -> Array:
         """Return the mask of the unknowns (p,) of the fit and of some families."""
         return (self.family == "") | np.isin(self.family, list(widths))
 
-    def maximize_evidence(self, widths: Mapping[str, float]) -> _Model:
+    def maximize_evidence(self, widths: Mapping[str, float]) -> Model:
         """Find the prior widths of some families, and the noise, of greatest evidence."""
         columns = self.columns(widths)
-        reduced, n_rows = self.system.select(columns), count_rows(self.problem)
+        reduced = self.rows.select(columns)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
-        noise = float(np.sqrt(self.system.cost / n_rows))
+        # Displacements of images that are smaller than the noise of their corners may leave nothing.
+        noise = reduced.noise_after(1.0, np.zeros(len(x)), np.zeros((len(x), len(x)))) or MIN_NOISE_RATIO
         smallest = MIN_NOISE_RATIO * noise
         rounds = 0
         while True:
             weights = self.weights(widths)[columns]
-            rows = reduced.scaled(1 / noise)
+            rows = reduced.at(noise)
             root = rows.sqrt_covariance(weights)[0]
             determined = 1 - np.einsum("ij,ij->i", root, root) * weights**2
             step, _ = rows.solve(weights, x)
-            misfit = rows.squared_error(step)
-            updated_noise = noise * float(np.sqrt(misfit / max(n_rows - np.sum(determined), 1.0)))
-            updated_noise = max(updated_noise, smallest)
+            updated_noise = max(reduced.noise_after(noise, step, root), smallest)
             updated = {name: _best_width(x + step, determined, expected, family == name) for name in widths}
             changes = [np.log(updated_noise / noise)] + [np.log(updated[k] / widths[k]) for k in widths]
             rounds += 1
@@ -323,18 +330,18 @@ class _Candidates:
             widths, noise = updated, updated_noise
         posterior = rows.with_priors(weights, x)
         log_det = np.sum(np.log(np.abs(np.diag(posterior.r)))) - np.sum(np.log(weights[weights > 0]))
-        log_evidence = -0.5 * posterior.min_cost - float(log_det) - n_rows * np.log(noise)
+        log_evidence = -0.5 * posterior.min_cost - float(log_det) - reduced.log_det(noise)
         names = np.array(_unknown_names(self.problem))[columns]
         values = dict(zip(names.tolist(), (x + step).tolist(), strict=True))
-        return _Model(widths, noise, log_evidence, values)
+        return Model(widths, noise, log_evidence, values)
 
-    def cv_error(self, model: _Model) -> float:
+    def cv_error(self, model: Model) -> float:
         """Compute the RMS error of the random folds with the families of a model."""
-        weights, columns = self.weights(model.widths) * model.noise, self.columns(model.widths)
-        squares = [fold.n_rows * fold.error(weights, self.x, columns) ** 2 for fold in self.folds]
+        weights, columns = self.weights(model.widths), self.columns(model.widths)
+        squares = [fold.squared_error(model.noise, weights, self.x, columns) for fold in self.folds]
         return float(np.sqrt(sum(squares) / sum(fold.n_rows for fold in self.folds)))
 
-    def trial(self, name: str, current: _Model) -> FamilyTrial:
+    def trial(self, name: str, current: Model) -> FamilyTrial:
         """Try a family on top of those of a model."""
         model = self.maximize_evidence({**current.widths, name: 1.0})
         gain = model.log_evidence - current.log_evidence
@@ -344,12 +351,24 @@ class _Candidates:
         return FamilyTrial(name, before, after, gain, model.widths[name])
 
 
+def _factor_folds(
+    problem: Problem, x: Array, folds: Sequence[Fold]
+) -> tuple[NoisyRows, tuple[NoisyFold, ...]]:
+    """Factor rows of unknown noise."""
+    systems, n_rows = factor_partition(problem, x, folds), count_rows(problem)
+    whole = systems[0].fitted.merged(systems[0].held_out)
+    return NoisyRows((NoiseClass(whole, n_rows),)), tuple(
+        NoisyFold(NoisyRows((NoiseClass(one.fitted, n_rows - one.n_rows),)), one.held_out, one.n_rows)
+        for one in systems
+    )
+
+
 def _unknown_names(problem: Problem) -> list[str]:
     """Return the names of the unknowns of a problem, robot and instruments."""
     return [one.name for one in (*problem.errors.parameters, *problem.instrument_parameters)]
 
 
-def _prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
+def prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
     """Return the weights of the priors (p,) of a problem with the expected widths for other widths."""
     return problem.weights / np.array([widths.get(name, 1.0) for name in family])
 
@@ -401,7 +420,7 @@ def _with_families(
     return replace(problem, errors=errors, weights=weights, bounds=bounds), x, family
 
 
-def _select(candidates: _Candidates, names: Sequence[str], model: _Model) -> tuple[list[FamilyTrial], _Model]:
+def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tuple[list[FamilyTrial], Model]:
     """Select families one after the other."""
     remaining, chosen = list(names), list[FamilyTrial]()
     while True:
@@ -568,13 +587,11 @@ def extend(
         )
     judged = fit.without_rejected()
     n_configurations = len(np.unique(configuration_groups(judged.data)))
-    missing = _missing_parameters(fit.problem, families)
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or _ignore
     report(PHASE, 1, _N_STEPS)
-    trials, model, random_ratio = _select_families(judged, missing)
-    selected = {name: missing[name] for name in model.widths}
+    trials, model, random_ratio, selected = select_families(judged, families)
     report(PHASE, 2, _N_STEPS)
     extended, noise = fit, _noise(judged)
     if selected:
@@ -614,18 +631,24 @@ def _ignore(phase: str, step: int, total: int) -> None:
     """Receive the progress if nobody else does."""
 
 
+def with_selected(
+    fit: Fit, selected: dict[str, list[ErrorParameter]], model: Model
+) -> tuple[Problem, Array, Array]:
+    """Add selected families to the problem of a fit; return it with x and the family of each unknown."""
+    problem, _, family = _with_families(fit.problem, fit.solution.x, selected)
+    x = np.array([model.values[name] for name in _unknown_names(problem)])
+    return problem, x if problem.bounds is None else np.clip(x, *problem.bounds), family
+
+
 def _fit_selected(
     fit: Fit,
     selected: dict[str, list[ErrorParameter]],
-    model: _Model,
+    model: Model,
     max_iterations: int,
 ) -> tuple[Fit, float]:
     """Fit the geometry and selected families at temperature 1."""
-    problem, _, family = _with_families(fit.problem, fit.solution.x, selected)
-    x = np.array([model.values[name] for name in _unknown_names(problem)])
-    if problem.bounds is not None:
-        x = np.clip(x, *problem.bounds)
-    selected_problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
+    problem, x, family = with_selected(fit, selected, model)
+    selected_problem = problem.with_prior_weights(prior_weights(problem, family, model.widths))
     solution = minimize(selected_problem, "lm", x, max_iterations, loose=True)
     trimmed = outlier_weights(problem, solution.x, fit.weights)
     if any((w < 1).any() for w in trimmed):
@@ -638,8 +661,9 @@ def _fit_selected(
     fitted = Fit(fit.data, problem, solution, weights, fit.iterations, fit.stage)
     # `_Candidates` divides the expected weights of its problem by the widths.
     judged = fitted.without_rejected().problem
-    model = _Candidates(judged, solution.x, family, solution.system).maximize_evidence(model.widths)
-    problem = problem.with_prior_weights(_prior_weights(problem, family, model.widths))
+    rows = NoisyRows((NoiseClass(solution.system, count_rows(judged)),))
+    model = _Candidates(judged, solution.x, family, rows).maximize_evidence(model.widths)
+    problem = problem.with_prior_weights(prior_weights(problem, family, model.widths))
     return replace(fitted, problem=problem), model.noise
 
 
@@ -689,12 +713,17 @@ def families_by_stage(names: Iterable[str]) -> list[tuple[str, ...]]:
     return [tuple(family.name for family in known if family.rule.stage == stage) for stage in stages]
 
 
-def _select_families(
-    fit: Fit, missing: dict[str, list[ErrorParameter]]
-) -> tuple[tuple[FamilyTrial, ...], _Model, float]:
-    """Select families of joint errors."""
+def select_families(
+    fit: Fit, names: Sequence[str], factor: FactorFolds = _factor_folds
+) -> tuple[tuple[FamilyTrial, ...], Model, float, dict[str, list[ErrorParameter]]]:
+    """Select families of joint errors among those of some names.
+
+    The function that factors the rows says what is known of their noise. The error of random folds with the
+    selected families relative to that of the geometry follows, and the parameters of these families.
+    """
+    missing = _missing_parameters(fit.problem, names)
     trials: list[FamilyTrial] = []
-    model, random_ratio = _Model({}, _noise(fit), float("nan"), {}), float("nan")
+    model, random_ratio = Model({}, _noise(fit), float("nan"), {}), float("nan")
     problem, x = fit.problem, fit.solution.x
     low_order = tuple(name for name in missing if not FAMILIES[name].is_curve)
     stages = [(low_order, families_by_stage(low_order))] if low_order else []
@@ -708,7 +737,7 @@ def _select_families(
         families = {
             name: ps for name, ps in missing.items() if name in (*model.widths, *added, *physical_families)
         }
-        candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families))
+        candidates = _Candidates.with_folds(*_with_families(fit.problem, fit.solution.x, families), factor)
         # From the expected widths: the iteration does not leave a width near zero, which may have been the
         # best one without the families that were added since.
         model = candidates.maximize_evidence(dict.fromkeys(model.widths, 1.0))
@@ -731,7 +760,8 @@ def _select_families(
             break
         problem = replace(candidates.problem, weights=candidates.weights(model.widths) * model.noise)
         x = np.array([model.values.get(name, 0.0) for name in _unknown_names(problem)])
-    return tuple(sorted(trials, key=lambda trial: not trial.is_selected)), model, random_ratio
+    ordered = tuple(sorted(trials, key=lambda trial: not trial.is_selected))
+    return ordered, model, random_ratio, {name: missing[name] for name in model.widths}
 
 
 def _are_residuals_correlated(fit: Fit, noise: float) -> bool:

@@ -45,6 +45,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
@@ -63,7 +64,7 @@ from .cameras import (
     with_stated_distortion,
 )
 from .cameras.image_session import find_image_session
-from .cameras.procedure import ImageFitting, calibrate_images, require_no_selection, with_common_start
+from .cameras.procedure import ImageFitting, calibrate_images, require_shown_families, with_common_start
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
@@ -129,8 +130,8 @@ def calibrate(
             Method "gn" always weights all samples equally.
         extend: Families of joint errors that are added where the measurements support them: "auto" for all,
             "none", or names of `estimation.EXTENSIONS`; see `model_selection`. The default is "auto", but
-            "none" for method "gn", without priors, where only base and tool are unknown, and for image
-            coordinates, whose families are named among the parameters.
+            "none" for method "gn", without priors, and where only base and tool are unknown. Image
+            coordinates show backlash and elasticity; other families are named among the parameters.
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
@@ -178,6 +179,8 @@ def calibrate(
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     chain = _at_measured_temperature(chain, data)
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    if LOW_COST in robot_sets:
+        chain = replace(chain, parameters=HAND_BUILT)
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     signs = None
     if turned != "auto":
@@ -212,7 +215,7 @@ def calibrate(
     families = _extension_families(extend, errors, method, priors)
     _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
-        require_no_selection(extend, families)
+        require_shown_families(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
     first = first_errors(chain, data) if LOW_COST in robot_sets else {}
     start = partial(
@@ -247,7 +250,7 @@ def calibrate(
     groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress, arm_type(robot_sets))
-        images = calibrate_images(fitting, fit, chain, holdout, exchanges)
+        images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)
         return replace(images, signs=signs, with_auto=with_auto, session=of_images)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):

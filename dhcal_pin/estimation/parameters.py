@@ -227,6 +227,7 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
     if term := family.joint_term or family.link_term:
         has_effect = term.has_effect(chain.loads)
         coefficients = [c for c in coefficients if has_effect[c.owner]]
+    prior = (LOW_COST in chain.parameters and family.low_cost_prior) or family.prior
     nominal = [0.0] * len(coefficients)
     if chain.transmission is not None:
         nominal = chain.transmission.coefficients[[c.entry for c in coefficients]].tolist()
@@ -247,7 +248,7 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
             value,
             frames[c.owner],
             twists[c.owner],
-            family.prior,
+            prior,
             c.entry,
             scale,
         )

@@ -21,7 +21,7 @@ covariance is I + A·Aᵀ, and residuals and Jacobians are multiplied by its inv
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -311,6 +311,11 @@ class CameraCorners(Measurement):
         )
         return replace(self.rig, cameras=cameras, boards=boards)
 
+    @property
+    def has_jitter(self) -> bool:
+        """Whether the corners of an image share a displacement."""
+        return bool(self.jitter.any())
+
     def with_jitter(self, jitter: Array) -> Self:
         """Return a copy with another jitter, shape (m, 2, 6) [px]."""
         return self.replace(jitter=jitter)
@@ -465,7 +470,7 @@ class CameraCorners(Measurement):
         Samples (g, c), basis U (g, 2c, 6) and factors 1 - 1/√(1 + s²) (g, 6) of the g images with c corners.
         """
         out: list[tuple[Array, Array, Array]] = []
-        if not self.jitter.any():
+        if not self.has_jitter:
             return out
         whitened = self.jitter.transpose(1, 0, 2) * self._weights[:, :, None]
         group = label_stops(self)
@@ -487,6 +492,22 @@ class CameraCorners(Measurement):
             explained = basis @ (factors[..., None] * (basis.swapaxes(-1, -2) @ flat))
             rows[..., samples] -= explained.reshape(part.shape).swapaxes(-3, -2)
         return rows
+
+    def take_displacements(self, rows: Array) -> Iterator[tuple[Array, Array]]:
+        """Take the components along the jitter out of whitened rows.
+
+        Args:
+            rows: Whitened rows of c columns, (c, 2, m), from which the components are subtracted.
+
+        Yields:
+            For the g images of each number of corners, their components (c, 6·g), and the standard deviations
+            by the jitter that these had before they were whitened, relative to those of the corners, (6·g,).
+        """
+        for samples, basis, factors in self._jitter_bases:
+            part = rows[..., samples].swapaxes(-3, -2)
+            components = basis.swapaxes(-1, -2) @ part.reshape(*part.shape[:-2], -1)[..., None]
+            rows[..., samples] -= (basis @ components).reshape(part.shape).swapaxes(-3, -2)
+            yield components.reshape(len(rows), -1), np.sqrt(1 / (1 - factors) ** 2 - 1).ravel()
 
     def residual(self, frames: FrameBatch, u: Array) -> Array:
         """Return the whitened residuals (2, m)."""

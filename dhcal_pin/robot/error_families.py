@@ -164,6 +164,7 @@ class ErrorFamily:
         joint_term: Term of each joint; None for other families.
         link_term: Term of the links; None for other families.
         condition: Condition that must be known of the samples, one of `CONDITIONS`; empty for q alone.
+        low_cost_prior: Prior of a low-cost arm; None if it is the same.
     """
 
     name: str
@@ -177,6 +178,7 @@ class ErrorFamily:
     joint_term: Term | None = None
     link_term: Term | None = None
     condition: str = ""
+    low_cost_prior: float | None = None
 
     @property
     def is_curve(self) -> bool:
@@ -274,7 +276,8 @@ _OF_A_CONDITION = SelectionRule(0, 0.02)
 
 # The priors are typical of industrial arms: gear ratios are off by 0.2 %; eccentricity is about 1 mrad, and a
 # higher harmonic about 0.1 mrad; a joint yields by about 0.1 mrad/Nm; backlash reaches a few mrad; aluminium
-# grows by 23e-6 per kelvin, steel by 12e-6.
+# grows by 23e-6 per kelvin, steel by 12e-6. Servos of low-cost arms have a play of half a degree, and their
+# plastic links and controllers yield by a degree under the weight of a stretched arm, about 1 Nm.
 FAMILIES = {
     family.name: family
     for family in (
@@ -316,6 +319,7 @@ FAMILIES = {
             joint_term=Term(
                 "compliance", "rad/Nm", "torque[{i}]", _torques, _is_loaded, "torque_by_q[{i}][{j}]"
             ),
+            low_cost_prior=1e-2,
         ),
         ErrorFamily(
             COUPLING,
@@ -335,6 +339,7 @@ FAMILIES = {
             "backlash_rad",
             joint_term=Term("backlash", "rad", "-0.5 * approach[{i}]", _half_direction, _all_joints),
             condition="approach",
+            low_cost_prior=np.deg2rad(0.5),
         ),
         ErrorFamily(
             THERMAL,

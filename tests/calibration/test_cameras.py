@@ -422,12 +422,10 @@ def test_a_long_series_of_images_shows_periodic_errors_and_compliance():
     assert not links.camera_stages[-1].is_kept
 
 
-def test_families_are_not_selected_from_images(arm):
+def test_families_that_images_imitate_are_not_selected_from_them(arm):
     data = images_of(arm, 10, np.random.default_rng(0))
-    with pytest.raises(
-        DhcalError, match=r"extend 'compliance': families .* placement,offset,compliance,camera"
-    ):
-        dh.calibrate(arm, data, "placement,camera", extend="compliance")
+    with pytest.raises(DhcalError, match=r"extend 'harmonics': only .* placement,offset,harmonics,camera"):
+        dh.calibrate(arm, data, "placement,camera", extend="harmonics")
 
 
 def test_clusters_hold_out_every_image_once(arm):

@@ -62,6 +62,25 @@ def test_corners_of_photographs_with_joint_values(run, photographs):
         assert 0 <= int(row["corner"]) < 24
 
 
+@pytest.mark.parametrize(
+    ("comment", "column"), [("# rows: in order\n", "approach_joint_1"), ("", "time[s]"), ("", "payload[kg]")]
+)
+def test_order_and_conditions_of_photographs_are_kept(run, photographs, comment, column):
+    """Photographs that were taken in another order than that of their names."""
+    images = sorted(photographs.iterdir())[:6:2]
+    taken = [images[1], images[2], images[0]]
+    rows = [f"{image.name},{10 * i},{i - 1 if 'approach' in column else i}" for i, image in enumerate(taken)]
+    Path("joints.csv").write_text("\n".join([f"{comment}image,joint_1[deg],{column}", *rows]))
+    stdout_of(run("detect", *images, "--rig", "rig.toml", "--joints", "joints.csv", "-o", "corners.csv"))
+    rows = rows_of("corners.csv")
+    is_ordered = column != "payload[kg]"
+    assert ("# rows: in order" in Path("corners.csv").read_text().splitlines()) == is_ordered
+    order = list(dict.fromkeys(row["image"] for row in rows))
+    assert order == [image.name for image in (taken if is_ordered else images)]
+    values = dict.fromkeys((float(row["joint_1[deg]"]), float(row[column])) for row in rows)
+    assert set(values) == {(10 * i, i - 1 if "approach" in column else i) for i in range(3)}
+
+
 def test_exchanged_rows_and_columns_are_named(run, photographs):
     images = sorted(photographs.iterdir())[::3]
     stdout_of(run("detect", *images, "--rig", "rig.toml", "-o", "right.csv"))

@@ -188,6 +188,14 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at))
 
 
+def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
+    """Estimate the displacement of images anew, fit with it, and return the temperature of the fit."""
+    fit, jitter = fit_with_jitter(fit, max_iterations)
+    n_configurations = gate.n_configurations if jitter.is_significant else 0
+    opened_at = temperature(n_configurations, OPEN_SAMPLES)
+    return _solve(fit, fit.problem, opened_at, max_iterations), opened_at
+
+
 def _best(fits: Sequence[Fit], folds: Sequence[Fold]) -> Fit:
     """Return the fit that predicts left-out clusters best, the last one without clusters."""
     errors = [held_out_error(fit, folds) for fit in fits]

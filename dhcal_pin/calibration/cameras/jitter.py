@@ -3,11 +3,14 @@
 The scatter of the corners within an image, after the displacement of the tool that explains the image best,
 shows the noise of the corners. What the images still differ by is an error of the arm in each configuration.
 It is modelled as a random displacement [v, ω] of the tool, v ~ N(0, a²) and ω ~ N(0, b²) in each axis; see
-`measurements.camera`. Its standard deviations a and b follow by expectation and maximization (Dempster, Laird
-and Rubin 1977). With the whitened derivative A_i of image i by a displacement, its whitened residuals r_i and
-D = diag(a², a², a², b², b², b²):
+`measurements.camera`. The play of a low-cost arm displaces the tool by its n revolute joints, too, with the
+motions J of the tool and c² the variance of each joint: d = [v, ω] + J·δ, δ ~ N(0, c²). The standard
+deviations a, b and c follow by expectation and maximization (Dempster, Laird and Rubin 1977). With the
+whitened derivative A_i of image i by [v, ω, δ], its residuals r_i and D = diag(a², ..., b², ..., c², ...):
 
-    C_i = (D⁻¹ + A_iᵀ·A_i)⁻¹,    m_i = C_i·A_iᵀ·r_i,    a² ← mean of m_v² + C_vv,    b² ← mean of m_ω² + C_ωω.
+    C_i = (D⁻¹ + A_iᵀ·A_i)⁻¹,    m_i = C_i·A_iᵀ·r_i,    a² ← mean of m_v² + C_vv,
+
+and so on for b² and c². The covariance of the displacement d is diag(a², a², a², b², b², b²) + c²·J·Jᵀ.
 
 Whether the images show a displacement at all is said by the ratio of the likelihoods with it and without it.
 
@@ -22,13 +25,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..._kernels.types import FrameBatch
 from ..._typing import Array
+from ...estimation.parameters import LOW_COST
 from ...estimation.problem import Problem
 from ...measurements.base import Measurement, label_stops
 from ...measurements.camera import CameraCorners
+from ...robot.chain import Chain
 
-# First standard deviations of the displacement [m], [rad], and smallest ones.
-FIRST_STD = (1e-3, 1e-3)
+# First standard deviations of the displacement [m], [rad] and of the joints [rad], and smallest ones.
+FIRST_STD = (1e-3, 1e-3, 1e-3)
 MIN_STD = 1e-7
 # Iterations, and relative change that ends them.
 _N_ITERATIONS, _RTOL = 200, 1e-3
@@ -47,6 +53,8 @@ class Jitter:
     noise: float  # Standard deviation of an image coordinate, relative to the stated or placeholder one
     position: float  # Standard deviation of the displacement of the tool along each axis [m]
     rotation: float  # Standard deviation of its rotation about each axis [rad]
+    # Standard deviation of the displacement of each revolute joint of a low-cost arm [rad].
+    joints: float = 0.0
     # Logarithm of the likelihood with the displacement over that without it, where noise explains all.
     log_likelihood_ratio: float = 0.0
 
@@ -76,12 +84,14 @@ def estimate_jitter(
         u = problem.instrument_values_of(plain, x)
         residual = plain.residual(frames, u)
         derivative = plain.displacement_derivative(frames, u) / plain.sigma[:, :, None]
+        derivative = np.concatenate([derivative, derivative @ _joint_motions(chain, frames)], 2)
         label = label_stops(plain)
         is_stated = is_stated and item.has_stated_sigma
         for number in range(label.max() + 1):
             samples = label == number
             if np.abs(residual[:, samples]).max() < MAX_RESIDUAL:
-                images.append((residual.T[samples].ravel(), derivative[samples].reshape(-1, 6)))
+                of_image = derivative[samples].reshape(-1, derivative.shape[2])
+                images.append((residual.T[samples].ravel(), of_image))
     if not images:
         return Jitter(1.0, *FIRST_STD)
     noise = 1.0 if is_stated else _scatter(images)
@@ -97,13 +107,23 @@ def estimate_jitter(
     return replace(jitter, log_likelihood_ratio=float(ratio))
 
 
+def _joint_motions(chain: Chain, frames: FrameBatch) -> Array:
+    """Return the motions of the tool by the joints of a low-cost arm that have play, (m, 6, n)."""
+    has_play = ~chain.is_prismatic & (LOW_COST in chain.parameters)
+    return chain.joint_jacobian(frames)[has_play].transpose(2, 1, 0)
+
+
+def _groups(n_components: int) -> Array:
+    """Return the number of the standard deviation of each component: 6 of the tool, then the joints."""
+    return np.repeat([0, 1, 2], [3, 3, n_components - 6])
+
+
 def _log_likelihood(images: Sequence[tuple[Array, Array]], jitter: Jitter) -> float:
     """Return the logarithm of the likelihood of a displacement over that of none with the same noise."""
-    std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
-    out = 0.0
+    out, std = 0.0, np.array([jitter.position, jitter.rotation, jitter.joints])
     for residual, derivative in images:
         # I + A·Aᵀ in the singular vectors of A, which may be large and singular for images of another arm.
-        u, s, _ = np.linalg.svd(derivative * std, full_matrices=False)
+        u, s, _ = np.linalg.svd(derivative * std[_groups(derivative.shape[1])], full_matrices=False)
         explained = (u.T @ residual) ** 2 * s**2 / (1 + s**2)
         out += 0.5 * float(np.sum(explained - np.log1p(s**2)))
     return out
@@ -121,23 +141,24 @@ def _scatter(images: Sequence[tuple[Array, Array]]) -> float:
 
 def _maximize_likelihood(images: Sequence[tuple[Array, Array]], noise: float, n_determined: float) -> Jitter:
     """Return the standard deviations of the displacement of greatest likelihood."""
-    position, rotation = FIRST_STD
+    std = np.array(FIRST_STD)
     # The fit has absorbed a part of the displacements: that of the parameters among six per image.
     n_displacements = 6 * len(images)
     share = max(1 - n_determined / n_displacements, 0.2)
     information = np.array([a.T @ a for _, a in images])
     projected = np.array([a.T @ r for r, a in images])
+    groups = _groups(information.shape[1])
+    counts = np.fmax(np.bincount(groups, minlength=3), 1)
     for _ in range(_N_ITERATIONS):
-        precision = np.diag(1 / np.array([position] * 3 + [rotation] * 3) ** 2)
-        covariance = np.linalg.inv(precision + information)
+        covariance = np.linalg.inv(np.diag(1 / std[groups] ** 2) + information)
         mean = (covariance @ projected[:, :, None])[:, :, 0]
         squares = np.mean(mean**2 / share + np.diagonal(covariance, axis1=1, axis2=2), 0)
-        updated = max(np.sqrt(squares[:3].mean()), MIN_STD), max(np.sqrt(squares[3:].mean()), MIN_STD)
-        change = max(abs(np.log(updated[0] / position)), abs(np.log(updated[1] / rotation)))
-        position, rotation = float(updated[0]), float(updated[1])
+        updated = np.fmax(np.sqrt(np.bincount(groups, squares, 3) / counts), MIN_STD)
+        change = np.abs(np.log(updated / std)).max()
+        std = updated
         if change < _RTOL:
             break
-    return Jitter(noise, position, rotation)
+    return Jitter(noise, *std.tolist())
 
 
 def with_jitter(
@@ -145,12 +166,14 @@ def with_jitter(
 ) -> tuple[Measurement, ...]:
     """Give image coordinates the noise and the jitter that were estimated."""
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    std = np.array([jitter.position] * 3 + [jitter.rotation] * 3)
     out: list[Measurement] = []
     for item in data:
         if isinstance(item, CameraCorners):
             frames = chain.forward_kinematics(item.conditions())
             derivative = item.displacement_derivative(frames, problem.instrument_values_of(item, x))
-            item = item.with_scaled_sigma({"pixels": jitter.noise}).with_jitter(derivative * std)
+            motions = _joint_motions(chain, frames)
+            of_tool = np.diag([jitter.position**2] * 3 + [jitter.rotation**2] * 3)
+            root = np.linalg.cholesky(of_tool + jitter.joints**2 * motions @ motions.swapaxes(1, 2))
+            item = item.with_scaled_sigma({"pixels": jitter.noise}).with_jitter(derivative @ root)
         out.append(item)
     return tuple(out)

@@ -5,7 +5,8 @@ After the first fit these stages follow:
 1. Widths of the priors of lenses and noise of the corners (`lens_priors`, `reweighting`).
 2. Corners of boards as unknowns, where they improve left-out images (`target_points`).
 3. The gate decides how far the arm is corrected (`gate`).
-4. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
+4. Backlash and elasticity are added if the displacements of the images support them (`joint_errors`).
+5. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
    (`board_size`, `diagnosis`).
 """
 
@@ -23,7 +24,6 @@ from ...exceptions import ConvergenceError, InvalidArgumentError, NotObservableE
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
-from ..model_selection import Extension
 from ..result import Result, make_result
 from ..reweighting import Fit, reweight
 from .arm_types import CORNERS, IMAGES, ArmType
@@ -32,18 +32,20 @@ from .board_size import find_board_size
 from .diagnosis import HandEyeFit
 from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
 from .jitter import with_jitter
+from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
 from .seen_ranges import seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
 
-def require_no_selection(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
-    """Raise an error if families of joint errors shall be selected from images."""
-    if families and extend not in (None, "auto"):
+def require_shown_families(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
+    """Raise an error if families of joint errors shall be selected that images do not show."""
+    others = [name for name in families if name not in FAMILIES]
+    if others and extend not in (None, "auto"):
         raise InvalidArgumentError(
-            f"extend {','.join(families)!r}: families of joint errors are not selected from images; name "
-            f"them among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{families[0]}', 1)}"
+            f"extend {others[0]!r}: only {' and '.join(FAMILIES)} are selected from images; name other "
+            f"families among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{others[0]}', 1)}"
         )
 
 
@@ -112,6 +114,7 @@ def calibrate_images(
     chain: Chain,
     holdout: tuple[Measurement, ...],
     exchanges: Sequence[Exchange],
+    families: Sequence[str],
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     if not (fit.solution.converged or fit.solution.iterations):
@@ -127,6 +130,7 @@ def calibrate_images(
     ungated = with_lens_priors(fit)
     gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.arm_type)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
+    gated, extension = add_joint_errors(gated, families, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
     if has_arm:
@@ -134,7 +138,7 @@ def calibrate_images(
         warnings += [warning] if warning else []
     result = replace(
         make_result(gated.fit, 1.0, holdout, "lm"),
-        extension=Extension(temperature=gate.temperature, n_configurations=gate.n_configurations),
+        extension=extension,
         input_warnings=tuple(warnings),
         camera_stages=(*axis_stages(exchanges), *stages),
         arm_type=fitting.arm_type,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..._typing import PathLike
     from ...cameras import Camera
     from ...detection import BoardDetection
+    from ...io.measurement_files import ImageJoints
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
 
@@ -43,7 +44,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="joint values of each image: a table with a column `image` with the file names and one column "
         "per joint, or those of the pose of the flange (x[mm],y[mm],z[mm] and qw,qx,qy,qz or "
         "rx[rad],ry[rad],rz[rad]), or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names "
-        "of the images are times such as 1700000000.25.png; without it the output has no joint values",
+        "of the images are times such as 1700000000.25.png; without it the output has no joint values. "
+        "Columns approach_JOINT have the direction in which a joint moved last (-1, 0 or 1); the comment "
+        "`# rows: in order` says that the rows are in the order in which the images were taken",
     )
     parser.add_argument(
         "--joint-topic",
@@ -102,6 +105,7 @@ def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
 def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Sequence[str]) -> int:
     """Find the corners in images and write them."""
     from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
+    from ...io.measurement_files.columns import IN_ORDER
     from ...io.rig_file import only_entry, read_rig
     from ...io.tabular import csv_text
     from ..outputs import require_writable_outputs, write_with_json
@@ -117,12 +121,22 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     require_writable_outputs([args.output, args.json], inputs)
     rig = read_rig(args.rig)
     camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
-    joints, notes = _joints(args, paths)
-    notes = [*video_notes, *notes]
+    read = _joints(args, paths)
+    joints, notes = (read.joints, [*video_notes, *read.notes]) if read else (None, [*video_notes])
+    comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
+    if read and read.is_ordered:
+        place = {name: number for number, name in enumerate(read.joints)}
+        paths.sort(key=lambda path: place[os.path.basename(path)])
+        comments.append(IN_ORDER)
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = corner_columns(rig, camera, detections, joints)
-    comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
+    used = {image.path for each in detections for image in each.used}
+    if read and read.is_ordered and (left_out := [path for path in paths if path not in used]):
+        notes.append(
+            f"{args.joints}: {os.path.basename(left_out[0])} shows no board; directions of approach by the "
+            "order of the images are wrong for the next one if a joint turned back in between"
+        )
     contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
     if args.overlay:
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
@@ -151,9 +165,9 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     return 0
 
 
-def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, str]] | None, list[str]]:
+def _joints(args: Namespace, paths: Sequence[str]) -> ImageJoints | None:
     """Return the joint values of the images, and notes on them."""
-    from ...io.measurement_files import read_image_joints, read_recorded_joints  # lazy import: slow to load
+    from ...io.measurement_files import read_joint_table, read_recorded_joints  # lazy import: slow to load
     from ...io.measurement_files.bag import is_bag
 
     is_recording = bool(args.joints) and is_bag(args.joints)
@@ -161,8 +175,8 @@ def _joints(args: Namespace, paths: Sequence[str]) -> tuple[dict[str, dict[str, 
         raise InvalidArgumentError("--joint-topic: needs --joints with a recording; omit it")
     if is_recording:
         recorded = read_recorded_joints(args.joints, paths, args.joint_topic)
-        return recorded.joints, [f"{args.joints}: {text}" for text in recorded.notes]
-    return (read_image_joints(args.joints, paths) if args.joints else None), []
+        return recorded._replace(notes=[f"{args.joints}: {text}" for text in recorded.notes])
+    return read_joint_table(args.joints, paths) if args.joints else None
 
 
 def _overlays(

@@ -1,6 +1,8 @@
 """Public names of dhcal_pin.io.measurement_files; `__init__.py` loads each on first use."""
 
+from .image_joints import ImageJoints as ImageJoints
 from .image_joints import read_image_joints as read_image_joints
+from .image_joints import read_joint_table as read_joint_table
 from .image_times import read_recorded_joints as read_recorded_joints
 from .parts import Part as Part
 from .parts import iter_measurements as iter_measurements

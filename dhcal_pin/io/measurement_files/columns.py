@@ -32,6 +32,8 @@ from ...units import ANGLES, LENGTHS
 from ..tables import Column, DataTable
 from ..tabular import require_usable_names
 
+# Comment that declares that the rows of a file are in the order of measurement.
+IN_ORDER = "rows: in order"
 QUATERNION = ("qw", "qx", "qy", "qz")
 ROTVEC = ("rx", "ry", "rz")
 # Positions that the controller was commanded to, and positions measured again after a calibration. They serve
@@ -118,6 +120,11 @@ def condition_columns(chain: Chain) -> dict[str, list[str]]:
         for condition in CONDITIONS.values()
     }
     return {name: names for name, names in columns.items() if not joints.intersection(names)}
+
+
+def is_in_order(table: DataTable) -> bool:
+    """Return whether a comment declares that the rows of a table are in the order of measurement."""
+    return any(text.strip().lower() == IN_ORDER for text in table.comments)
 
 
 def describe_conditions() -> str:

@@ -1,19 +1,38 @@
-"""Joint values of images: a table with a column of file names and one column per joint."""
+"""Joint values of images: a table with a column of file names and one column per joint.
+
+Directions of approach, `approach_JOINT`, and other conditions may stand beside them.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError
+from ...units import UNITS
 from ..tables import read_table
+from .columns import is_in_order
 
 IMAGE = "image"
 
 
+class ImageJoints(NamedTuple):
+    """Joint values of images."""
+
+    joints: dict[str, dict[str, str]]  # Cells of the joint columns by header, for the name of each image
+    notes: list[str]  # Sentences on images during which the robot moved
+    is_ordered: bool = False  # Whether the images are in the order in which they were taken
+
+
 def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[str, str]]:
     """Read the joint values that belong to images."""
+    return read_joint_table(path, images).joints
+
+
+def read_joint_table(path: PathLike, images: Sequence[str]) -> ImageJoints:
+    """Read the joint values that belong to images, in the order of the table if it is that of measurement."""
     table = read_table(path)
     headers = [header.strip() for header in table.headers]
     if IMAGE not in headers:
@@ -38,7 +57,12 @@ def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[s
             f"{table.source}: no joint values of {os.path.basename(missing[0])}{more}; expected a row for "
             f"each image, with its file name in the column `{IMAGE}`{known}"
         )
-    return {
+    is_ordered = is_in_order(table) or any(
+        column.name == "time" and column.unit in UNITS["time"] for column in table.columns.values()
+    )
+    if is_ordered:
+        images = sorted(images, key=lambda image: rows[_stem(image)])
+    joints = {
         os.path.basename(image): {
             header: table.cells[rows[_stem(image)]][i].strip()
             for i, header in enumerate(headers)
@@ -46,6 +70,7 @@ def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[s
         }
         for image in images
     }
+    return ImageJoints(joints, [], is_ordered)
 
 
 def _stem(name: str) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from .bag import read_bag_joints
+from .image_joints import ImageJoints
 
 # Time around an image within which the robot should stand still [s], and largest change of a joint [rad].
 STILL_TIME, MAX_CHANGE = 0.1, 1e-3
@@ -20,13 +20,6 @@ _SUBDIVISIONS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 # A time in a name: seconds with a fraction behind a point or with nanoseconds behind an underscore, or a
 # whole number.
 _TIME = re.compile(r"(\d{9,})(?:\.(\d+)|_(\d{9}))?(?!.*\d{9})")
-
-
-class RecordedImages(NamedTuple):
-    """Joint values of images."""
-
-    joints: dict[str, dict[str, str]]  # Cells of the joint columns by header, for the name of each image
-    notes: list[str]  # Sentences on images during which the robot moved
 
 
 def image_time(name: str) -> float | None:
@@ -48,7 +41,7 @@ def image_time(name: str) -> float | None:
 
 def read_recorded_joints(
     path: PathLike, images: Sequence[str], joint_topic: str | None = None
-) -> RecordedImages:
+) -> ImageJoints:
     """Read the joint values at the times of images from a recording."""
     source, times = os.fspath(path), np.empty(len(images))
     for i, image in enumerate(images):
@@ -84,7 +77,7 @@ def read_recorded_joints(
     if moving:
         more = f" and {len(moving) - 1} more images" if len(moving) > 1 else ""
         notes.append(f"the robot moved at the time of {moving[0]}{more}; take images while it stands still")
-    return RecordedImages(joints, notes)
+    return ImageJoints(joints, notes)
 
 
 def _change(when: Array, q: Array, time: float) -> float:

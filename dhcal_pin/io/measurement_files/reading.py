@@ -47,6 +47,7 @@ from .columns import (
     describe_conditions,
     find_kind,
     has_tool_poses,
+    is_in_order,
     joint_units,
     joints_off_the_chain,
     known_columns,
@@ -56,8 +57,6 @@ from .columns import (
 from .counts import with_joint_values
 from .tool_poses import solve_tool_poses
 
-# Comment that declares that the rows of a file are in the order of measurement.
-IN_ORDER = "rows: in order"
 # Smallest accepted standard deviation [m or rad]; no instrument is as accurate.
 _MIN_SIGMA = 1e-15
 # Largest deviation of a quaternion's norm from 1. Rounding to three decimals stays below it.
@@ -316,7 +315,7 @@ def with_conditions(data: Measurement, table: DataTable, chain: Chain) -> Measur
             values[name] = parsed[0]
     if values:
         data = data.with_conditions(**values)
-    is_ordered = "time" in values or any(text.strip().lower() == IN_ORDER for text in table.comments)
+    is_ordered = "time" in values or is_in_order(table)
     return data.in_order() if is_ordered and data.configurations_per_row == 1 else data
 
 
