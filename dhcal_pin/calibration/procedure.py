@@ -50,7 +50,7 @@ from ..plausibility.signs import SignDecision, decide_signs, first_errors, known
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
-from ..session import can_have_session, find_scale, find_session, refine_changes
+from ..session import can_have_session, find_scale, find_session
 from . import model_selection
 from .cameras import (
     arm_type,
@@ -63,7 +63,7 @@ from .cameras import (
     split_sets,
     with_stated_distortion,
 )
-from .cameras.image_session import find_image_session
+from .cameras.image_session import find_image_session, fit_with_changes
 from .cameras.procedure import ImageFitting, calibrate_images, require_shown_families, with_common_start
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
@@ -207,9 +207,6 @@ def calibrate(
             executor=executor,
         )
         of_images = find_image_session(chain, data, holdout, of_poses)
-    if of_images and not of_images.changes.is_empty:
-        data, holdout = of_images.applied(data, holdout)
-    data = with_common_start(chain, data)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
@@ -221,10 +218,9 @@ def calibrate(
     start = partial(
         _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
     )
-    fit = start(data)
     if of_images and not of_images.changes.is_empty:
-        of_images = refine_changes(of_images, replace(fit.problem, data=fit.data), fit.solution.x)
-        data, holdout = of_images.applied(fit.data, holdout)
+        of_images, fit, holdout = fit_with_changes(of_images, data, holdout, start)
+    else:
         fit = start(data)
     # The confirmation of changes and the calibration itself often need the same fits.
     reweighted = cache(
@@ -287,6 +283,7 @@ def _first_fit(
 ) -> Fit:
     """Initialize base, tool and instruments, and solve for the first time, from first errors of the robot."""
     started = replace(errors, chain=errors.at(_start(errors, first))) if first else errors
+    data = with_common_start(errors.chain, data)
     started, data, weights = _initialize(started, data, known, options.max_iterations, options.is_robust)
     if not first:
         errors = started

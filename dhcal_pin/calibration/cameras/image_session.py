@@ -7,7 +7,7 @@ images have the base pose B' and the tool pose T'. A motion C of the base and D 
 
     C' = M·C·M⁻¹ with M = B'·B⁻¹,        D' = N·D·N⁻¹ with N = T'⁻¹·T.
 
-The first fit of all corners refines the motions.
+The first fit of all corners refines the motions. They are kept if the images then fit better than without.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.pose import Pose
 from ...robot.chain import Chain
-from ...session import Session
+from ...session import Session, refine_changes
 from ...session.causes import Cause
+from ...session.search import MAX_SAMPLE_COST, MIN_LOG_EVIDENCE, MIN_NOISE
 from ...session.timeline import Timeline, order_samples
 from ..result import Result
+from ..reweighting import Fit
+from ..session_check import without_changes
 
 
 def find_image_session(
@@ -73,6 +76,50 @@ def find_image_session(
         lag=None,
         scales=(),
     ).described()
+
+
+def fit_with_changes(
+    session: Session,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    start: Callable[[tuple[Measurement, ...]], Fit],
+) -> tuple[Session, Fit, tuple[Measurement, ...]]:
+    """Fit images for the first time with the changes of a session; without if these do not explain them."""
+    fit = start(session.applied(data, holdout)[0])
+    refined = refine_changes(session, replace(fit.problem, data=fit.data), fit.solution.x)
+    changed, held_out = refined.applied(data, holdout)
+    fit = start(changed)
+    try:
+        without = start(data)
+    except DhcalError:
+        return refined, fit, held_out
+    if session.has_two_robots or _explains_better(fit, without):
+        return refined, fit, held_out
+    return without_changes(session), without, holdout
+
+
+def _explains_better(fit: Fit, other: Fit) -> bool:
+    """Return whether one fit explains images so much better than another one that this is evidence.
+
+    An image has six degrees of freedom, and counts no more than an outlier does.
+    """
+    squares = [_image_squares(each) for each in (fit, other)]
+    noise = max(min(float(np.median(each)) for each in squares), MIN_NOISE**2)
+    limit = 1 + MAX_SAMPLE_COST / 6
+    costs = [6 * float(np.sum(np.minimum(each / noise, limit))) for each in squares]
+    return costs[1] - costs[0] > 2 * MIN_LOG_EVIDENCE
+
+
+def _image_squares(fit: Fit) -> Array:
+    """Return the mean square of the residuals of each image."""
+    problem, x, out = fit.problem, fit.solution.x, []
+    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    for item in fit.data:
+        values = problem.instrument_values_of(item, x)
+        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
+        labels = item.sample_groups
+        out.append(np.bincount(labels, np.mean(residual**2, 0)) / np.bincount(labels))
+    return np.concatenate(out)
 
 
 def _carried_cause(cause: Cause, tool: Array) -> Cause:
