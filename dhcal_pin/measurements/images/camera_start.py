@@ -176,6 +176,8 @@ def moving_information(item: Corners, views: BoardViews, samples: Array) -> Arra
 
     The twists are in the frame of the one that stands still. The noise is that of all images.
     """
+    if not len(samples):
+        return np.empty((0, 6, 6))
     number = {int(sample): i for i, sample in enumerate(views.sample)}
     keys = np.column_stack([item.image, item.board])
     out = []
