@@ -85,16 +85,19 @@ def fit_with_changes(
     start: Callable[[tuple[Measurement, ...]], Fit],
 ) -> tuple[Session, Fit, tuple[Measurement, ...]]:
     """Fit images for the first time with the changes of a session; without if these do not explain them."""
-    fit = start(session.applied(data, holdout)[0])
-    refined = refine_changes(session, replace(fit.problem, data=fit.data), fit.solution.x)
-    changed, held_out = refined.applied(data, holdout)
-    fit = start(changed)
+    try:
+        fit = start(session.applied(data, holdout)[0])
+        session = refine_changes(session, replace(fit.problem, data=fit.data), fit.solution.x)
+        changed, held_out = session.applied(data, holdout)
+        fit = start(changed)
+    except DhcalError:
+        return without_changes(session), start(data), holdout
     try:
         without = start(data)
     except DhcalError:
-        return refined, fit, held_out
+        return session, fit, held_out
     if session.has_two_robots or _explains_better(fit, without):
-        return refined, fit, held_out
+        return session, fit, held_out
     return without_changes(session), without, holdout
 
 
