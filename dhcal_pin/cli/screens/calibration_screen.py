@@ -38,7 +38,10 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
     sizes = [text for text in unidentified if SCALE_UNKNOWN in text][:1]
     advice = [f"warning: {SCALE_UNKNOWN}; {text.rpartition('; ')[2]}" for text in sizes]
-    warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
+    all_warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
+    signs = fit.signs
+    turned = [f"{names[job.robot]}: warning: {signs.note}"] if signs and signs.turned else []
+    warnings = [text for text in all_warnings if text not in turned]
     notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
     hints = [f"hint: {outcome.hint}"] if outcome.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
@@ -54,6 +57,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(notes, noun="note on the files", rank=1),
         Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
+        Block(turned, "yellow"),
         Block([*advice, *warnings], "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
         Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),
