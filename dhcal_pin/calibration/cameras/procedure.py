@@ -120,9 +120,9 @@ def calibrate_images(
     is_stuck = not (fit.solution.converged or fit.solution.iterations)
     if is_stuck and fitted_error(fit).pixels > fitting.arm_type.max_error:
         raise ConvergenceError(
-            "images: no step from the first values brings the model nearer to the corners; check the joint "
-            "values or the servo file of the counts, and the poses in the rig file (xyz_m, rotvec_rad), or "
-            "omit those of the cameras or those of the boards"
+            "images: no step from the first values brings the model nearer to the corners; check the poses "
+            "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards, and "
+            "check the joint values, or the servo file of the counts"
         )
     has_arm = fit.problem.errors.has_arm
     fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
