@@ -42,11 +42,11 @@ def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable
     shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]
     share = float(min([1.0, *(min(each, 1 - each) for each in shares)]))
     # Half of the samples on the shorter side of a step have larger residuals.
-    sizes = [_sizes(_residuals(each), 1 - share / 2) for each in (without, fit)]
+    sizes = [_sizes(residuals_of(each), 1 - share / 2) for each in (without, fit)]
     if max(np.max(a / b) for a, b in zip(*sizes, strict=True)) > MIN_GROSS_RATIO:
         return True
     unchanged = extended(without)
-    residuals = [_residuals(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
+    residuals = [residuals_of(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
     noise = [1.4826 * size for size in _sizes(residuals[1], 0.5)]
     costs = [
         sum(
@@ -78,8 +78,8 @@ def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
     return [np.fmax(np.quantile(np.abs(r), share, axis=1, keepdims=True), MIN_NOISE) for r in residuals]
 
 
-def _residuals(fit: Fit) -> Sequence[Array]:
-    """Return the residuals of a fit, (k, m) each."""
+def residuals_of(fit: Fit) -> Sequence[Array]:
+    """Return the residuals of a fit, (k, m) each, without the weights of the samples."""
     problem, x = fit.problem, fit.solution.x
     chain = problem.errors.at(x[: len(problem.errors.parameters)])
     return [

@@ -130,7 +130,7 @@ class SlowChange:
         if self.time_constant is not None:
             unit = "s" if self.time_unit == "s" else f"{self.time_unit}s"
             how += f", with a time constant of {self.time_constant:.3g} {unit}"
-        if self.of == "links":
+        if self.kind == "links":
             by = f"up to {size}" if self.shape == "free" else size
             return f"The lengths of the links changed {how}, which moved the tool by {by}."
         part = f"zero of joint {self.of}" if self.kind == "joint" else self.of

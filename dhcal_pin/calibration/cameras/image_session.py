@@ -30,7 +30,7 @@ from ...session.search import MAX_SAMPLE_COST, MIN_LOG_EVIDENCE, MIN_NOISE
 from ...session.timeline import Timeline, order_samples
 from ..result import Result
 from ..reweighting import Fit
-from ..session_check import without_changes
+from ..session_check import residuals_of, without_changes
 
 
 def find_image_session(
@@ -115,14 +115,9 @@ def _explains_better(fit: Fit, other: Fit) -> bool:
 
 def _image_squares(fit: Fit) -> Array:
     """Return the mean square of the residuals of each image."""
-    problem, x, out = fit.problem, fit.solution.x, []
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    for item in fit.data:
-        values = problem.instrument_values_of(item, x)
-        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
-        labels = item.sample_groups
-        out.append(np.bincount(labels, np.mean(residual**2, 0)) / np.bincount(labels))
-    return np.concatenate(out)
+    groups = [item.sample_groups for item in fit.data]
+    parts = zip(groups, residuals_of(fit), strict=True)
+    return np.concatenate([np.bincount(g, np.mean(r**2, 0)) / np.bincount(g) for g, r in parts])
 
 
 def _carried_cause(cause: Cause, tool: Array) -> Cause:
