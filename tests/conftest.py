@@ -26,6 +26,8 @@ from dhcal_pin.robot.urdf import parse_urdf
 
 # Otherwise every process compiles all tests anew.
 sys.dont_write_bytecode = False
+# The garbage collector would else take a tenth of the time of the tests.
+gc.set_threshold(50_000, 20, 50)
 # Benchmarks need rivals in environments of their own.
 collect_ignore_glob = ["bench_*.py"]
 
