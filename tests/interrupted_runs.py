@@ -21,8 +21,10 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import psutil
 from command_line import positions_csv
+from PIL import Image
 from robots import URDF
 from signal_steps import SignalAtStep, count_steps
 
@@ -103,6 +105,11 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("diff", "arm.urdf", "arm.dh.toml", "--json", "sub/d.json", "--report", "d.html"),
         ("d.html", "sub/d.json"),
     ),
+    "check": (("check", "arm.dh.toml", "--json", "sub/k.json"), ("sub/k.json",)),
+    "detect": (
+        ("detect", "i.png", "--rig", "rig.toml", "-o", "d.csv", "--json", "sub/d.json"),
+        ("d.csv", "sub/d.json"),
+    ),
     "board": (("board", "rig.toml", "-o", "b.pdf", "--json", "sub/b.json"), ("b.pdf", "sub/b.json")),
 }
 # Files that a command may leave for the next run, which continues with them.
@@ -147,6 +154,10 @@ class Interruption:
         Path("a.fleet.toml").write_text(FLEET)
         Path("t.csv").write_text("x[mm],y[mm],z[mm]\n400,100,300\n300,-200,400\n")
         Path("rig.toml").write_text(RIG.format(square=20 if old else 25))
+        squares = np.kron(np.indices((5, 7)).sum(0) % 2, np.full((40, 40), 255))
+        sides = (180, 180) if old else (170, 190)
+        picture = np.pad(squares, ((140, 140), sides), constant_values=255)
+        Image.fromarray(picture.astype(np.uint8)).save("i.png")
 
     def _run_alone(self) -> None:
         status = self._in_child(lambda: dhcal(self.words))
