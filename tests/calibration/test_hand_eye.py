@@ -173,6 +173,17 @@ def test_images_with_wrong_joint_values_are_counted(has_names):
         assert f"left out ({', '.join(listed[:3])} and 1 more): check" in text
 
 
+def test_joint_values_that_are_wrong_at_random_displace_images():
+    """As of an arm that had not stopped; no cause that is tried explains the images."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 61, is_on_wrist=True, n_images=10)
+    wrong = np.random.default_rng(0).normal(0, 2e-3, (images.n_images, chain.n_joints))
+    data = images.replace(q=images.q + wrong[images.image])
+    found = dh.calibrate(chain, data, "camera,board", loss="linear").hand_eye
+    assert found is not None
+    assert [cause.cause for cause in found.causes] == ["displaced images"]
+    assert "all corners of an image are displaced together" in found.likely
+
+
 def test_similar_rotations_are_named():
     """An arm that is wrong and turns little: the camera is wrong by more than the images show."""
     chain, images, setup = faulty_setup(
