@@ -23,7 +23,8 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.linear_model import Layout, whitened_rows
-from dhcal_pin.session.timeline import _file_numbers
+from dhcal_pin.session.search import WIDTHS, _Search
+from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
 KINDS = (Position, Pose)
@@ -99,6 +100,35 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
         for column, change in zip(block.columns, changes, strict=True):
             # The rows are the derivative of the model, the residual is measured minus modelled.
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "changes", [Changes("base", 1.5e-4), *(Changes(joint=(j, 0.01 * DEGREE)) for j in (1, 4))]
+)
+def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
+    """Of Gaussian data with and without the step, whose coefficients have a prior of the best width."""
+    simulation = Simulation("ur10", 60, 3)
+    data = simulation.measure(Pose, changes)
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors = select_parameters(chain, "minimal,base,tool")
+    problem = make_problem(errors, (data,), 1 / errors.priors, {})
+    search = _Search(problem, np.zeros(len(errors.parameters)), order_samples((data,), ()), True, 60, 60)
+    search.run()
+    (cause,), rows = search.causes, search.linearize()
+    rows /= search.solve(rows, [cause]).noise[..., None]
+    model = rows[..., search.layout.model].reshape(rows[..., 0].size, -1)
+    step = cause.columns_of(rows, search.numbers, search.times).reshape(len(model), -1)
+    values = rows[..., -1].ravel() + model @ search.x + step @ cause.values
+    factor = model / search.layout.weights
+
+    def log_likelihood(width):
+        covariance = np.eye(len(model)) + factor @ factor.T + (step * (width * cause.sizes) ** 2) @ step.T
+        return -0.5 * (np.linalg.slogdet(covariance)[1] + values @ np.linalg.solve(covariance, values))
+
+    gain = max(map(log_likelihood, WIDTHS)) - log_likelihood(0.0)
+    n_steps, n_causes = len(search.edges), len(search.layout.blocks)
+    expected = gain - np.log(n_steps * n_causes)
+    assert cause.log_evidence == pytest.approx(expected, abs=0.25 * len(cause.values))
 
 
 def session_of(fit: Result) -> Session:
