@@ -279,6 +279,14 @@ def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side(size):
     assert fit.comparisons[0].after.groups["position"].rms < 2e-4
 
 
+def test_errors_of_joints_along_a_path_are_no_change():
+    """Residuals of a path change slowly; left-out blocks of time show that no cause explains them."""
+    simulation = Simulation("ur10", 291, 52, is_path=True)
+    simulation.add_eccentricities(2.3e-3)
+    fit = calibrate(simulation.chain, simulation.measure(Position), extend="none")
+    assert not session_of(fit).found
+
+
 def test_two_robots_are_refused():
     simulation = Simulation("ur10", 100, 3)
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
