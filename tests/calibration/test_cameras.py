@@ -206,7 +206,9 @@ def test_first_values_of_one_file_are_not_those_of_another_rig():
     few, others = (images.take(part) for part in (images.image < 1, images.image >= 1))
     mixed = few, others.with_rig(replace(rig, cameras=(replace(camera, name="other"),)))
     assert all(a is b for a, b in zip(with_common_start(chain, mixed), mixed, strict=True))
-    start = [p.nominal for item in with_common_start(chain, (few, others)) for p in item.instrument_parameters]
+    start = [
+        p.nominal for item in with_common_start(chain, (few, others)) for p in item.instrument_parameters
+    ]
     assert np.all(np.isfinite(start))
 
 
@@ -463,3 +465,11 @@ def test_clusters_hold_out_every_image_once(arm):
     np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), 1)
     for (mask,) in folds:
         assert all(len(set(mask[data.image == number])) == 1 for number in range(data.n_images))
+
+
+def test_clusters_are_regions_of_joint_space(arm):
+    rng = np.random.default_rng(4)
+    region = rng.permutation(np.arange(60) % 5)
+    q = rng.uniform(-2, 2, (5, 6))[region] + rng.normal(0, 0.05, (60, 6))
+    found = np.array([mask for (mask,) in cluster_folds([dh.Pose(q, arm.poses(q))])])
+    assert {tuple(mask) for mask in found} == {tuple(region == number) for number in range(5)}

@@ -64,7 +64,9 @@ def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
 
 def test_rejected_corners_do_not_hide_a_bent_board():
     """The corners at the ends of the board disagree with the majority; they are right."""
-    check_cause(hand_eye("panda", "warped", 11, True, loss="auto", n_images=20), "warped")
+    fit = hand_eye("panda", "warped", 11, True, loss="auto", n_images=20)
+    check_cause(fit, "warped")
+    assert "it is not flat" in fit.hand_eye.causes[0].text
 
 
 @pytest.mark.slow
