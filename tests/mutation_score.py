@@ -210,9 +210,7 @@ def main() -> None:
     executed = ExecutedLines(options.results, options.tests)
     end = time.monotonic() + 60 * options.minutes
     with tempfile.TemporaryDirectory() as folder:
-        for name in ("dhcal_pin", "tests", "urdf", "docs", "pyproject.toml"):
-            copied = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
-            copied(ROOT / name, Path(folder) / name)
+        shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", ".venv"), dirs_exist_ok=True)
         environment = os.environ | {"PYTHONPATH": folder}
         pytest = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "not slow", "-p", "no:cacheprovider"]
         chosen_tests = Path(folder) / "chosen_tests"

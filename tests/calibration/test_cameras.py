@@ -14,8 +14,9 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
-from dhcal_pin.calibration.cameras.axis_order import exchange_axes
+from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, exchange_axes, reorder
 from dhcal_pin.calibration.cameras.gate import cluster_folds
+from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.cameras import Board
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
@@ -180,6 +181,35 @@ def test_exchanged_image_coordinates_are_named(is_on_wrist):
     assert any("u and v are exchanged in the measurements" in text for text in exchanged.input_warnings)
     rms = [fit.comparisons[0].after["residual_rms"] for fit in (right, exchanged)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
+@pytest.mark.parametrize("what", ORDERS)
+def test_an_order_exchanges_what_it_names(what):
+    _, images, _ = faulty_setup("ur10", "focal", 1, is_on_wrist=True, n_images=5)
+
+    def named(item):
+        values = *item.rig.cameras[0].values[:4], *item.values[0]
+        return dict(zip(("fx", "fy", "cx", "cy", "u", "v"), values, strict=True))
+
+    expected = named(images)
+    for pair in what.split(", and "):
+        one, other = pair.split(" and ")
+        expected[one], expected[other] = expected[other], expected[one]
+    (exchanged,) = reorder([images], [Exchange("camera0", what, None, None)])
+    assert named(exchanged) == expected
+
+
+def test_first_values_of_one_file_are_not_those_of_another_rig():
+    """One image has no first values; images of another camera cannot give them."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 1, is_on_wrist=True, n_images=10)
+    rig, (camera,) = images.rig, images.rig.cameras
+    few, others = (images.take(part) for part in (images.image < 1, images.image >= 1))
+    mixed = few, others.with_rig(replace(rig, cameras=(replace(camera, name="other"),)))
+    assert all(a is b for a, b in zip(with_common_start(chain, mixed), mixed, strict=True))
+    start = [
+        p.nominal for item in with_common_start(chain, (few, others)) for p in item.instrument_parameters
+    ]
+    assert np.all(np.isfinite(start))
 
 
 @pytest.mark.parametrize("seed", some_slow([32, 34], {0}))
@@ -435,3 +465,11 @@ def test_clusters_hold_out_every_image_once(arm):
     np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), 1)
     for (mask,) in folds:
         assert all(len(set(mask[data.image == number])) == 1 for number in range(data.n_images))
+
+
+def test_clusters_are_regions_of_joint_space(arm):
+    rng = np.random.default_rng(4)
+    region = rng.permutation(np.arange(60) % 5)
+    q = rng.uniform(-2, 2, (5, 6))[region] + rng.normal(0, 0.05, (60, 6))
+    found = np.array([mask for (mask,) in cluster_folds([dh.Pose(q, arm.poses(q))])])
+    assert {tuple(mask) for mask in found} == {tuple(region == number) for number in range(5)}

@@ -80,6 +80,11 @@ def test_rows_are_those_of_images_with_scaled_displacements(plain):
         assert both.cost < whole.at(1.0).cost
 
 
+def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
+    """The geometry lacks play and sag: the temperature of N configurations is 1 + N/20."""
+    assert plain.problem.temperature == 1 + plain.data[0].n_images / 20
+
+
 def test_play_and_sag_are_selected_and_corrected(shot, plain, fit):
     assert families(fit) == {"backlash", "compliance"}
     values = {p.name: x for p, x in zip(fit.parameters, fit.x, strict=False)}

@@ -8,7 +8,7 @@ import pytest
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import _without_centre, intrinsics_candidates
+from dhcal_pin.cameras.intrinsics import _is_plausible, _without_centre, intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
 from dhcal_pin.exceptions import NotObservableError
 from dhcal_pin.measurements.images.camera_start import _well_fitting
@@ -171,6 +171,8 @@ def test_wrong_points_near_a_plane_do_not_agree(depth):
         agrees = agreeing_points(points, image)
         assert not agrees[:3].any()
         assert agrees[3:].mean() > 0.9
+        # A shift of the image is a projective map, too.
+        np.testing.assert_array_equal(agreeing_points(points, image + np.array([3.0, 2.0])), agrees)
 
 
 def views(rng, count, points=CHECKERBOARD):
@@ -235,3 +237,11 @@ def test_focal_length_with_the_centre_in_the_middle():
     values = _without_centre(views)
     assert values is not None
     np.testing.assert_allclose(values, [1.3, 1.3, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.01, 0.01, 0, 0), (1, 1e-2, 0, 0), (1, 10, 0, 0), (10, 1, 0, 0), (1, 1, 3, 0), (1, 1, 0, -3)]
+)
+def test_lenses_that_are_not_built_are_implausible(values):
+    assert not _is_plausible(values, 1.0, 0.75)
+    assert _is_plausible((1.0, 1.05, 0.05, -0.05), 1.0, 0.75)

@@ -7,7 +7,7 @@ import pytest
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera
-from dhcal_pin.cameras.lens_fit import fit_lens, fit_unknown_lens
+from dhcal_pin.cameras.lens_fit import _LensProblem, fit_lens, fit_unknown_lens
 from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
 from dhcal_pin.exceptions import NotObservableError
 
@@ -92,6 +92,15 @@ def test_values_without_width_are_held():
     fit = fit_lens(views, LENSES["pinhole"], values, std)
     np.testing.assert_array_equal(fit.values[[2, 3, 8]], values[[2, 3, 8]])
     np.testing.assert_allclose(fit.values[4], TRUE["pinhole"][4], atol=0.05)
+
+
+def test_a_value_one_standard_deviation_off_costs_one():
+    """The cost is minus twice the logarithm of the density, here with the same errors of the images."""
+    values, std = stated_lens("pinhole", "stated")
+    std[8] = 0.0
+    problem = _LensProblem([], LENSES["pinhole"], values, std, 1)
+    before, after = (problem._cost([np.ones((8, 10))], values + k * std) for k in (0, 1))
+    assert after - before == pytest.approx(8)
 
 
 def test_images_without_a_pose_are_left_out():

@@ -60,15 +60,17 @@ def test_a_corrected_homing_offset_adds_the_angle(tmp_path, make, sign):
         lerobot_text(),
         lerobot_text().replace("\n", "\r\n"),
         json.dumps(json.loads(lerobot_text()), separators=(",", ":")),
-        lerobot_text()
-        .replace('"gripper"', '"gr\\u00f6\\"{if"')
-        .replace('"id"', '"note": "homing_offset: 3", "id"'),
+        *(
+            lerobot_text().replace('"wrist_roll"', name).replace('"id"', '"note": "homing_offset: 3", "id"')
+            for name in ('"gr\\u00f6\\"{if"', '"grö\\"{if"')
+        ),
     ],
 )
 def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
     servos = read_servos(written(tmp_path, "arm.json", text))
     assert servos.with_zeros_moved({})[0].lerobot_content() == text
-    corrected, _ = servos.with_zeros_moved({"elbow_flex": np.deg2rad(9.0), "wrist_roll": -0.2})
+    last = servos.servos[4].joint
+    corrected, _ = servos.with_zeros_moved({"elbow_flex": np.deg2rad(9.0), last: -0.2})
     by_hand = text
     # 9 degrees are 102.4 of 4095 steps, -0.2 rad are -130.3.
     for before, after in ((-50, -152), (150, 280)):

@@ -10,6 +10,7 @@ from camera_setups import ARMS, simulate
 
 import dhcal_pin as dh
 from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.measurements.images.camera_parameters import camera_parameters
 
 # Weights of f(x + k·h) - f(x - k·h), k = 1, 2, 3, in the derivative of sixth order (Fornberg 1988).
 WEIGHTS = np.array([3 / 4, -3 / 20, 1 / 60])
@@ -74,3 +75,12 @@ def test_derivatives_of_every_unknown(name, model, is_on_wrist):
         n_checked += largest > 0
     # Corners that are not seen in the drawn samples, and joints without gravity torque, have no effect.
     assert n_checked > 0.6 * len(x)
+
+
+def test_units_and_priors_of_cameras_follow_from_their_names():
+    camera = dh.cameras.Camera("c", "tip", 1280, 960, np.array([900.0, 900, 640, 480, 0, 0, 0, 0, 0]))
+    found = {p.name.split(".")[1]: (p.unit, p.prior) for p in camera_parameters(camera)}
+    for alike in ("x y z", "rx ry rz", "fx fy cx cy", "k1 k2 p1 p2 k3"):
+        assert len({found[name] for name in alike.split()}) == 1
+    units = "m m m rad rad rad px px px px 1 1 1 1 1".split()
+    assert [unit for unit, _ in found.values()] == units

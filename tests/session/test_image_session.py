@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
+from dhcal_pin.calibration.cameras.image_session import find_image_session
 from dhcal_pin.cameras import Rig
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements import CameraCorners, Pose
@@ -94,6 +95,17 @@ def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, re
         ratios.append(arm_error(fit.chain, truth, images) / limit)
     assert np.mean(named) >= (0.8 if is_slow else 1.0)
     assert np.median(ratios) < (1.5 if is_slow else 1.0)
+
+
+def test_changes_need_images_alone_and_of_one_board():
+    nominal, _, images, _ = photograph(1, True, True, MOTION, count=10)
+    two = images.with_rig(replace(images.rig, boards=images.rig.boards * 2)).replace(board=images.image % 2)
+
+    def calibrated(_):
+        raise AssertionError
+
+    for data in ([images, Pose(images.q, nominal.poses(images.q))], [two]):
+        assert find_image_session(nominal, data, (), calibrated) is None
 
 
 @pytest.mark.parametrize("is_on_wrist", [True, False])

@@ -118,6 +118,7 @@ def test_large_changes_have_the_right_size():
     first = result.changes[0]
     assert first.kind == "base"
     assert abs(first.size - 0.05) < 4 * first.std + 1e-5
+    assert result.reasons[0].startswith("The base moved by ")
 
 
 def test_a_turn_about_the_first_axis_names_joint_and_base():
@@ -185,6 +186,8 @@ def test_hidden_joints_are_named():
     result = recheck(chain, [data])
     assert result.verdict == "ok"
     assert "Zeros of wrist_3_joint do not move it" in result.reasons[1]
+    shifted = data.replace(values=data.positions() + np.array([0.003, 0.004, 0.0]))
+    assert recheck(chain, [shifted]).residual_rms == pytest.approx(5e-3)
 
 
 def test_lengths_of_wires_are_refused():

@@ -22,8 +22,11 @@ from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
+from dhcal_pin.session.causes import Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
-from dhcal_pin.session.timeline import _file_numbers
+from dhcal_pin.session.robot_changes import JointPaths
+from dhcal_pin.session.search import WIDTHS, _Search
+from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
 KINDS = (Position, Pose)
@@ -99,6 +102,74 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
         for column, change in zip(block.columns, changes, strict=True):
             # The rows are the derivative of the model, the residual is measured minus modelled.
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
+
+
+def search_of(changes, n_cells=60, is_ordered=True):
+    """Return the search of a session of 60 poses."""
+    simulation = Simulation("ur10", 60, 3)
+    data = simulation.measure(Pose, changes)
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors = select_parameters(chain, "minimal,base,tool")
+    problem = make_problem(errors, (data,), 1 / errors.priors, {})
+    start, timeline = np.zeros(len(errors.parameters)), order_samples((data,), ())
+    return _Search(problem, start, timeline, is_ordered, 60, n_cells)
+
+
+@pytest.mark.parametrize(
+    "changes", [Changes("base", 1.5e-4), *(Changes(joint=(j, 0.01 * DEGREE)) for j in (1, 4))]
+)
+def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
+    """Of Gaussian data with and without the step, whose coefficients have a prior of the best width."""
+    search = search_of(changes)
+    search.run()
+    (cause,), rows = search.causes, search.linearize()
+    rows /= search.solve(rows, [cause]).noise[..., None]
+    model = rows[..., search.layout.model].reshape(rows[..., 0].size, -1)
+    step = cause.columns_of(rows, search.numbers, search.times).reshape(len(model), -1)
+    values = rows[..., -1].ravel() + model @ search.x + step @ cause.values
+    factor = model / search.layout.weights
+
+    def log_likelihood(width):
+        covariance = np.eye(len(model)) + factor @ factor.T + (step * (width * cause.sizes) ** 2) @ step.T
+        return -0.5 * (np.linalg.slogdet(covariance)[1] + values @ np.linalg.solve(covariance, values))
+
+    gain = max(map(log_likelihood, WIDTHS)) - log_likelihood(0.0)
+    n_steps, n_causes = len(search.edges), len(search.layout.blocks)
+    expected = gain - np.log(n_steps * n_causes)
+    assert cause.log_evidence == pytest.approx(expected, abs=0.25 * len(cause.values))
+
+
+def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_order():
+    search = search_of(Changes("base", 2e-3, at=0.45), n_cells=10)
+    search.run()
+    assert [cause.shape for cause in search.causes] == [Step(27)]
+    search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
+    fit = search.solve(search.first_rows, [])
+    assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+
+
+def test_paths_of_joints_are_those_of_each_file():
+    times, lag = np.split(0.1 * np.arange(80), 2), 0.05
+    paths = [(np.sin, np.cos), (np.cos, lambda t: -np.sin(t))]
+    items = [
+        Position(np.outer(f(t), [1, 2]), np.zeros((40, 3))).replace(source=f.__name__).with_conditions(time=t)
+        for t, (f, _) in zip(times, paths, strict=True)
+    ]
+    timeline = order_samples(items, ())
+    numbers = timeline.fitted_numbers
+    found = JointPaths(timeline).evaluate(numbers, timeline.fitted_times, lag)
+    for i, (t, functions) in enumerate(zip(times, paths, strict=True)):
+        for each, f in zip(found, functions, strict=True):
+            inner = slice(40 * i + 5, 40 * i + 35)
+            np.testing.assert_allclose(each[inner, 1], 2 * f(t[5:35] + lag), atol=1e-4)
+    # Times are no numbers of samples.
+    np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
+
+
+@pytest.mark.parametrize("shape", [Drift(2.0, 6.0), Drift(2.0, 6.0, 1.0), FreeDrift(2.0, 6.0)])
+def test_nothing_drifts_before_and_after_a_session(shape):
+    begin, before, end, after = shape.values(np.arange(4), np.array([2.0, 0.0, 6.0, 9.0]))
+    np.testing.assert_allclose([before, end, after], [begin, 0 * begin, 0 * begin], atol=1e-12)
 
 
 def session_of(fit: Result) -> Session:
@@ -249,6 +320,14 @@ def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side(size):
     assert fit.comparisons[0].after.groups["position"].rms < 2e-4
 
 
+def test_errors_of_joints_along_a_path_are_no_change():
+    """Residuals of a path change slowly; left-out blocks of time show that no cause explains them."""
+    simulation = Simulation("ur10", 291, 52, is_path=True)
+    simulation.add_eccentricities(2.3e-3)
+    fit = calibrate(simulation.chain, simulation.measure(Position), extend="none")
+    assert not session_of(fit).found
+
+
 def test_two_robots_are_refused():
     simulation = Simulation("ur10", 100, 3)
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
@@ -278,6 +357,8 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     data = simulation.measure(Position, Changes(scales=scales))
     fit = calibrate(simulation.chain, data, extend="none")
     (scale,) = session_of(fit).scales
+    assert ("too long compared with the other axes" in scale.finding) == bool(scale.axis)
+    assert scale.finding.startswith("Measured z is" if scale.axis else "The correction makes the whole robot")
     assert scale.axis == ("z" if scales[0] == 1 else "")
     assert scale.factor == pytest.approx(scales[2], abs=3 * scale.std)
     assert fit.verdict.status == "caution"

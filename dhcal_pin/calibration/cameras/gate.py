@@ -139,11 +139,10 @@ def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
 
 def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
     """Judge whether the corners of boards are where the rig states them; see `target_points`."""
-    if not fit.problem.errors.has_arm:
-        return None
     clusters = cluster_folds(fit.data)
-    images = k_fold(fit.data, N_IMAGE_FOLDS) if clusters else ()
-    return try_target_points(fit, images, clusters, max_iterations)
+    if not clusters or not fit.problem.errors.has_arm:
+        return None
+    return try_target_points(fit, k_fold(fit.data, N_IMAGE_FOLDS), clusters, max_iterations)
 
 
 def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: ArmType) -> GatedFit:

@@ -61,7 +61,7 @@ def try_target_points(
 ) -> TargetPoints | None:
     """Judge the corners of boards as unknowns on left-out images."""
     names = judged_boards(boards_of(fit.data))
-    if not names or len(clusters) < 2:
+    if not names:
         return None
     freed = with_free_points(fit, names)
     solution = minimize(freed.problem, "lm", freed.solution.x, max_iterations, loose=True)
