@@ -20,8 +20,8 @@ from ..reweighting import Fit
 from .sets import describe_configurations
 from .stages import fitted_error
 
-# Median difference of the angles from which images are unrelated [rad], smallest number of images, and largest
-# number of them that are compared.
+# Median difference of the angles from which images are unrelated [rad], and smallest and largest number of
+# images that are compared.
 MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 10, 200
 # Shifts of the joint values by rows that are a mistake of their own, and are named as such.
 SHIFTS = (-2, -1, 1, 2)
@@ -47,9 +47,9 @@ def require_related_images(fit: Fit, chain: Chain, max_error: float) -> None:
     where = images[0].source or "images"
     raise InvalidArgumentError(
         f"{where}: the boards in the images do not move as the {stated} say: the rotations between images "
-        f"differ by {np.degrees(min(differences)):.0f}° (median) from those of the robot, wherever camera and "
-        f"board are; expected the {stated} of the same images with right units, signs and order, and the URDF "
-        "of the robot in the images"
+        f"differ by {np.degrees(min(differences)):.0f}° (median) from those of the robot, wherever camera "
+        f"and board are; expected the {stated} of the same images with right units, signs and order, and "
+        "the URDF of the robot in the images"
     )
 
 
