@@ -34,10 +34,9 @@ from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
-from .seen_ranges import seen_ranges_warning
+from .seen_ranges import require_related_images, seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
-from .unrelated_images import require_related_images
 
 
 def require_shown_families(extend: str | Sequence[str] | None, families: Sequence[str]) -> None:
