@@ -126,14 +126,14 @@ def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
 
     If there are parameters without a prior, the fit starts from the nominal robot, as the values of
     undetermined parameters in x contain information of all samples. If the calibration did not converge, the
-    fit stops after as many iterations.
+    fit stops after as many iterations, at most `MAX_REFIT_ITERATIONS`.
     """
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
         return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
     if not fit.converged:
         with suppress(DhcalError):  # method "gn" may diverge on few samples
-            return minimize(problem, fit.method, nominal, fit.iterations).x
+            return minimize(problem, fit.method, nominal, min(fit.iterations, MAX_REFIT_ITERATIONS)).x
     return minimize(problem, "lm", nominal, MAX_REFIT_ITERATIONS).x
 
 

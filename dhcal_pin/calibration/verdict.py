@@ -58,6 +58,8 @@ MAX_CHANCE = 0.025
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
+# Share of outliers above which the other images do not decide.
+MAX_IMAGE_OUTLIER_SHARE = 0.5
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.
@@ -425,10 +427,11 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 
 def _outliers(fit: Evidence) -> list[Finding]:
-    """Advise caution if many samples are outliers."""
+    """Advise caution if many samples are outliers; refuse images that are mostly outliers."""
     n_outliers = fit.n_outliers
+    is_refused = bool(fit.camera_stages) and n_outliers > MAX_IMAGE_OUTLIER_SHARE * fit.n_samples
     # Images that differ because of a wrong lens or a wrong arm are no outliers.
-    is_explained = fit.hand_eye is not None and bool(fit.hand_eye.causes)
+    is_explained = fit.hand_eye is not None and bool(fit.hand_eye.causes) and not is_refused
     if is_explained:
         return []
     run = _consecutive_outliers(fit)
@@ -439,7 +442,7 @@ def _outliers(fit: Evidence) -> list[Finding]:
     remedy = "Check the measurements."
     if n_outliers > MIN_MIXED_SHARE * fit.n_samples:
         remedy = "They may be of another set-up, tool or robot: calibrate them by themselves, too."
-    return [Finding("caution", f"{text}. {run or remedy}")]
+    return [Finding("refused" if is_refused else "caution", f"{text}. {run or remedy}")]
 
 
 def _consecutive_outliers(fit: Evidence) -> str:

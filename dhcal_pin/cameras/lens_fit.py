@@ -24,18 +24,20 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .._typing import Array
+from ..subsampling import evenly_spaced_indices
 from .intrinsics import intrinsics_candidates, undetermined_focal_length
 from .lens import FOCAL_AND_CENTRE, Lens
-from .pose_from_points import estimate_poses
+from .pose_from_points import MIN_POINTS, estimate_poses
 from .rig import DISTORTION_PRIORS, PIXEL_PRIORS, Camera
 
-# Largest number of views that the lens is fitted to, and of trial steps.
-_MAX_VIEWS, _N_STEPS = 30, 20
+# Largest number of views among which those of the fit are chosen, of views that the lens is fitted to, and of
+# trial steps.
+_MAX_EXAMINED, _MAX_VIEWS, _N_STEPS = 60, 30, 20
 # First damping of the lens, and damping of the poses, which are determined.
 _DAMPING, _POSE_DAMPING = 1e-3, 1e-9
 # Change of the cost, twice the negative logarithm of the likelihood, that ends the steps.
@@ -69,9 +71,17 @@ class LensFit:
 def fit_camera(views: Sequence[View], camera: Camera, *, repeats_errors: bool = False) -> LensFit:
     """Fit the lens of a camera and the poses of boards to its images, starting from the lens of the rig."""
     std = _lens_widths(camera)
+    usable = [view for view in views if len(view[0]) >= MIN_POINTS]
+    drawn = views
+    if std.any() and len(usable) > _MAX_EXAMINED:
+        drawn = [usable[i] for i in evenly_spaced_indices(len(usable), _MAX_EXAMINED)]
     if camera.has_intrinsics:
-        return fit_lens(views, camera.lens, camera.values, std, repeats_errors=repeats_errors)
-    return fit_unknown_lens(views, camera, std, repeats_errors=repeats_errors)
+        fit = fit_lens(drawn, camera.lens, camera.values, std, repeats_errors=repeats_errors)
+    else:
+        fit = fit_unknown_lens(drawn, camera, std, repeats_errors=repeats_errors)
+    if drawn is views:
+        return fit
+    return replace(fit, poses=fit_lens(views, camera.lens, fit.values, 0 * std).poses)
 
 
 def _lens_widths(camera: Camera) -> Array:

@@ -313,17 +313,19 @@ class Measurement(ABC):
         """Return a copy whose instrument parameters are initialized from the tool poses of a robot."""
         return self
 
-    def initialized_from(self, chain: Chain, is_used: Array) -> Self:
+    def initialized_from(self, chain: Chain, is_used: Array, is_kept: Array | None = None) -> Self:
         """Return a copy with initial values of the instrument parameters from a part of the samples.
 
         Args:
             chain: Robot whose tool poses the initial values are fitted to.
             is_used: Whether each sample is used, (m,).
+            is_kept: Whether the copy has each sample, (m,); all of them if not given.
         """
         part = self.take(is_used).initialized(chain)
         per_sample = (*self.sample_fields, "recorded")
         common = [field.name for field in fields(self) if field.name not in per_sample]
-        return self.replace(**{name: getattr(part, name) for name in common})
+        kept = self if is_kept is None else self.take(is_kept)
+        return kept.replace(**{name: getattr(part, name) for name in common})
 
     def matched_to(self, known: Mapping[str, float]) -> Self:
         """Return a copy with the unknowns of a calibration, if its known values decide on them."""

@@ -582,20 +582,15 @@ class CameraCorners(Measurement):
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy with first values of all parameters that have none, from the images themselves."""
-        if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
-            return self
-        return self._with_first_values(chain)
+        return self.initialized_from(chain, np.ones(len(self.rows), bool))
 
-    def initialized_from(self, chain: Chain, is_used: Array) -> Self:
-        """Return a copy with first values from some of the images."""
+    def initialized_from(self, chain: Chain, is_used: Array, is_kept: Array | None = None) -> Self:
+        """Return a copy with first values from some of the images; lenses are those of all images."""
+        kept = self if is_kept is None else self.take(is_kept)
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
-            return self
-        return self._with_first_values(chain, is_used)
-
-    def _with_first_values(self, chain: Chain, is_used: Array | None = None) -> Self:
-        """Return a copy with first values; messages begin with the file of the images."""
+            return kept
         try:
-            return self.with_values(first_values(self.corners, self.board_views, chain, is_used))
+            return kept.with_values(first_values(self.corners, self.board_views, chain, is_used))
         except NotObservableError as error:
             where = f"{self.source}: " if self.source else ""
             raise NotObservableError(f"{where}{error}") from None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import LENSES, Board, Camera
-from dhcal_pin.cameras.lens_fit import _LensProblem, fit_lens, fit_unknown_lens
+from dhcal_pin.cameras import LENSES, Board, Camera, pose_from_points
+from dhcal_pin.cameras.lens_fit import _LensProblem, fit_camera, fit_lens, fit_unknown_lens
 from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
 from dhcal_pin.exceptions import NotObservableError
 
@@ -170,3 +170,20 @@ def test_wrong_points_do_not_change_the_lens():
     ]
     assert errors[1][2:4].max() < 30
     assert errors[1][2:4].max() < 0.5 * errors[0][2:4].max()
+
+
+def test_many_images_have_the_lens_of_some_and_a_pose_each(monkeypatch):
+    """The closed forms are evaluated once for each image, and not for every lens that is tried."""
+    poses, views = images(np.random.default_rng(5), "pinhole", count=150)
+    views.insert(70, (CHECKERBOARD[:3], views[0][1][:3]))
+    closed_forms = pose_from_points._first_poses
+    calls: list[int] = []
+    monkeypatch.setattr(
+        pose_from_points, "_first_poses", lambda *view: [calls.append(len(view)), closed_forms(*view)][1]
+    )
+    fit = fit_camera(views, without_focal_lengths("pinhole")[0])
+    np.testing.assert_allclose(fit.values[:4], TRUE["pinhole"][:4], atol=15)
+    assert fit.poses[70] == []
+    assert angles(fit.poses[:70] + fit.poses[71:], poses).max() < 0.05
+    # Some hundred for the search of the focal length, 60 for each of two first lenses, and all views.
+    assert len(calls) < 600

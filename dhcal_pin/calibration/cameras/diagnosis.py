@@ -63,6 +63,8 @@ MAX_NOISE_RATIO = 1.5
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
 # up to this ratio of their errors.
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
+# Larger errors are not stated as numbers [px], [m]: boards behind a camera have no place in the image.
+MAX_STATED_PIXELS, MAX_STATED_DISTANCE = 5000.0, 10.0
 # Rotation about a second axis that is none [rad].
 NO_ROTATION = 1e-4
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
@@ -229,12 +231,16 @@ class HandEyeDiagnosis:
 
 
 def _mm(value: float) -> str:
-    """Format a length [m] in millimetres."""
+    """Format a length [m] in millimetres, up to the largest one that says something."""
+    if value > MAX_STATED_DISTANCE:
+        return f"more than {MAX_STATED_DISTANCE:.0f} m"
     return format_quantity(value, "m", 0.1 * value, small=True)
 
 
 def _px(value: float) -> str:
-    """Format a number of pixels."""
+    """Format a number of pixels, up to the largest one that says something."""
+    if value > MAX_STATED_PIXELS:
+        return f"more than {MAX_STATED_PIXELS:.0f} px"
     return format_quantity(value, "px", 0.1 * value)
 
 

@@ -150,14 +150,11 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
     n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
     folds = cluster_folds(fit.problem.data)
-    kept = nominal = without_arm(fit, max_iterations)
+    nominal = without_arm(fit, max_iterations)
     is_right = not residual_jitter(nominal).is_significant
-    if not is_right:
-        shared, _ = fit_with_jitter(nominal, max_iterations)
-        kept = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
-    kept = _solve(kept, kept.problem, 1.0, max_iterations)
     if not fit.problem.errors.has_arm:
         gate = Gate(float("nan"), 1.0, n_configurations, is_right, is_right, arm_type)
+        kept = _kept_fit(nominal, is_right, folds, max_iterations)
         return GatedFit(kept, nominal, kept, gate)
     shared, jitter = fit_with_jitter(fit, max_iterations)
     is_complete = not jitter.is_significant
@@ -178,7 +175,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     others_ratio = _others_ratio(best.closed, max_iterations)
     gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
     if not gate.is_open:
-        return GatedFit(kept, nominal, best.closed, gate)
+        return GatedFit(_kept_fit(nominal, is_right, folds, max_iterations), nominal, best.closed, gate)
     opened_at = 1.0
     if not is_complete:
         factor = 1.0 if best.model is shared else share
@@ -193,6 +190,14 @@ def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
     n_configurations = gate.n_configurations if jitter.is_significant else 0
     opened_at = temperature(n_configurations, OPEN_SAMPLES)
     return _solve(fit, fit.problem, opened_at, max_iterations), opened_at
+
+
+def _kept_fit(nominal: Fit, is_right: bool, folds: Sequence[Fold], max_iterations: int) -> Fit:
+    """Fit the nominal arm with the noise that predicts left-out clusters best."""
+    if not is_right:
+        shared, _ = fit_with_jitter(nominal, max_iterations)
+        nominal = _best((fit_with_corner_noise(nominal, max_iterations), shared), folds)
+    return _solve(nominal, nominal.problem, 1.0, max_iterations)
 
 
 def _best(fits: Sequence[Fit], folds: Sequence[Fold]) -> Fit:
@@ -343,16 +348,18 @@ def judge_stages(
 
     frames = without_arm(fit, max_iterations, ("intrinsics", POINTS_SET))
     out = [judged("frames", frames, True, "Poses of cameras and boards are always estimated.")]
-    lenses = without_arm(fit, max_iterations, (POINTS_SET,))
+    points = lenses = gated.nominal
+    sets = {item.set_of(p.name) for item in fit.data for p in item.instrument_parameters}
+    has_points = POINTS_SET in sets
+    if has_points:
+        lenses = without_arm(fit, max_iterations, (POINTS_SET,))
     if len(lenses.problem.weights) > len(frames.problem.weights):
         stage = judged("intrinsics", lenses, True, "The rig does not fix them.")
         out.append(replace(stage, reason=f"{stage.reason} {_change(out[-1], stage)}".strip()))
-    points = gated.nominal
-    has_points = len(points.problem.weights) > len(lenses.problem.weights)
     if not has_points and count_corners(fit.data) <= MAX_POINTS:
-        points = without_arm(
-            with_free_points(fit, [board.name for board in boards_of(fit.data)]), max_iterations
-        )
+        freed = with_free_points(lenses, [board.name for board in boards_of(fit.data)])
+        solution = minimize(freed.problem, "lm", freed.solution.x, max_iterations, loose=True)
+        points = replace(freed, solution=solution)
     if len(points.problem.weights) > len(lenses.problem.weights):
         reason = (
             "The rig leaves them free."

@@ -34,7 +34,7 @@ from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
-from .seen_ranges import seen_ranges_warning
+from .seen_ranges import require_related_images, seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
@@ -117,8 +117,10 @@ def calibrate_images(
     families: Sequence[str],
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
+    max_error = fitting.arm_type.max_error
     is_stuck = not (fit.solution.converged or fit.solution.iterations)
-    if is_stuck and fitted_error(fit).pixels > fitting.arm_type.max_error:
+    if is_stuck and fitted_error(fit).pixels > max_error:
+        require_related_images(fit, chain, max_error)
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
             "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards, and "
@@ -126,6 +128,7 @@ def calibrate_images(
         )
     has_arm = fit.problem.errors.has_arm
     fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
+    require_related_images(fit, chain, max_error)
     points = judge_target_points(fit, fitting.max_iterations)
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
@@ -145,7 +148,8 @@ def calibrate_images(
         camera_stages=(*axis_stages(exchanges), *stages),
         arm_type=fitting.arm_type,
     )
-    if gate.is_open and fitted_error(gated.fit).pixels < fitting.arm_type.max_error:
+    if gate.is_open and fitted_error(gated.fit).pixels < max_error:
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
+    require_related_images(frames, chain, max_error)
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))

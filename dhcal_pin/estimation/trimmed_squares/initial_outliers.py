@@ -52,8 +52,7 @@ def find_initial_outliers(
     """Find samples that are so far from the nominal robot that a fit must begin without them."""
     all_good = [np.zeros(len(item.rows), bool) for item in data]
     frames = errors.only_frames() or ErrorModel(errors.chain, ())
-    parts = [item.take(_draw_groups(item)) for item in data]
-    starts = [_initialize_instruments(frames.chain, part) for part in parts]
+    starts = [_initialize_instruments(frames.chain, item, _draw_groups(item)) for item in data]
     parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
     weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
     problem = Problem(frames, tuple(starts), weights, known)
@@ -97,25 +96,29 @@ def _thin_groups(item: Measurement) -> Array:
     return is_drawn
 
 
-def _initialize_instruments(chain: Chain, item: Measurement) -> Measurement:
-    """Initialize the instrument of a measurement from the subset whose start most samples agree with."""
-    best = item.initialized(chain)
-    if not item.instrument_parameters or not len(item.rows):
+def _initialize_instruments(chain: Chain, item: Measurement, is_drawn: Array) -> Measurement:
+    """Initialize the instrument of drawn samples (m,) from the subset whose start most of them agree with.
+
+    What a measurement knows without the robot, such as the lens of a camera, is that of all samples.
+    """
+    best = item.initialized_from(chain, is_drawn, is_drawn)
+    if not best.instrument_parameters or not len(best.rows):
         return best
-    frames = chain.forward_kinematics(item.conditions())
-    labels = item.sample_groups
+    frames = chain.forward_kinematics(best.conditions())
+    labels = best.sample_groups
     n_labels = int(labels.max()) + 1
-    rows_per_label = item.residual_dim * len(labels) / n_labels
-    least = int(np.ceil(len(item.instrument_parameters) / rows_per_label)) + 1
+    rows_per_label = best.residual_dim * len(labels) / n_labels
+    least = int(np.ceil(len(best.instrument_parameters) / rows_per_label)) + 1
     rng = np.random.default_rng(0)
     best_misfit = _median_square(best, frames)
     for i in range(N_STARTS):
         size = max(MIN_CONFIGURATIONS, least if i % 2 else 2 * least)
         if size >= n_labels:
             break
-        subset = np.isin(labels, rng.permutation(n_labels)[:size])
+        is_used = is_drawn.copy()
+        is_used[is_drawn] = np.isin(labels, rng.permutation(n_labels)[:size])
         try:
-            start = item.initialized_from(chain, subset)
+            start = item.initialized_from(chain, is_used, is_drawn)
         except DhcalError:
             # The subset does not determine the instrument.
             continue

@@ -119,11 +119,8 @@ def _fit_camera(camera: Camera, content: tuple[tuple[bytes, bytes], ...], repeat
     return fit_camera(views, camera, repeats_errors=repeats_errors)
 
 
-def first_values(
-    item: Corners, views: BoardViews, chain: Chain, is_used: Array | None = None
-) -> dict[str, float]:
-    """Estimate the first values of all parameters of cameras and boards."""
-    used = np.ones(len(item.values), bool) if is_used is None else is_used
+def first_values(item: Corners, views: BoardViews, chain: Chain, used: Array) -> dict[str, float]:
+    """Estimate the first values of all parameters of cameras and boards from the used samples (m,)."""
     values: dict[str, float] = {}
     for camera, lens in zip(item.rig.cameras, views.lenses, strict=True):
         if not camera.has_intrinsics:
