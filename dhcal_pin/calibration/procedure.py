@@ -194,6 +194,7 @@ def calibrate(
     data, exchanges = exchange_axes(chain, data)
     holdout = reorder(holdout, exchanges)
     of_images = None
+    arm = arm_type(robot_sets)
     if session != "off" and method == "lm" and has_images(data):
         of_poses = partial(
             calibrate,
@@ -206,7 +207,7 @@ def calibrate(
             turned="none",
             executor=executor,
         )
-        of_images = find_image_session(chain, data, holdout, of_poses)
+        of_images = find_image_session(chain, data, holdout, of_poses, arm)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
@@ -245,7 +246,7 @@ def calibrate(
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
     groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(groups, stages, max_iterations, progress, arm_type(robot_sets))
+        fitting = ImageFitting(groups, stages, max_iterations, progress, arm)
         images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)
         return replace(images, signs=signs, with_auto=with_auto, session=of_images)
     fit = reweighted(fit, stages)

@@ -25,7 +25,7 @@ from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
-from .cameras.seen_ranges import small_ranges
+from .cameras.image_checks import small_ranges
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -122,7 +122,7 @@ class Verdict:
 
 def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
-    findings = _unmoved_joints(fit) or _few_images(fit)
+    findings = _unmoved_joints(fit) or _unrelated_images(fit) or _few_images(fit)
     if not any(finding.status == "refused" for finding in findings):
         findings += [*_mixups(fit.diagnosis), *_signs(fit), *_board_size(fit), *_two_robots(fit)]
     if not any(finding.status == "refused" for finding in findings):
@@ -176,6 +176,12 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
     text += ": the calibration holds only where "
     text += "they stand. Move them, too." if len(unmoved) > 1 else "it stands. Move it, too."
     return [Finding("caution", text)]
+
+
+def _unrelated_images(fit: Evidence) -> list[Finding]:
+    """Refuse images that are not those of the joint values or of the robot."""
+    sentence = fit.hand_eye_fit.unrelated if fit.hand_eye_fit else ""
+    return [Finding("refused", sentence)] if sentence else []
 
 
 def _few_images(fit: Evidence) -> list[Finding]:

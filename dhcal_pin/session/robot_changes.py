@@ -86,6 +86,11 @@ class RobotChanges:
         return replace(self, lag=0.0)
 
     @property
+    def of_frames(self) -> RobotChanges:
+        """The changes of base and tool alone."""
+        return RobotChanges(self.base, self.tool)
+
+    @property
     def is_empty(self) -> bool:
         """Whether nothing changed."""
         return self.base.is_identity and self.tool.is_identity and not (self.zeros or self.growth or self.lag)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
 import pytest
 from camera_setups import ARMS, random_setup, simulate, visible_corners, wrong_arm
+from paper_arms import photograph as photograph_servo_arm
 from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
+from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
 from dhcal_pin.calibration.cameras.image_session import find_image_session
 from dhcal_pin.cameras import Rig
-from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.parameters import LOW_COST, select_parameters
 from dhcal_pin.measurements import CameraCorners, Pose
 from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.measurements.images import image_pose
@@ -105,7 +108,29 @@ def test_changes_need_images_alone_and_of_one_board():
         raise AssertionError
 
     for data in ([images, Pose(images.q, nominal.poses(images.q))], [two]):
-        assert find_image_session(nominal, data, (), calibrated) is None
+        assert find_image_session(nominal, data, (), calibrated, INDUSTRIAL) is None
+
+
+def test_play_is_no_change_of_a_joint():
+    """The play of a servo arm displaces images like a change of a joint zero, which is not looked for."""
+    nominal, _, images, _ = photograph(1, True, True, 0 * MOTION)
+    is_second_half = images.rows >= images.image_poses().rows[12]
+    q = images.q + np.deg2rad([0, 0, 1, 0, 0, 0]) * is_second_half[:, None]
+    calibrated = partial(calibrate, nominal, extend="none")
+    found = [
+        find_image_session(nominal, [images.replace(q=q)], (), calibrated, arm)
+        for arm in (INDUSTRIAL, ARM_TYPES[LOW_COST])
+    ]
+    assert [[event.kind for event in each.events] for each in found] == [["joint"], []]
+    assert found[1].changes.is_empty
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [403, 539])
+def test_clean_servo_arms_have_no_session(seed):
+    shot = photograph_servo_arm(seed)
+    fit = calibrate(shot.nominal, shot.images)
+    assert not (fit.session and fit.session.sentences)
 
 
 @pytest.mark.parametrize("is_on_wrist", [True, False])

@@ -11,10 +11,10 @@ from .diagnosis import HandEyeFit as HandEyeFit
 from .gate import apply_gate as apply_gate
 from .gate import judge_stages as judge_stages
 from .gate import judge_target_points as judge_target_points
+from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .lens_priors import lens_prior_groups as lens_prior_groups
 from .lens_priors import with_lens_priors as with_lens_priors
 from .lens_priors import with_stated_distortion as with_stated_distortion
-from .seen_ranges import seen_ranges_warning as seen_ranges_warning
 from .sets import DEFAULT_SETS as DEFAULT_SETS
 from .sets import HAND_EYE_SETS as HAND_EYE_SETS
 from .sets import MIXED_SETS as MIXED_SETS

@@ -32,11 +32,13 @@ class ArmType:
     # Number of different images below which the arm is not written, and number that is advised.
     min_images: int = 0
     advised_images: int = 0
+    # Whether images show a change of joint zeros or links: play and sag imitate it.
+    shows_joint_changes: bool = True
 
 
 INDUSTRIAL = ArmType(0.5, 0.25, 10.0, (CORNERS, IMAGES))
 # Types of arms by the parameter set that is estimated. 40 px are 2° for a lens of 1150 px.
-ARM_TYPES = {LOW_COST: ArmType(0.8, 0.8, 40.0, (IMAGES,), 10, 20)}
+ARM_TYPES = {LOW_COST: ArmType(0.8, 0.8, 40.0, (IMAGES,), 10, 20, shows_joint_changes=False)}
 
 
 def arm_type(sets: Iterable[str]) -> ArmType:

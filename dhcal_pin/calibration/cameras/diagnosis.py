@@ -257,10 +257,13 @@ class HandEyeFit:
     fit: Fit  # Fit of the poses with the nominal arm; only base and tool of the robot may be unknown
     position_std: float  # Largest standard deviation of the position of a camera or a board [m]
     holdout: tuple[Measurement, ...]  # Held-out images, for the order of all images
+    unrelated: str = ""  # What shows that the images are not those of the joint values or of the robot
 
     @cached_property
     def diagnosis(self) -> HandEyeDiagnosis | None:
-        """Likely cause of the error, on first use; None with fewer than five configurations."""
+        """Likely cause of the error, on first use; None with few configurations or unrelated images."""
+        if self.unrelated:
+            return None
         return diagnose_hand_eye(self.fit, self.position_std, self.holdout)
 
 

@@ -31,6 +31,7 @@ from ...session.timeline import Timeline, order_samples
 from ..result import Result
 from ..reweighting import Fit
 from ..session_check import residuals_of, without_changes
+from .arm_types import ArmType
 
 
 def find_image_session(
@@ -38,6 +39,7 @@ def find_image_session(
     data: Sequence[Measurement],
     holdout: Sequence[Measurement],
     calibrated: Callable[[Sequence[Pose]], Result],
+    arm: ArmType,
 ) -> Session | None:
     """Find what happened while the images of one camera and one board were taken.
 
@@ -65,11 +67,12 @@ def find_image_session(
     causes = [
         replace(cause, block=replace(cause.block, **blocks.get(cause.block.kind, {})))
         for cause in found.causes
-        if not cause.block.is_constant
+        if not cause.block.is_constant and (arm.shows_joint_changes or cause.block.kind in blocks)
     ]
+    changes = found.changes.carried_to(base, tool)
     return replace(
         found,
-        changes=found.changes.carried_to(base, tool).without_lag,
+        changes=changes.without_lag if arm.shows_joint_changes else changes.of_frames,
         timeline=_timeline_of_images(images, holdout, poses, found.timeline.unit),
         chain=chain,
         causes=tuple(_carried_cause(cause, tool) for cause in causes),

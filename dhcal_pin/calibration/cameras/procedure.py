@@ -30,11 +30,11 @@ from .arm_types import CORNERS, IMAGES, ArmType
 from .axis_order import Exchange, axis_stages
 from .board_size import find_board_size
 from .diagnosis import HandEyeFit
-from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter
+from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter, without_arm
+from .image_checks import find_unrelated_images, seen_ranges_warning
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
-from .seen_ranges import require_related_images, seen_ranges_warning
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
@@ -119,16 +119,21 @@ def calibrate_images(
     """Calibrate from images, starting from a first fit."""
     max_error = fitting.arm_type.max_error
     is_stuck = not (fit.solution.converged or fit.solution.iterations)
-    if is_stuck and fitted_error(fit).pixels > max_error:
-        require_related_images(fit, chain, max_error)
+    unrelated = find_unrelated_images(fit, chain, max_error)
+    if is_stuck and fitted_error(fit).pixels > max_error and not unrelated:
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
             "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards, and "
             "check the joint values, or the servo file of the counts"
         )
     has_arm = fit.problem.errors.has_arm
-    fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
-    require_related_images(fit, chain, max_error)
+    if not unrelated:
+        fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
+        unrelated = find_unrelated_images(fit, chain, max_error)
+    if unrelated:
+        frames = without_arm(fit, fitting.max_iterations) if has_arm else fit
+        result = replace(make_result(frames, 1.0, holdout, "lm"), arm_type=fitting.arm_type)
+        return replace(result, hand_eye_fit=HandEyeFit(frames, np.inf, holdout, unrelated))
     points = judge_target_points(fit, fitting.max_iterations)
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
@@ -151,5 +156,5 @@ def calibrate_images(
     if gate.is_open and fitted_error(gated.fit).pixels < max_error:
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
-    require_related_images(frames, chain, max_error)
-    return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout))
+    unrelated = find_unrelated_images(frames, chain, max_error)
+    return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout, unrelated))
