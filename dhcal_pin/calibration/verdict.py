@@ -56,6 +56,8 @@ MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 MAX_CHANCE = 0.025
 # Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
+# Largest error of the zero of a servo that needs no caution [rad].
+MAX_ZERO = np.deg2rad(40.0)
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
 # Share of outliers above which the other images do not decide.
@@ -124,7 +126,13 @@ def judge(fit: Evidence) -> Verdict:
     """Judge a calibration by all rules."""
     findings = _unmoved_joints(fit) or _unrelated_images(fit) or _few_images(fit)
     if not any(finding.status == "refused" for finding in findings):
-        findings += [*_mixups(fit.diagnosis), *_signs(fit), *_board_size(fit), *_two_robots(fit)]
+        findings += [
+            *_mixups(fit.diagnosis),
+            *_signs(fit),
+            *_large_zeros(fit),
+            *_board_size(fit),
+            *_two_robots(fit),
+        ]
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
@@ -209,6 +217,24 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
 def _signs(fit: Evidence) -> list[Finding]:
     """Advise caution if signs of joints are open, and say what decides them."""
     return [Finding("caution", question) for question in (fit.signs.questions if fit.signs else ())]
+
+
+def _large_zeros(fit: Evidence) -> list[Finding]:
+    """Advise caution if zeros of servos are far off: the URDF may have other zeros than the servo file."""
+    values = zip(fit.errors.parameters, fit.x, strict=False) if fit.signs else ()
+    zeros = {p.name.removesuffix(".offset"): x for p, x in values if p.name.endswith(".offset")}
+    large = [
+        f"{name} by {np.degrees(zeros[name]):.0f}°"
+        for name, is_prismatic in zip(fit.chain.moving_joints, fit.chain.prismatic, strict=True)
+        if not is_prismatic and abs(zeros.get(name, 0.0)) > MAX_ZERO
+    ]
+    if not large:
+        return []
+    text = (
+        f"The zeros move farther than usual: {', '.join(large)}. The URDF may have other zeros than the "
+        "servo file: with all joints at zero, `dhcal view` has to show the pose that the servos call zero."
+    )
+    return [Finding("caution", text)]
 
 
 def _board_size(fit: Evidence) -> list[Finding]:

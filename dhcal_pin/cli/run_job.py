@@ -106,6 +106,7 @@ class CalibrationOutcome:
     held_out_outliers: dict[str, list[int]]  # Lines of outliers that were held out, by measurement file
     warnings: dict[str, list[str]]  # Warnings about the input, by file
     notes: dict[str, list[str]]  # What of the input is not used, by file
+    moved_zeros: list[str]  # How the zeros of servos move
     hint: str  # Suggestion to use --extend; empty if there is none
 
 
@@ -438,9 +439,10 @@ def _write_job(
     written, corrected = move_zeros(fit, servos) if servos and is_kept else (fit, None)
     options = {**vars(job), "servo_file": corrected}
     contents = ROBOT_FORMATS[ending].files(written, job.output, options) if is_kept else {}
-    if servos and corrected:
+    moved_zeros = describe_moves(servos, corrected) if servos and corrected else []
+    if corrected:
         contents[robot_stem(job.output) + SERVO_ENDING] = corrected.toml_content()
-        data.notes.setdefault(job.robot, []).extend(describe_moves(servos, corrected))
+        data.notes.setdefault(job.robot, []).extend(moved_zeros)
     source = _provenance(job, sets, data, inputs, contents, hint)
     files = name_robot_files(map(str, contents), job.output)
     done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
@@ -475,6 +477,7 @@ def _write_job(
         held_out_outliers=held_out,
         warnings=data.warnings,
         notes=data.notes,
+        moved_zeros=moved_zeros,
         hint=hint,
     )
 

@@ -96,7 +96,7 @@ def _check_example_robots() -> InstallationCheck:
     robots = example_robots()
     if robots:
         return InstallationCheck("example robots", "ok", f"{len(robots)}, such as example:ur10")
-    return InstallationCheck("example robots", "note", "none; pip install 'dhcal-pin[robots]'")
+    return InstallationCheck("example robots", "note", "none; pip install example-robot-data")
 
 
 def _check_extras() -> Iterator[InstallationCheck]:
@@ -109,7 +109,7 @@ def _check_extras() -> Iterator[InstallationCheck]:
         try:
             check = InstallationCheck(f"extra {extra}", "ok", f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
-            text = f"not installed; pip install 'dhcal-pin[{extra}]'"
+            text = f"{package} is not installed; pip install {package}"
             check = InstallationCheck(f"extra {extra}", "note", text)
         yield check
 

@@ -35,6 +35,9 @@ from .mixups import comparable_items, draw_samples, has_enough_rows
 MIN_LOG_RATIO = 10.0
 # Number of joints that are turned around together, or that are not in a mirrored arm.
 _MAX_TURNED = 2
+# Smallest residual for which the links of camera and board may be exchanged [m]: play and sag leave less.
+# Largest ratio of the residual with exchanged links to that without.
+_MIN_EXCHANGED, _MAX_EXCHANGED = 0.01, 0.2
 # Number of configurations among which the one that decides is chosen, and its smallest useful distance [m].
 _N_CONFIGURATIONS, _MIN_DISTANCE = 1000, 0.01
 # Largest usual zeros, in default standard deviations.
@@ -147,13 +150,10 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
     samples = _samples(data)
     if not samples:
         return undecided
-    fits: dict[tuple[int, ...], Evidence] = {}
-    for turned in _hypotheses(chain):
-        change = JointChange.of(chain.n_joints, signs=_signs(chain, turned).astype(int).tolist())
-        changed = Hypothesis("", "", change).apply(samples)
-        assert changed is not None
-        fits[turned] = fit_evidence(chain, changed, HAND_BUILT)
+    fits = _fit_signs(chain, samples)
     ranked = sorted(fits, key=lambda turned: -fits[turned].log)
+    if fits[ranked[0]].length_scale > _MIN_EXCHANGED:
+        _require_right_links(chain, data, fits[ranked[0]])
     limit = fits[ranked[0]].log - MIN_LOG_RATIO
     chosen = () if fits[()].log >= limit else ranked[0]
     others = [turned for turned in ranked if turned != chosen and fits[turned].log >= limit]
@@ -163,6 +163,35 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
         turned=_names(chain, chosen),
         open=tuple(_open_signs(chain, chosen, other, fits) for other in others),
     )
+
+
+def _fit_signs(chain: Chain, samples: Sequence[Measurement]) -> dict[tuple[int, ...], Evidence]:
+    """Compute the evidence of each hypothesis."""
+    fits = {}
+    for turned in _hypotheses(chain):
+        change = JointChange.of(chain.n_joints, signs=_signs(chain, turned).astype(int).tolist())
+        changed = Hypothesis("", "", change).apply(samples)
+        assert changed is not None
+        fits[turned] = fit_evidence(chain, changed, HAND_BUILT)
+    return fits
+
+
+def _require_right_links(chain: Chain, data: Sequence[Measurement], best: Evidence) -> None:
+    """Raise an error if images fit an arm with camera and board on each other's links, and not as stated."""
+    rigs = [item.rig for item in data if item.rig is not None]
+    if len(rigs) < len(data) or not all(rig.has_links_to_exchange for rig in rigs):
+        return
+    samples = _samples([item.replace(rig=item.rig.with_exchanged_links()) for item in data if item.rig])
+    exchanged = max(_fit_signs(chain, samples).values(), key=lambda each: each.log)
+    if (
+        exchanged.log > best.log + MIN_LOG_RATIO
+        and exchanged.length_scale < _MAX_EXCHANGED * best.length_scale
+    ):
+        camera, board = rigs[0].cameras[0], rigs[0].boards[0]
+        raise InvalidArgumentError(
+            f"{rigs[0].source or 'rig'}: the images show camera {camera.name!r} on link {board.link!r} and "
+            f"board {board.name!r} on link {camera.link!r}; expected these links, the reverse of those stated"
+        )
 
 
 def simulate_decision(chain: Chain, q: Array, rng: np.random.Generator) -> SignDecision:

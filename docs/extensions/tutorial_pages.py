@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import posixpath
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,20 @@ def copy_notebooks(app: Sphinx) -> None:
         shutil.copyfile(executed if is_current else notebook, source / "tutorials" / notebook.name)
 
 
+def link_pages(app: Sphinx, name: str, source: list[str]) -> None:
+    """Replace links to notebooks by links to their pages.
+
+    Args:
+        app: Running build.
+        name: Name of a page.
+        source: Its text, which is replaced.
+    """
+    folder = posixpath.dirname(name)
+    notebooks = posixpath.relpath("../notebooks", folder or ".")
+    pages = posixpath.relpath("tutorials", folder or ".")
+    source[0] = re.sub(rf"\]\({re.escape(notebooks)}/(\w+\.ipynb)", rf"]({pages}/\1", source[0])
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the extension.
 
@@ -32,4 +48,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
         Properties of the extension.
     """
     app.connect("builder-inited", copy_notebooks)
+    app.connect("source-read", link_pages)
     return {"parallel_read_safe": True}

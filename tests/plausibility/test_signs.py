@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from paper_arms import photograph
 from servo_arms import JOINTS, RANGES, SO101, TIP, ServoArm, lerobot_degrees
 
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility import decide_signs
 from dhcal_pin.plausibility.signs import known_signs
@@ -135,6 +138,37 @@ def test_images_and_few_samples_leave_all_signs_open():
     signs = decide_signs(NOMINAL, [measured(arm, rng, 5, "position")])
     assert not signs.is_compared
     assert "--turned" in signs.questions[0]
+
+
+def test_a_urdf_with_other_zeros_is_named():
+    """Followed advice helps: with the zeros of the servos in the URDF nothing is said."""
+    rng = np.random.default_rng(4)
+    arm = ServoArm.random(rng, 10.0, 0)
+    poses = measured(arm, rng, 25, "pose")
+    other = poses.replace(q=poses.q + np.deg2rad([0, 90, -90, 0, 0]))
+    reasons = [
+        " ".join(calibrate(NOMINAL, data, "low-cost,base,tool", session="off").verdict.reasons)
+        for data in (poses, other)
+    ]
+    assert "zeros" not in reasons[0]
+    assert re.search(r"shoulder_lift by -(8|9|10)\d?°, elbow_flex by (8|9|10)\d?°.*servo file", reasons[1])
+
+
+@pytest.mark.parametrize("seed", [2, *(pytest.param(i, marks=pytest.mark.slow) for i in range(3, 15))])
+def test_exchanged_links_of_camera_and_board_are_named(seed):
+    shot = photograph(seed, 12 if seed % 2 else 25)
+    images = shot.images.with_rig(shot.images.rig.with_exchanged_links())
+    camera, board = shot.images.rig.camera_mounts[0].moves, shot.images.rig.board_mounts[0].moves
+    links = ["tip" if moves else "world" for moves in (board, camera)]
+    stated = replace(images.rig, **{
+        name: tuple(replace(each, link=link) for each in getattr(images.rig, name))
+        for name, link in zip(("cameras", "boards"), links, strict=True)
+    })  # fmt: skip
+    message = (
+        f"camera 'cam' on link '{links[1]}' and board 'paper' on link '{links[0]}'; expected these links"
+    )
+    with pytest.raises(InvalidArgumentError, match=message):
+        decide_signs(shot.nominal, [images.with_rig(stated)])
 
 
 def test_turned_joints_turn_the_other_way_in_the_urdf():

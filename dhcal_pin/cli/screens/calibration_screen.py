@@ -42,7 +42,13 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     signs = fit.signs
     turned = [f"{names[job.robot]}: warning: {signs.note}"] if signs and signs.turned else []
     warnings = [text for text in all_warnings if text not in turned]
-    notes = [f"note: {names[p]}: {text}" for p, texts in outcome.notes.items() for text in texts]
+    moved = [f"warning: {text}" for text in outcome.moved_zeros]
+    notes = [
+        f"note: {names[p]}: {text}"
+        for p, texts in outcome.notes.items()
+        for text in texts
+        if text not in outcome.moved_zeros
+    ]
     hints = [f"hint: {outcome.hint}"] if outcome.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
     by_file = summary.file_table([names[path] for path in outcome.fitted], fit.file_comparisons)
@@ -57,7 +63,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(notes, noun="note on the files", rank=1),
         Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
-        Block(turned, "yellow"),
+        Block([*turned, *moved], "yellow"),
         Block([*advice, *warnings], "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
         Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),

@@ -365,8 +365,8 @@ def _require_joints(table: DataTable, chain: Chain, prefix: str) -> None:
         units = {name: "mm" if joint_units(chain, name) is LENGTHS else "deg" for name in chain.joint_names}
         expected = ",".join(f"{prefix}{name}[{unit}]" for name, unit in units.items())
         raise FileFormatError(
-            f"{table.header_location}: no column for joint {prefix + missing[0]!r}; "
-            f"this robot needs {expected}"
+            f"{table.header_location}: no column for joint {prefix + missing[0]!r}; this robot needs "
+            f"{expected}; if the measured point does not move with it, choose another tip link"
         )
 
 
