@@ -101,8 +101,7 @@ def _move_texts(result: Plan) -> list[str]:
         texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
     if blocked:
         texts.append(f"The straight moves to poses {', '.join(blocked)} collide; no way around was found.")
-    free = "The straight moves in joint space from pose to pose are free of collisions of the shapes that are "
-    return texts or [f"{free}checked."]
+    return texts or ["The straight moves in joint space from pose to pose are free of checked collisions."]
 
 
 def _program_content(done: Planned, path: str) -> str:
