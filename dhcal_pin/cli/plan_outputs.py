@@ -101,7 +101,7 @@ def _move_texts(result: Plan) -> list[str]:
         texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
     if blocked:
         texts.append(f"The straight moves to poses {', '.join(blocked)} collide; no way around was found.")
-    return texts or ["The straight moves in joint space from pose to pose are free of checked collisions."]
+    return texts or ["The straight moves in joint space are free of collisions as far as these are checked."]
 
 
 def _program_content(done: Planned, path: str) -> str:
