@@ -49,7 +49,8 @@ def tasks(folder: Path) -> dict[str, Callable[[], object]]:
         "calibrate 1,000 poses, geometry": lambda: calibrate(
             chain, poses, sets, extend="none", session="off"
         ),
-        "calibrate 1,000 poses": lambda: calibrate(chain, poses, sets),
+        "calibrate 1,000 poses": lambda: calibrate(chain, poses, sets, session="off"),
+        "calibrate 1,000 poses, with session": lambda: calibrate(chain, poses, sets),
         "plan 20 poses of 500 candidates": lambda: plan(chain, 20, noise=Noise(1e-4, 1e-4), candidates=500),
     }
 

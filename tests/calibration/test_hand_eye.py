@@ -66,6 +66,7 @@ def test_rejected_corners_do_not_hide_a_bent_board():
     """The corners at the ends of the board disagree with the majority; they are right."""
     fit = hand_eye("panda", "warped", 11, True, loss="auto", n_images=20)
     check_cause(fit, "warped")
+    assert fit.hand_eye is not None
     assert "it is not flat" in fit.hand_eye.causes[0].text
 
 

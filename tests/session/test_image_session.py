@@ -121,8 +121,9 @@ def test_play_is_no_change_of_a_joint():
         find_image_session(nominal, [images.replace(q=q)], (), calibrated, arm)
         for arm in (INDUSTRIAL, ARM_TYPES[LOW_COST])
     ]
-    assert [[event.kind for event in each.events] for each in found] == [["joint"], []]
-    assert found[1].changes.is_empty
+    events = [[event.kind for event in each.events] for each in found if each]
+    assert events == [["joint"], []]
+    assert not any(each.changes.zeros for each in found[1:] if each)
 
 
 @pytest.mark.slow
