@@ -97,7 +97,7 @@ def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, re
             limit = 0.25 * arm_error(nominal, truth, images)
         ratios.append(arm_error(fit.chain, truth, images) / limit)
     assert np.mean(named) >= (0.8 if is_slow else 1.0)
-    assert np.median(ratios) < (1.5 if is_slow else 1.0)
+    assert np.median(ratios) < (2.0 if is_slow else 1.0)
 
 
 def test_changes_need_images_alone_and_of_one_board():
