@@ -153,13 +153,13 @@ def test_curves_of_high_order_have_a_prior_width_of_their_own(has_fine_lines):
         is_line = [p.name.endswith(("sin40", "cos55")) for p in errors.parameters]
         truth = errors.at(2e-5 * np.array(is_line))
         data = Pose.simulate(truth, data.q, Noise(2e-5, 4e-5), np.random.default_rng(0))
-    fit = calibrate(arm, data)
+    fit = calibrate(arm, data, session="off")
     assert fit.extension is not None
     assert ("fine-curves" in fit.extension.families) == has_fine_lines
     if has_fine_lines:
         widths = {trial.family: trial.prior_width for trial in fit.extension.trials}
         assert widths["fine-curves"] < 0.3 * widths["curves"]
-        without = calibrate(arm, data, extend="harmonics,compliance,curves")
+        without = calibrate(arm, data, extend="harmonics,compliance,curves", session="off")
         q = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 6))
         offsets = [one.chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3] for one in (fit, without)]
         assert np.std(offsets[0]) < 0.9 * np.std(offsets[1])

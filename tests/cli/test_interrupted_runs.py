@@ -19,7 +19,7 @@ def outcomes(folder: Path, command: str, name: str, n_steps: int, n_times: int) 
     return json.loads(done.stdout.splitlines()[-1])
 
 
-COMMANDS = [("report", "SIGKILL"), ("in place", "SIGINT"), ("study", "SIGINT")]
+COMMANDS = [("report", "SIGKILL"), ("study", "SIGINT")]
 
 
 @pytest.mark.parametrize(("command", "name"), COMMANDS)

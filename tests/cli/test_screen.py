@@ -17,6 +17,7 @@ from slow_cases import some_slow
 from dhcal_pin.cli.screens.screen import HEIGHT, WIDTH, Block, Screen, cell_width, fold, section_blocks
 from dhcal_pin.formatting import Table
 from dhcal_pin.measurements import KINDS
+from dhcal_pin.paper import simulations
 from dhcal_pin.report.document import Section
 
 ARMS = ("experiment.dh.toml", "sim_6dof.dh.toml", "scara.urdf", "planar_2r.urdf")
@@ -136,7 +137,9 @@ def test_corrections_are_ordered_by_their_size(run, robot_folder):
     ],
     ids=lambda command: command[0],
 )
-def test_other_commands(run, robot_folder, command):
+def test_other_commands(run, robot_folder, undrawn, monkeypatch, command):
+    rows = simulations.simulation_rows
+    monkeypatch.setattr(simulations, "simulation_rows", lambda: rows(seeds=2))
     status, _, err = run(*command)
     assert status == 0, err
     assert_fits(err)
