@@ -22,7 +22,7 @@ class ImageJoints(NamedTuple):
     """Joint values of images."""
 
     joints: dict[str, dict[str, str]]  # Cells of the joint columns by header, for the name of each image
-    notes: list[str]  # Sentences on images during which the robot moved
+    notes: list[str]  # Sentences on rows without an image, or on images during which the robot moved
     is_ordered: bool = False  # Whether the images are in the order in which they were taken
 
 
@@ -70,7 +70,15 @@ def read_joint_table(path: PathLike, images: Sequence[str]) -> ImageJoints:
         }
         for image in images
     }
-    return ImageJoints(joints, [], is_ordered)
+    shown = {_stem(image) for image in images}
+    unused = [table.cells[row][index].strip() for stem, row in rows.items() if stem not in shown]
+    notes = []
+    if unused:
+        count = "1 row has" if len(unused) == 1 else f"{len(unused)} rows have"
+        notes = [
+            f"{table.source}: {count} no image, such as {unused[0]!r}; check that each row has its own image"
+        ]
+    return ImageJoints(joints, notes, is_ordered)
 
 
 def _stem(name: str) -> str:
