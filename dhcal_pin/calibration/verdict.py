@@ -25,7 +25,7 @@ from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
-from .cameras.image_checks import small_ranges
+from .cameras.image_checks import MAX_IMAGE_OUTLIER_SHARE, small_ranges
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -60,8 +60,6 @@ MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 MAX_ZERO = np.deg2rad(40.0)
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
-# Share of outliers above which the other images do not decide.
-MAX_IMAGE_OUTLIER_SHARE = 0.5
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.

@@ -9,6 +9,7 @@ import pytest
 from camera_setups import ARMS, simulate, wrong_arm
 
 from dhcal_pin import calibrate
+from dhcal_pin.calibration.verdict import judge
 
 MESSAGE = r"do not move as the joint values say: the rotations between images differ by [1-9]\d°"
 
@@ -28,6 +29,15 @@ def test_images_of_another_arm_are_refused(seed):
     other = wrong_arm(chain, 1.0, rng)
     setup = simulate(chain, other, rng, is_on_wrist=seed % 2 == 0, n_images=12, sigma=0.3)
     require_refusal(calibrate(chain, setup.images))
+
+
+def test_images_that_are_mostly_outliers_are_refused(monkeypatch):
+    chain = ARMS["ur10"]()
+    rng = np.random.default_rng(3)
+    fit = calibrate(chain, simulate(chain, chain, rng, is_on_wrist=True, n_images=10, sigma=0.3).images)
+    for share, status in ((0.4, "caution"), (0.6, "refused")):
+        monkeypatch.setattr(type(fit), "n_outliers", int(share * fit.n_samples))
+        assert judge(fit).status == status
 
 
 def test_joint_values_of_other_images_are_refused():

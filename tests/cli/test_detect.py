@@ -60,6 +60,8 @@ def test_corners_of_photographs_with_joint_values(run, photographs):
         assert 0 <= float(row["u[px]"]) < 1600
         assert 0 <= float(row["v[px]"]) < 1200
         assert 0 <= int(row["corner"]) < 24
+    Path("joints.csv").write_text("\n".join([*table, "99.png,1,2"]))
+    assert "joints.csv: 1 row has no image, such as '99.png'" in unfolded(run(*command)[2])
 
 
 @pytest.mark.parametrize(

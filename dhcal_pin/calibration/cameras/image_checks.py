@@ -28,8 +28,8 @@ from .stages import fitted_error
 MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 10, 200
 # Shifts of the joint values by rows that are a mistake of their own, and are named as such.
 SHIFTS = (-2, -1, 1, 2)
-# Share of rejected corners above which a fit says nothing.
-MAX_REJECTED_SHARE = 0.5
+# Share of outliers above which a fit says nothing.
+MAX_IMAGE_OUTLIER_SHARE = 0.5
 
 
 def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
@@ -38,7 +38,7 @@ def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
     A fit whose corners are within `max_error` [px] of the model, and not mostly rejected, is not questioned.
     """
     rejected = np.concatenate([weights <= ZERO_WEIGHT for weights in fit.weights])
-    if fitted_error(fit).pixels <= max_error and rejected.mean() <= MAX_REJECTED_SHARE:
+    if fitted_error(fit).pixels <= max_error and rejected.mean() <= MAX_IMAGE_OUTLIER_SHARE:
         return ""
     images = [item for item in fit.data if isinstance(item, CameraCorners)]
     if len(images) < len(fit.data):
