@@ -101,7 +101,7 @@ def test_franka_with_a_camera_on_the_wrist(franka, repeats, seed):
 
 @pytest.mark.parametrize(
     "focal_and_centre",
-    some_slow([((640, 640, 640, 360),), ((655, 630, 655, 350),), ((np.nan,) * 4,)], {2}),
+    some_slow([((640, 640, 640, 360),), ((655, 630, 655, 350),), ((np.nan,) * 4,)], ()),
     ids=["stated", "wrong", "unknown"],
 )
 def test_franka_with_a_lens_that_is_estimated(franka, focal_and_centre):
@@ -142,6 +142,7 @@ def test_franka_on_the_other_side_of_joint_space(franka, sign):
     assert np.all(calibrated <= [1.20, 0.95])
 
 
+@pytest.mark.slow
 def test_noise_that_grows_near_the_board_improves_other_images(franka, monkeypatch):
     """Images are taken from 0.2 to 0.5 m, and the arm errs by millimetres rather than by pixels."""
     arm, images, positions = franka
@@ -270,7 +271,7 @@ def test_flange_poses_without_a_robot(flange_images):
     camera = replace(images.rig.cameras[0], values=lens_of_images(images), intrinsics="fixed")
     images = images.with_rig(replace(images.rig, cameras=(camera,)))
     squares = []
-    for i in range(images.n_images):
+    for i in range(0, images.n_images, 3):
         fit = dh.calibrate(
             flange, images.take(images.image != i), "camera,board", priors="none", loss="linear"
         )

@@ -623,7 +623,7 @@ def extend(
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    final = reweight(extended, (stage,), groups, max_iterations, progress, effective_parameters, loose=False)
+    final = reweight(extended, (stage,), groups, max_iterations, progress, effective_parameters)
     return final, extension
 
 

@@ -128,7 +128,6 @@ def reweight(
     max_iterations: int,
     progress: Progress | None,
     count_determined: CountDetermined = observable_directions,
-    loose: bool = True,
 ) -> Fit:
     """Solve a problem again until noise scales, prior widths and robust weights have settled."""
     expected = fit.problem.weights
@@ -136,8 +135,8 @@ def reweight(
     for rounds_left in reversed(range(MAX_ROUNDS)):
         if progress:
             progress(PHASE, MAX_ROUNDS - rounds_left, MAX_ROUNDS)
-        loose = loose and rounds_left > 1
-        state = _next_round(state, groups, expected, max_iterations, count_determined, loose)
+        is_last = rounds_left <= 1
+        state = _next_round(state, groups, expected, max_iterations, count_determined, is_last)
         if state.is_done:
             break
     return replace(state.fit, stage=state.stages[-1])
@@ -149,7 +148,7 @@ def _next_round(
     expected: Array,
     max_iterations: int,
     count_determined: CountDetermined,
-    loose: bool,
+    is_last: bool,
 ) -> ReweightState:
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
     fit, stage = state.fit, state.stages[0]
@@ -182,7 +181,7 @@ def _next_round(
         return replace(state, stages=state.stages[1:], weight_change=WeightChange())
     if has_settled and state.is_final:
         return replace(state, is_done=True)
-    is_final = has_settled or not loose
+    is_final = has_settled or is_last
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
         # The rows are the same: continue the previous iteration with the new priors.
         problem = problem.with_prior_weights(priors)

@@ -426,14 +426,12 @@ class UnfactoredSystem(TriangularSystem):
 def uses_normal_equations(problem: Problem) -> bool:
     """Check whether the normal equations of a problem take much less time than the R factor of its rows.
 
-    They are accurate if all unknowns have priors. There are many transmission coefficients, more rows than
-    unknowns, and one configuration per row.
+    They are accurate if all unknowns have priors. There are many transmission coefficients, and one
+    configuration per row.
     """
     n_coefficients = sum(parameter.coefficient_index is not None for parameter in problem.errors.parameters)
-    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     return (
         n_coefficients > MANY_COLUMNS
-        and n_rows > 2 * len(problem.weights)
         and not problem.instrument_parameters
         and bool(problem.weights.all())
         and all(map(_is_structured, problem.data))

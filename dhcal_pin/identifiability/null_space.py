@@ -95,7 +95,7 @@ class ObservabilityProbe:
     @property
     def n_repetitions(self) -> int:
         """Number of hypothetical samples per measured sample, so that there are enough rows."""
-        return 1 + _ROWS_PER_UNKNOWN * len(self.x) // sum(len(item.rows) for item in self.problem.data)
+        return 1 + _ROWS_PER_UNKNOWN * len(self.x) // self.n_equations
 
     @property
     def n_equations(self) -> int:

@@ -151,7 +151,7 @@ def test_unknown_link_of_a_sidecar_is_named(calibrated, tmp_path):
 
 @pytest.mark.parametrize(
     "series",
-    some_slow(["Series_D/measurements_iso_cubes", "Series_B/measurements_joint_configurations"], [0]),
+    some_slow(["Series_D/measurements_iso_cubes", "Series_B/measurements_joint_configurations"], ()),
 )
 def test_urdf_alone_of_half_a_real_series(series):
     """The other half is judged, which was not fitted."""

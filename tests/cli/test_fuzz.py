@@ -49,7 +49,7 @@ def survive(data: bytes) -> None:
         assert robot.read_bytes() == data
 
 
-@settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=LENIENT)
+@settings(max_examples=75, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_any_robot(data, mutations):
     survive(mutated(data, mutations))

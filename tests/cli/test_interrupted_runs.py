@@ -9,6 +9,7 @@ from pathlib import Path
 
 import interrupted_runs
 import pytest
+from slow_cases import some_slow
 
 
 def outcomes(folder: Path, command: str, name: str, n_steps: int, n_times: int) -> dict[str, int]:
@@ -19,7 +20,7 @@ def outcomes(folder: Path, command: str, name: str, n_steps: int, n_times: int) 
     return json.loads(done.stdout.splitlines()[-1])
 
 
-COMMANDS = [("report", "SIGKILL"), ("study", "SIGINT")]
+COMMANDS = some_slow([("report", "SIGKILL"), ("study", "SIGINT")], {0})
 
 
 @pytest.mark.parametrize(("command", "name"), COMMANDS)

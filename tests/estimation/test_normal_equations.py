@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from robots import measured_arm, random_joints, random_table
+from slow_cases import some_slow
 
 import dhcal_pin.estimation.folds as folds
 import dhcal_pin.estimation.problem as problem_module
@@ -112,16 +113,17 @@ def test_each_member_agrees_with_the_triangular_system():
 def test_samples_that_determine_few_unknowns():
     """Ten poses for 443 unknowns: the priors decide on the others."""
     problem, x = curved_problem(m=10)
-    assert not uses_normal_equations(problem)
+    assert uses_normal_equations(problem)
     system, triangular = normal_equations(problem, x), linearize_and_factor(problem, x, small_angle=False)
     root, expected = (each.sqrt_covariance(problem.weights)[0] for each in (system, triangular))
     np.testing.assert_allclose(np.linalg.norm(root, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
     assert triangular.merged(system).cost == pytest.approx(2 * triangular.cost, rel=1e-9)
 
 
-def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch):
-    """The sets have 421 unknowns; the rows of 220 poses are three times as many."""
-    problem, _ = curved_problem(m=220, sets="minimal,base,tool,compliance,harmonics,curves")
+@pytest.mark.parametrize("m", some_slow([60, 220], {0}))
+def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch, m):
+    """The sets have 421 unknowns; 60 poses have fewer rows, 220 poses three times as many."""
+    problem, _ = curved_problem(m=m, sets="minimal,base,tool,compliance,harmonics,curves")
     arm, data = problem.errors.chain, problem.data
     fit = calibrate(arm, data)
     for module in (problem_module, folds):

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from robots import paper, robot_file
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
@@ -344,11 +345,12 @@ def test_similar_poses_name_the_joint_to_move():
     assert all("joint_5" in text for text in texts)
 
 
+@pytest.mark.parametrize("seeds", some_slow([1, 3], {0}))
 @pytest.mark.parametrize("arm", [*TABLES, "ur10", "tiago", "sim_6dof_actual"])
-def test_poses_over_the_full_range_need_no_advice(arm):
+def test_poses_over_the_full_range_need_no_advice(arm, seeds):
     """The rank is 4 per revolute joint, 2 per prismatic joint and 6, wherever the tracker is."""
     chain = load(arm)
-    for seed in range(3):
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
         placed = replace(chain, base=se3.exp6(rng.normal(0, 1, 6)), tool=se3.exp6(rng.normal(0, 0.5, 6)))
         data = Pose.simulate(placed, draw_q(chain, 60, seed), Noise(1e-4, 1e-4), rng)

@@ -114,7 +114,7 @@ def test_every_planned_pose_has_the_board_in_view(name):
     arm, rig = setup(name)
     images = PlannedImages(rig, distance=(0.2, 0.8), max_angle=np.deg2rad(50), margin=30.0)
     space = WorkspaceConstraints() if name == "talos_full_v2-head" else FLOOR
-    found = plan(arm, 12, noise=NOISE, images=images, candidates=150, space=space)
+    found = plan(arm, 12, noise=NOISE, images=images, candidates=60, space=space)
     pixels, distances, angles = opencv_view(arm, rig, found.q)
     assert np.all((pixels >= 30) & (pixels <= [1249, 929]))
     assert np.all((distances >= 0.2) & (distances <= 0.8))
@@ -309,9 +309,9 @@ def test_predicted_error_is_that_of_the_solver():
     arm, rig = setup("ur10-fixed")
     images = PlannedImages(rig)
     task = np.random.default_rng(5).uniform(*joint_range(arm), (40, arm.n_joints))
-    found = plan(arm, 15, noise=NOISE, images=images, candidates=120, space=FLOOR, task=task)
+    found = plan(arm, 15, noise=NOISE, images=images, candidates=60, space=FLOOR, task=task)
     views = sampler(arm, images)
-    drawn = views.draw(120, np.random.default_rng(7))
+    drawn = views.draw(60, np.random.default_rng(7))
     random = np.array([q for q in drawn if views.is_feasible(q)])[:15]
     errors, nominal = found.information.errors, rig.board_in_camera(0, 0, arm.poses(task))
     middle, rng = np.array([*rig.boards[0].points.mean(0), 1.0]), np.random.default_rng(6)
@@ -427,7 +427,7 @@ def test_predicted_error_contains_that_of_unknown_corners(seeds):
     rig = small_board(rig)
     rng = np.random.default_rng(8)
     task = rng.uniform(*joint_range(arm), (50, arm.n_joints))
-    options = {"noise": Noise(), "parameters": SETS, "candidates": 150, "space": FLOOR, "task": task}
+    options = {"noise": Noise(), "parameters": SETS, "candidates": 60, "space": FLOOR, "task": task}
     found = plan(arm, 8, images=PlannedImages(rig), **options)
     squares = []
     for _ in range(seeds):
@@ -453,7 +453,7 @@ def test_plan_says_what_the_corners_of_a_board_cost_if_they_must_be_estimated():
     """With `points = "auto"` the corners are exact in the plan; the error otherwise is stated beside it."""
     arm, rig = setup("ur10-wrist")
     rig = with_points(rig, columns=5, rows=4)
-    options = {"noise": NOISE, "candidates": 40, "space": FLOOR}
+    options = {"noise": NOISE, "candidates": 24, "space": FLOOR}
     auto = plan(arm, 5, images=PlannedImages(rig), **options)
     prior = plan(arm, 5, images=PlannedImages(with_points(rig, has_free_points=True)), **options)
     fixed = plan(arm, 5, images=PlannedImages(with_points(rig, has_exact_points=True)), **options)

@@ -244,7 +244,7 @@ def curve(sizes, seeds: int) -> list[tuple[float, float]]:
 
 
 def test_predicted_errors_agree_with_simulation():
-    for predicted, reached in curve((10, 24), 10):
+    for predicted, reached in curve((16,), 10):
         # The RMS of ten robots with thirty directions each has a standard deviation of 4 %.
         assert predicted == pytest.approx(reached, rel=0.15)
 
