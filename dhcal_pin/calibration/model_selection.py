@@ -312,17 +312,21 @@ class _Candidates:
         reduced = self.rows.select(columns)
         family, x, expected = self.family[columns], self.x[columns], self.problem.weights[columns]
         # Displacements of images that are smaller than the noise of their corners may leave nothing.
-        noise = reduced.noise_after(1.0, np.zeros(len(x)), np.zeros((len(x), len(x)))) or MIN_NOISE_RATIO
+        nothing = np.zeros((len(x), len(x)))
+        noise = reduced.noise_after(1.0, np.zeros(len(x)), nothing, 0.0) or MIN_NOISE_RATIO
         smallest = MIN_NOISE_RATIO * noise
         rounds = 0
         while True:
             weights = self.weights(widths)[columns]
             rows = reduced.at(noise)
             root = rows.sqrt_covariance(weights)[0]
-            determined = 1 - np.einsum("ij,ij->i", root, root) * weights**2
+            from_priors = np.einsum("ij,ij->i", root, root) * weights**2
+            n_determined = root.shape[1] - float(from_priors.sum())
             step, _ = rows.solve(weights, x)
-            updated_noise = max(reduced.noise_after(noise, step, root), smallest)
-            updated = {name: _best_width(x + step, determined, expected, family == name) for name in widths}
+            updated_noise = max(reduced.noise_after(noise, step, root, n_determined), smallest)
+            updated = {
+                name: _best_width(x + step, 1 - from_priors, expected, family == name) for name in widths
+            }
             changes = [np.log(updated_noise / noise)] + [np.log(updated[k] / widths[k]) for k in widths]
             rounds += 1
             if np.abs(changes).max() < EVIDENCE_TOL or rounds == MAX_EVIDENCE_ROUNDS:

@@ -225,16 +225,18 @@ class NoisyRows:
         """Return the sum of the logarithms of the standard deviations of all rows."""
         return 0.5 * sum(one.n_rows * float(np.log(one.variance(noise))) for one in self.classes)
 
-    def noise_after(self, noise: float, step: Array, root: Array) -> float:
+    def noise_after(self, noise: float, step: Array, root: Array, n_determined: float) -> float:
         """Return the noise that the rows show after a step (p,), from the noise before.
 
-        The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`.
+        The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`. The rows
+        of all classes together determine a number of unknowns, the sum of the numbers of each class.
         """
         total = weight = smallest = 0.0
-        for one in self.classes:
+        others = [one.system.predicted_variance(root) / one.variance(noise) for one in self.classes[1:]]
+        for one, determined in zip(self.classes, (n_determined - sum(others), *others), strict=True):
             if one.share and one.n_rows:
                 variance = one.variance(noise)
-                freedom = one.n_rows - one.system.predicted_variance(root) / variance
+                freedom = one.n_rows - determined
                 excess = one.system.squared_error(step) - freedom * (1 - one.share)
                 total += excess * one.share / variance**2
                 weight += freedom * (one.share / variance) ** 2

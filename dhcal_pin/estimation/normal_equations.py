@@ -133,7 +133,7 @@ class NormalEquations(TriangularSystem):
         return root, scale
 
     def predicted_variance(self, root: Array) -> float:
-        """Compute the variance of all rows that uncertain unknowns cause."""
-        upper = np.triu(lapack.dlauum(root)[0])
+        """Compute the variance of all rows that uncertain unknowns cause; the root is upper triangular."""
+        upper = lapack.dlauum(root)[0]
         products = self.products[:-1, :-1]
         return 2 * float(np.vdot(products, upper)) - float(np.diag(products) @ np.diag(upper))
