@@ -43,8 +43,5 @@ def describe_moves(before: ServoFile, after: ServoFile) -> list[str]:
     if not moves:
         return []
     counts = ", ".join(f"{name} {count:+d}" for name, count in moves.items())
-    limits = (
-        "; in LeRobot the position limits move with them, so approach the ends slowly, and do not record the "
-        "ranges again, whose middle is the zero"
-    )
-    return [f"zeros of the servos move by whole counts: {counts}{limits if after.lerobot else ''}"]
+    limits = "; the position limits of LeRobot move, too: approach the ends slowly, keep the recorded ranges"
+    return [f"zeros of the servos move by counts: {counts}{limits if after.lerobot else ''}"]

@@ -48,7 +48,7 @@ def test_all_files_give_the_same_poses_for_the_same_counts(arm, run):
         assert status == 0
         assert "verdict: ok" in err
         # It belongs to the first screen: the arm moves differently with the new file.
-        assert "warning: zeros of the servos move by whole counts: " in err
+        assert "warning: zeros of the servos move by counts: " in err
     result = json.loads(Path("arm.json.result.json").read_text())
     assert set(result["signs"]["turned"]) == set(arm.wrong)
     assert {"lerobot", "urdf", "sidecar", "servos"} <= set(result["files"])
