@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def content_digests(contents: Mapping[PathLike, str | bytes]) -> dict[str, str]:
     }
 
 
+@cache
 def versions() -> dict[str, str]:
     """Return the versions of the packages that compute results."""
     return {name: metadata.version(name) for name in ("dhcal-pin", "pin", "numpy", "scipy")}

@@ -167,7 +167,7 @@ def list_first(items: Sequence[object]) -> str:
 
 def cell_width(text: str) -> int:
     """Count the columns of a terminal that a text takes."""
-    return sum(map(_char_width, text))
+    return len(text) if text.isascii() else sum(map(_char_width, text))
 
 
 def _char_width(char: str) -> int:
