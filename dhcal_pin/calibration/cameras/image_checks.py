@@ -25,7 +25,7 @@ from .stages import fitted_error
 
 # Median difference of the angles from which images are unrelated [rad], and smallest and largest number of
 # images that are compared.
-MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 10, 200
+MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 6, 200
 # Shifts of the joint values by rows that are a mistake of their own, and are named as such.
 SHIFTS = (-2, -1, 1, 2)
 # Share of outliers above which a fit says nothing.
