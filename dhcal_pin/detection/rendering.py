@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -74,9 +75,10 @@ def render_images(
 ) -> Iterator[Array]:
     """Render images of boards by one camera."""
     quality = quality or ImageQuality()
-    sight = _sight_of_pixel_corners(camera)
+    sight, print_of = _sight_of_pixel_corners(camera), cache(_print_of)
     for boards in views:
-        image = _ideal_image(sight, boards, quality.n_points)
+        sheets = [(print_of(board), se3.inverse(pose)) for board, pose in boards]
+        image = _ideal_image(sight, sheets, quality.n_points)
         if quality.blur_std:
             image = require_opencv().GaussianBlur(image, (0, 0), quality.blur_std)
         image = image + quality.noise_std * rng.standard_normal(image.shape)
@@ -90,13 +92,15 @@ def _sight_of_pixel_corners(camera: Camera) -> Array:
     return plane.reshape(2, *u.shape)
 
 
-def _ideal_image(sight: Array, boards: Sequence[tuple[Board, Array]], n: int) -> Array:
-    """Return the mean grey values of all pixels, (height, width), from n·n points per pixel at the edges."""
+def _ideal_image(sight: Array, sheets: Sequence[tuple[_Print, Array]], n: int) -> Array:
+    """Return the mean grey values of all pixels, (height, width), from n·n points per pixel at the edges.
+
+    With each print is the pose of the camera in its board.
+    """
     shape = sight.shape[1] - 1, sight.shape[2] - 1
     flat = sight.reshape(2, -1)
     image, nearest = np.full(shape, BACKGROUND), np.full(shape, np.inf)
     has_edges = np.zeros(shape, bool)
-    sheets = [(_print_of(board), se3.inverse(pose)) for board, pose in boards]
     for sheet, inverse in sheets:
         depth, points = _hits(flat, inverse)
         cells = np.where(np.isfinite(depth), sheet.cells(*points), 0).reshape(sight.shape[1:])

@@ -38,7 +38,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from .. import se3
 from .._typing import Array
@@ -153,13 +153,14 @@ class ChiSquare:
 
     @property
     def p_value(self) -> float:
-        """Probability of a chi-square at least this large if the hypothesis is true."""
-        return float(stats.chi2.sf(self.value - self.constant, self.freedom - self.constant))
+        """Probability of a chi-square at least this large if the hypothesis is true; NaN without freedom."""
+        freedom = self.freedom - self.constant
+        return float(special.chdtrc(freedom, max(self.value - self.constant, 0.0))) if freedom > 0 else np.nan
 
     @property
     def usual(self) -> tuple[float, float]:
         """Interval that contains the reduced chi-square of 95 % of cases if the hypothesis is true."""
-        ends = (stats.chi2.ppf(p, self.freedom - self.constant) for p in (0.025, 0.975))
+        ends = (special.chdtri(self.freedom - self.constant, 1 - p) for p in (0.025, 0.975))
         low, high = ((self.constant + float(end)) / max(self.freedom, 1) for end in ends)
         return low, high
 
@@ -435,7 +436,7 @@ def _lacking(fits: Sequence[ModelFit]) -> dict[str, float]:
         gain, added, remaining = (
             sum(getattr(each, key) for each in gains) for key in ("gain", "added", "remaining")
         )
-        p_value = float(stats.f.sf(gain / added, added, remaining))
+        p_value = float(special.fdtrc(added, remaining, gain / added))
         if p_value < LACKING_P / len(fits[0].gains):
             found[name] = p_value
     return dict(sorted(found.items(), key=lambda item: (item[1], item[0])))
