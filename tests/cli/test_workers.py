@@ -12,13 +12,16 @@ import psutil
 import pytest
 from command_line import positions_csv
 from robots import URDF
+from slow_cases import some_slow
 from study_runs import SMALL_STUDY
 
 STUDY = SMALL_STUDY.replace("seeds = 120", "seeds = 5000")
 JOB = '[[job]]\nrobot = "arm.dh.toml"\ndata = "data.csv"\noutput = "{}.urdf"\n'
 
 
-@pytest.mark.parametrize("command", ["study s.study.toml -o s.csv", "calibrate a.fleet.toml -o f.csv"])
+@pytest.mark.parametrize(
+    "command", some_slow(["study s.study.toml -o s.csv", "calibrate a.fleet.toml -o f.csv"], {1})
+)
 def test_workers_end_with_a_killed_command(tmp_path, command):
     shutil.copy(URDF / "experiment.dh.toml", tmp_path / "arm.dh.toml")
     (tmp_path / "data.csv").write_text(positions_csv(20))
