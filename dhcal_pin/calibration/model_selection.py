@@ -345,14 +345,14 @@ class _Candidates:
         squares = [fold.squared_error(model.noise, weights, self.x, columns) for fold in self.folds]
         return float(np.sqrt(sum(squares) / sum(fold.n_rows for fold in self.folds)))
 
-    def trial(self, name: str, current: Model) -> FamilyTrial:
-        """Try a family on top of those of a model."""
+    def trial(self, name: str, current: Model) -> tuple[FamilyTrial, Model]:
+        """Try a family on top of those of a model; return the model with it, too."""
         model = self.maximize_evidence({**current.widths, name: 1.0})
         gain = model.log_evidence - current.log_evidence
         before = after = float("nan")
         if gain > MIN_LOG_BAYES_FACTOR:
             before, after = self.cv_error(current), self.cv_error(model)
-        return FamilyTrial(name, before, after, gain, model.widths[name])
+        return FamilyTrial(name, before, after, gain, model.widths[name]), model
 
 
 def _factor_folds(
@@ -429,12 +429,11 @@ def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tupl
     remaining, chosen = list(names), list[FamilyTrial]()
     while True:
         trials = [candidates.trial(name, model) for name in remaining]
-        supported = [trial for trial in trials if trial.is_supported]
+        supported = [each for each in trials if each[0].is_supported]
         if not supported:
-            return [*chosen, *trials], model
-        best = min(supported, key=lambda trial: trial.cv_after)
+            return [*chosen, *(trial for trial, _ in trials)], model
+        best, model = min(supported, key=lambda each: each[0].cv_after)
         chosen.append(replace(best, is_selected=True))
-        model = candidates.maximize_evidence({**model.widths, best.family: best.prior_width})
         remaining.remove(best.family)
 
 
@@ -751,7 +750,8 @@ def select_families(
         if model.widths:
             # The arm has errors of its joints: those with a physical cause are shrunk, not selected.
             physical = [name for name in physical_families if name in families and name not in model.widths]
-            model = candidates.maximize_evidence({**model.widths, **dict.fromkeys(physical, 1.0)})
+            if physical:
+                model = candidates.maximize_evidence({**model.widths, **dict.fromkeys(physical, 1.0)})
             trials = [
                 replace(trial, is_selected=True, prior_width=model.widths[trial.family])
                 if trial.family in physical
