@@ -19,10 +19,11 @@ import numpy as np
 from scipy.linalg import lapack
 
 from .._typing import Array
-from .qr import TriangularSystem
+from .qr import TriangularSystem, merge_r_factors
 
-# Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite.
-_DIAGONAL_SHIFT = 1e-12
+# Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
+# squared pivot of such a matrix that counts.
+_DIAGONAL_SHIFT = _MIN_PIVOT = 1e-12
 
 
 class NormalEquations(TriangularSystem):
@@ -38,10 +39,20 @@ class NormalEquations(TriangularSystem):
     def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """[R z; 0 ρ], upper triangular, shape (p+1, p+1).
 
-        Directions that the rows determine by less than a millionth of the norm of a column are not
-        distinguished.
+        Directions that the rows determine by less than a millionth of the norm of a column count as
+        undetermined.
         """
-        return self.with_priors(np.zeros(len(self.products) - 1), 0.0).rows
+        scale = np.sqrt(np.diag(self.products)[:-1])
+        scale[scale == 0] = 1.0
+        matrix = self.products[:-1, :-1] / scale / scale[:, None]
+        root, pivots, rank, _ = lapack.dpstrf(matrix, tol=_MIN_PIVOT)
+        order, right = pivots - 1, self.products[:-1, -1] / scale
+        rows = np.zeros((rank + 1, len(self.products)))
+        rows[:-1, order] = np.triu(root)[:rank]
+        rows[:-1, -1] = lapack.dtrtrs(root[:rank, :rank], right[order[:rank]], trans=1)[0]
+        rows[-1, -1] = np.sqrt(max(self.cost - float(rows[:-1, -1] @ rows[:-1, -1]), 0.0))
+        rows[:-1, :-1] *= scale
+        return merge_r_factors([rows])
 
     @property
     def cost(self) -> float:

@@ -14,6 +14,7 @@ import dhcal_pin.estimation.problem as problem_module
 from dhcal_pin import Chain, calibrate
 from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.problem import UnfactoredSystem, normal_equations, uses_normal_equations
+from dhcal_pin.estimation.qr import rank
 from dhcal_pin.measurements import Noise, Pose, Position
 
 SETS = "minimal,base,tool,gain,coupling,compliance,harmonics,curves"
@@ -118,6 +119,12 @@ def test_samples_that_determine_few_unknowns():
     root, expected = (each.sqrt_covariance(problem.weights)[0] for each in (system, triangular))
     np.testing.assert_allclose(np.linalg.norm(root, axis=1), np.linalg.norm(expected, axis=1), rtol=1e-6)
     assert triangular.merged(system).cost == pytest.approx(2 * triangular.cost, rel=1e-9)
+    # The rows have no direction that the poses do not determine.
+    assert rank(system.r) == rank(triangular.r) == 60
+    assert np.abs(np.tril(system.rows, -1)).max() == 0
+    np.testing.assert_allclose(
+        system.rows.T @ system.rows, system.products, atol=1e-9 * system.products.max()
+    )
 
 
 @pytest.mark.parametrize("m", some_slow([60, 220], {0}))
