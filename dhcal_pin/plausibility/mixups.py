@@ -126,7 +126,7 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
     diagnosis, trial = _find_single(chain, items, sets)
     if trial is None:
         return diagnosis
-    if len(items) > 1:
+    if len(items) > 1 and not trial.single.hypotheses:
         separate = [(item, _find_one_or_two(chain, item, sets)) for item in items]
         for item, one in separate:
             if one.hypotheses:
@@ -176,7 +176,7 @@ class _Trial(NamedTuple):
     before: Evidence
     misfit: float  # Misfit of the nominal robot
     candidates: Sequence[_Candidate]
-    single: Diagnosis | None  # Decisive hypotheses that need large errors of the robot
+    single: Diagnosis  # Decisive hypotheses, with which the robot needs large errors, if any
 
 
 def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[Diagnosis, _Trial | None]:
@@ -190,32 +190,28 @@ def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[
     listed = list_hypotheses(chain, samples)
     candidates = list(_candidates(chain, ((each, _apply(each, samples, neighbourhood)) for each in listed)))
     misfit = float(nominal_misfits(chain, [samples])[0])
-    trial = _Trial(chain, samples, sets, before, misfit, candidates, None)
+    trial = _Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before))
     largest = _largest_misfit(trial)
     found = _decisive(trial, [each for each in candidates if each.misfit <= largest])
-    if found and found.after and not is_suspicious(found.after):
-        return found, None
-    return Diagnosis(before), trial._replace(single=found)
+    return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
 
 
 def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
-    single = trial.single
-    if trial.misfit and (leaves_residuals(trial.before) or trial.misfit > MAX_MISFIT):
-        pairs = _candidates(trial.chain, _changes_of_pairs(trial.candidates))
-        near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
-        largest, closest = _largest_misfit(trial, near), list[_Candidate]()
-        for pair in near:
-            is_new = not any(_are_equal(pair, other) for other in closest)
-            if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
-                closest.append(pair)
-        found = _decisive(trial, closest)
-        if found and found.after and not is_suspicious(found.after):
-            return found
-        far = [each.hypothesis for each in trial.candidates if each.misfit > largest]
-        if single and not set(single.hypotheses).isdisjoint(far):
-            single = None
-    return single or Diagnosis(trial.before)
+    if not trial.misfit or not (leaves_residuals(trial.before) or trial.misfit > MAX_MISFIT):
+        return trial.single
+    pairs = _candidates(trial.chain, _changes_of_pairs(trial.candidates))
+    near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
+    largest, closest = _largest_misfit(trial, near), list[_Candidate]()
+    for pair in near:
+        is_new = not any(_are_equal(pair, other) for other in closest)
+        if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
+            closest.append(pair)
+    found = _decisive(trial, closest)
+    if _is_certain(found):
+        return found
+    far = [each.hypothesis for each in trial.candidates if each.misfit > largest]
+    return trial.single if set(trial.single.hypotheses).isdisjoint(far) else Diagnosis(trial.before)
 
 
 def _find_one_or_two(chain: Chain, item: Measurement, sets: str) -> Diagnosis:
@@ -269,18 +265,14 @@ def _largest_misfit(trial: _Trial, others: Sequence[_Candidate] = ()) -> float:
 def _are_equal(first: _Candidate, second: _Candidate) -> bool:
     """Return whether two hypotheses change the samples alike."""
     one, two = (
-        [
-            values
-            for item in each.changed
-            for values in (item.configurations(), item.positions(), item.rotations())
-        ]
+        [array for item in each.changed for array in (item.q, item.positions(), item.rotations())]
         for each in (first, second)
     )
     return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
 
 
-def _decisive(trial: _Trial, candidates: Sequence[_Candidate]) -> Diagnosis | None:
-    """Return the diagnosis of the best hypotheses if a robot fits the samples after their change."""
+def _decisive(trial: _Trial, candidates: Sequence[_Candidate]) -> Diagnosis:
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
     scored = []
     for hypothesis, changed, _ in candidates:
         after = fit_evidence(trial.chain, changed, trial.sets)
@@ -290,8 +282,13 @@ def _decisive(trial: _Trial, candidates: Sequence[_Candidate]) -> Diagnosis | No
     ties = [(hypothesis, after) for log, hypothesis, after in scored if log >= best - _MAX_LOG_TIE]
     ties = [(hypothesis, after) for hypothesis, after in ties if not leaves_residuals(after)]
     if best - trial.before.log < _MIN_LOG_RATIO or not ties:
-        return None
+        return Diagnosis(trial.before)
     return Diagnosis(trial.before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
+
+
+def _is_certain(diagnosis: Diagnosis) -> bool:
+    """Return whether a robot with errors of ordinary size fits the samples after the change."""
+    return diagnosis.after is not None and not is_suspicious(diagnosis.after)
 
 
 def is_suspicious(evidence: Evidence) -> bool:
