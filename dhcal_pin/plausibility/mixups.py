@@ -8,10 +8,10 @@ evidence exceeds that of the file by the factor exp(15), and if the robot fits t
 ordinary measurements, with errors of ordinary size.
 
 If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
-closest ones is computed. A single hypothesis that needs large errors of the robot remains only if no pair
-brings the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong
-hypothesis makes of the measurements. Several hypotheses can describe the same change of the data, such as the
-sign of a joint and the zeros of two others; all of them are reported.
+closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
+the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong hypothesis
+makes of the measurements. Several hypotheses can describe the same change of the data, such as the sign of a
+joint and the zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .evidence import MANUFACTURED, Evidence, fit_evidence
-from .hypotheses import AxisScale, Hypothesis, JointChange, RowShift, both, list_hypotheses
+from .hypotheses import AxisScale, Hypothesis, JointChange, OtherNotation, RowShift, both, list_hypotheses
 from .misfit import MAX_MISFIT, nominal_misfits
 
 # Evidence of too few measurements: nothing is known about them.
@@ -56,6 +56,9 @@ _MAX_DISTANCE_RATIO = 8.0
 # A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor and the
 # least limit.
 _MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
+# Largest misfit of a robot with large errors. Below it, no pairs are tried if a robot fits the measurements
+# and no single hypothesis is in question. Above it, no single hypothesis that needs large errors remains.
+_PLAUSIBLE_MISFIT = 0.2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -198,7 +201,8 @@ def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[
 
 def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
-    if not trial.misfit or not (leaves_residuals(trial.before) or trial.misfit > MAX_MISFIT):
+    is_plausible = trial.misfit <= _PLAUSIBLE_MISFIT and not leaves_residuals(trial.before)
+    if not trial.misfit or (is_plausible and not trial.single.hypotheses):
         return trial.single
     pairs = _candidates(trial.chain, _changes_of_pairs(trial.candidates))
     near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
@@ -210,7 +214,7 @@ def _find_pair(trial: _Trial) -> Diagnosis:
     found = _decisive(trial, closest)
     if _is_certain(found):
         return found
-    far = [each.hypothesis for each in trial.candidates if each.misfit > largest]
+    far = [each.hypothesis for each in trial.candidates if each.misfit > min(largest, _PLAUSIBLE_MISFIT)]
     return trial.single if set(trial.single.hypotheses).isdisjoint(far) else Diagnosis(trial.before)
 
 
@@ -224,8 +228,7 @@ def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
     """Yield pairs of mistakes with the samples after both changes, in one order if the order does not matter.
 
     Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
-    are listed if the coordinates as they were read suggest them. Two changes of measured values by the same
-    rule are one mistake.
+    are listed if the coordinates as they were read suggest them. Rotations have one notation.
     """
     shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
     joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
@@ -239,7 +242,8 @@ def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
         # The change of joints is the faster one.
         yield both(joint.hypothesis, value.hypothesis), joint.hypothesis.apply(value.changed)
     for first, second in permutations(values, 2):
-        if not isinstance(second.hypothesis.change, AxisScale | type(first.hypothesis.change)):
+        changes = first.hypothesis.change, second.hypothesis.change
+        if not isinstance(changes[1], AxisScale) and not all(isinstance(c, OtherNotation) for c in changes):
             yield _then(first, second)
 
 
