@@ -38,10 +38,10 @@ _MIN_SAMPLES = 10
 _N_UNKNOWNS = 9
 # Number of rotations Q that are computed in turn with t, and share of the samples, those with the smallest
 # errors, that all but the first are computed from.
-_N_ROUNDS, _KEPT_SHARE = 5, 0.75
+_N_ROUNDS, _KEPT_SHARE = 5, 0.6
 # Number of variants, those with the smallest lower bounds, that are computed even if their bounds exceed
 # `MAX_MISFIT`: outliers may be the reason.
-_N_NEAREST = 16
+_N_NEAREST = 64
 # Fraction of the largest information that holds directions without information at zero.
 _MIN_INFORMATION = 1e-13
 # Positive number in place of a divisor of zero.

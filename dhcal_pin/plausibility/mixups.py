@@ -27,7 +27,7 @@ import numpy as np
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .evidence import MANUFACTURED, Evidence, fit_evidence
+from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import AxisScale, Hypothesis, JointChange, OtherNotation, RowShift, both, list_hypotheses
 from .misfit import MAX_MISFIT, nominal_misfits
 
@@ -54,11 +54,9 @@ _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
 # A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor and the
-# least limit.
+# least limit, or if it exceeds the largest limit, which depends on the errors that the robot may have.
 _MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
-# Largest misfit of a robot with large errors. Below it, no pairs are tried if a robot fits the measurements
-# and no single hypothesis is in question. Above it, no single hypothesis that needs large errors remains.
-_PLAUSIBLE_MISFIT = 0.2
+_LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -201,7 +199,7 @@ def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[
 
 def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
-    is_plausible = trial.misfit <= _PLAUSIBLE_MISFIT and not leaves_residuals(trial.before)
+    is_plausible = trial.misfit <= _LARGEST_MISFITS[trial.sets] and not leaves_residuals(trial.before)
     if not trial.misfit or (is_plausible and not trial.single.hypotheses):
         return trial.single
     pairs = _candidates(trial.chain, _changes_of_pairs(trial.candidates))
@@ -214,7 +212,7 @@ def _find_pair(trial: _Trial) -> Diagnosis:
     found = _decisive(trial, closest)
     if _is_certain(found):
         return found
-    far = [each.hypothesis for each in trial.candidates if each.misfit > min(largest, _PLAUSIBLE_MISFIT)]
+    far = [each.hypothesis for each in trial.candidates if each.misfit > largest]
     return trial.single if set(trial.single.hypotheses).isdisjoint(far) else Diagnosis(trial.before)
 
 
@@ -263,7 +261,7 @@ def _candidates(chain: Chain, changes: Iterable[_Change]) -> Iterator[_Candidate
 def _largest_misfit(trial: _Trial, others: Sequence[_Candidate] = ()) -> float:
     """Return the largest misfit of a hypothesis that is tried."""
     smallest = min(trial.misfit, *(each.misfit for each in (*trial.candidates, *others)))
-    return float(np.clip(_MAX_MISFIT_RATIO * smallest, _MIN_MISFIT, MAX_MISFIT))
+    return float(np.clip(_MAX_MISFIT_RATIO * smallest, _MIN_MISFIT, _LARGEST_MISFITS[trial.sets]))
 
 
 def _are_equal(first: _Candidate, second: _Candidate) -> bool:

@@ -13,7 +13,7 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups
-from dhcal_pin.plausibility.misfit import MAX_MISFIT, nominal_misfits
+from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.robot import Chain
 
 
@@ -211,7 +211,7 @@ def test_misfit_of_the_nominal_robot_is_that_of_its_errors(ur10, kind):
     squares = np.sum((tips - data.positions()) ** 2) / np.sum((tips - tips.mean(0)) ** 2)
     for r, m in zip(poses[:, :3, :3], data.rotations(), strict=False):
         squares += np.arccos(np.clip((np.trace(r.T @ m) - 1) / 2, -1, 1)) ** 2 / 3 / len(poses)
-    # A quarter of the samples, those with the largest errors, does not count.
+    # The samples with the largest errors do not count.
     assert 0.5 * np.sqrt(squares) < misfit < 1.1 * np.sqrt(squares)
     is_wrong = np.arange(60) % 10 == 3
     moved, few = with_positions(data, lambda p: p + is_wrong[:, None]), data.take(np.s_[:9])
@@ -220,8 +220,8 @@ def test_misfit_of_the_nominal_robot_is_that_of_its_errors(ur10, kind):
         ur10, [[data], [moved], [in_millimetres], [few]]
     )
     assert same == misfit
-    assert with_outliers < 1.5 * misfit
-    assert in_another_unit > MAX_MISFIT
+    assert with_outliers < 3 * misfit
+    assert in_another_unit > 0.5
     assert of_few == 0 == nominal_misfits(ur10, [[measured(Wires)]])[0]
     assert nominal_misfits(real_ur10(), [[data]])[0] < 5e-4
 
