@@ -7,11 +7,11 @@ A position p of a target at t in the tip frame, which has the rotation R and the
 with the rotation Q and the position b of the instrument. A measured rotation M fulfils Q·M = R·B with the
 rotation B of the tool. All sums of squares follow from the Gram matrix G of the columns (p, p_tip, R) about
 their means. If Q may be any matrix A, the equation is linear; its solution gives the start of t and a lower
-bound of the error. Then Q (Kabsch 1976) and t are computed from each other, without the samples with the
-largest errors, which may be outliers. The mean square of the error per
-degree of freedom counts relative to that of p about its mean. B is the rotation nearest to the mean of
-Rᵀ·Q·M, and both sides differ by the mean square 1 - trace(Bᵀ·mean)/3, a third of that of the angles. The two
-mean squares are added.
+bound of the error. Then Q (Kabsch 1976) and t are computed from each other, from the half of the samples with
+the smallest errors: the others may be outliers. The mean square of the error per degree of freedom counts
+relative to that of p about its mean. B is the rotation nearest to the mean of C = Rᵀ·Q·M, and the mean of
+1 - trace(Bᵀ·C)/3 is a third of the mean square of the angles between both sides; again half of the samples
+count. The two mean squares are added.
 
 Shapes: v variants of the data, m samples.
 """
@@ -38,7 +38,7 @@ _MIN_SAMPLES = 10
 _N_UNKNOWNS = 9
 # Number of rotations Q that are computed in turn with t, and share of the samples, those with the smallest
 # errors, that all but the first are computed from.
-_N_ROUNDS, _KEPT_SHARE = 5, 0.6
+_N_ROUNDS, _KEPT_SHARE = 5, 0.5
 # Number of variants, those with the smallest lower bounds, that are computed even if their bounds exceed
 # `MAX_MISFIT`: outliers may be the reason.
 _N_NEAREST = 64
@@ -84,10 +84,8 @@ def _sums_of_errors(arm: Chain, items: Sequence[Measurement]) -> Array:
     fit = _fit_rotations(z[near], t[near])
     squares[near], spread[near] = fit.square, fit.spread
     if len(items[0].rotations()) and items[0].conditions().base_motion is None:
-        measured = np.stack([items[i].rotations() for i in near.tolist()]).reshape(-1, m, 9)
-        products = (np.swapaxes(fit.kept[..., None] * r[near], 1, 2) @ measured).reshape(-1, 3, 3, 3, 3)
-        mean = np.einsum("vij,vikjl->vkl", fit.rotation, products) / fit.kept.sum(1)[:, None, None]
-        turns[near] = np.fmax(0, 1 - np.sum(nearest_rotation(mean) * mean, (1, 2)) / 3)
+        measured = np.stack([items[i].rotations() for i in near.tolist()])
+        turns[near] = _mean_turns(np.swapaxes(tip[near, :, :3, :3], 2, 3) @ fit.rotation[:, None] @ measured)
     return m * np.stack([squares, spread, turns, np.ones(v)])
 
 
@@ -105,11 +103,9 @@ class _Fit(NamedTuple):
 def _fit_rotations(z: Array, t: Array) -> _Fit:
     """Fit Q and t in turn, from the columns (v, m, 15) and starts (v, 3) of t."""
     v, m, _ = z.shape
-    k, fit = int(_KEPT_SHARE * m), _fit_rotation(z, t, np.ones((v, m)))
+    fit = _fit_rotation(z, t, np.ones((v, m)))
     for _ in range(_N_ROUNDS - 1):
-        kept = np.zeros((v, m))
-        np.put_along_axis(kept, np.argpartition(fit.errors, k - 1, 1)[:, :k], 1.0, 1)
-        fit = _fit_rotation(z, fit.t, kept)
+        fit = _fit_rotation(z, fit.t, _smallest(fit.errors))
     return fit
 
 
@@ -127,6 +123,23 @@ def _fit_rotation(z: Array, t: Array, kept: Array) -> _Fit:
     errors = np.sum((e - (kept[:, None] @ e) / k[:, None, None]) ** 2, -1)
     spread = np.einsum("vii->v", gram[:, :3, :3]) / k
     return _Fit(t, rotation, kept, errors, squares * 3 / (3 * k - _N_UNKNOWNS), spread)
+
+
+def _mean_turns(rotations: Array) -> Array:
+    """Return the mean of 1 - trace(Bᵀ·C)/3 of rotations C (v, m, 3, 3) with their mean rotation B."""
+    kept, errors = np.ones(rotations.shape[:2]), np.zeros(rotations.shape[:2])
+    for _ in range(_N_ROUNDS):
+        mean = nearest_rotation(np.einsum("vm,vmij->vij", kept, rotations))
+        errors = np.fmax(0, 1 - np.einsum("vij,vmij->vm", mean, rotations) / 3)
+        kept = _smallest(errors)
+    return np.sum(kept * errors, 1) / kept.sum(1)
+
+
+def _smallest(errors: Array) -> Array:
+    """Return 1 for the samples with the smallest errors (v, m) and 0 for the others."""
+    k, kept = int(_KEPT_SHARE * errors.shape[1]), np.zeros(errors.shape)
+    np.put_along_axis(kept, np.argpartition(errors, k - 1, 1)[:, :k], 1.0, 1)
+    return kept
 
 
 def _gram(z: Array, kept: Array) -> Array:

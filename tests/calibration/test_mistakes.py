@@ -313,6 +313,19 @@ def test_two_mistakes_are_named(names, robot):
     assert judge_two(names, robot, np.random.default_rng(3)) == "named"
 
 
+def test_a_mistake_in_all_files_of_an_arm_with_large_errors_is_named_for_all():
+    """The arm needs large errors also without the mistake."""
+    rng = np.random.default_rng(3)
+    true = with_errors(arm("ur10"), 10e-3, np.deg2rad(2.0), rng)
+    data = [Position.simulate(true, configurations(true, 40, rng), NOISE, rng) for _ in range(2)]
+    wrong = [
+        MISTAKES["sign of joint 2"].apply(item).replace(source=f"{i}.csv") for i, item in enumerate(data)
+    ]
+    found = diagnose_mixups(arm("ur10"), wrong)
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["sign:shoulder_lift_joint"]
+    assert found.source == ""
+
+
 @pytest.mark.slow
 def test_two_random_mistakes_are_named_or_none_is():
     outcomes = [judge_pair(seed) for seed in range(200, 450)]
