@@ -94,7 +94,6 @@ class _Fit(NamedTuple):
 
     t: Array  # Position of the target, (v, 3) [m]
     rotation: Array  # Q, (v, 3, 3)
-    kept: Array  # 1 for samples that were used and 0 for others, (v, m)
     errors: Array  # Squared error of each sample, (v, m) [m²]
     square: Array  # Mean square of the errors of the samples that were used, per degree of freedom, (v,) [m²]
     spread: Array  # Mean square of their positions p about the mean, (v,) [m²]
@@ -122,7 +121,7 @@ def _fit_rotation(z: Array, t: Array, kept: Array) -> _Fit:
     e = y[..., :3] + (y[..., 3:].reshape(v, m, 3, 3) @ t[:, None, :, None])[..., 0]
     errors = np.sum((e - (kept[:, None] @ e) / k[:, None, None]) ** 2, -1)
     spread = np.einsum("vii->v", gram[:, :3, :3]) / k
-    return _Fit(t, rotation, kept, errors, squares * 3 / (3 * k - _N_UNKNOWNS), spread)
+    return _Fit(t, rotation, errors, squares * 3 / (3 * k - _N_UNKNOWNS), spread)
 
 
 def _mean_turns(rotations: Array) -> Array:
