@@ -25,7 +25,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -213,7 +213,7 @@ class Measurement(ABC):
         copy = object.__new__(type(self))
         known = self.__dict__
         # Attributes only: cached properties must not be copied.
-        copy.__dict__.update({field.name: known[field.name] for field in fields(self)} | values)
+        copy.__dict__.update({name: known[name] for name in _field_names(type(self))} | values)
         return copy
 
     def take(self, index: Array | slice) -> Self:
@@ -485,6 +485,12 @@ class Measurement(ABC):
             if column.name == name and column.plausible_range:
                 return column.plausible_range(reach)
         return None
+
+
+@cache
+def _field_names(kind: type[Measurement]) -> tuple[str, ...]:
+    """Return the names of the attributes of a kind."""
+    return tuple(field.name for field in fields(kind))
 
 
 def whitened_jacobian(

@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, permutations, product
 from typing import Literal, Protocol
 
@@ -79,12 +80,23 @@ class JointChange:
             tuple(factors if factors is not None else [1.0] * n),
         )
 
+    @cached_property
+    def joints(self) -> frozenset[int]:
+        """Numbers of the joints that change; changes of different joints commute."""
+        values = zip(self.sources, self.signs, self.offsets, self.factors, strict=True)
+        return frozenset(j for j, value in enumerate(values) if value != (j, 1, 0.0, 1.0))
+
+    @cached_property
+    def _columns(self) -> tuple[Array, Array, Array]:
+        """Numbers of the columns, their factors with signs, and their summands."""
+        return np.array(self.sources), np.array(self.signs) * self.factors, np.array(self.offsets)
+
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements at the changed joint positions."""
         if not item.configurations_per_row:
             return None
-        q = item.configurations()[:, self.sources]
-        return item.resample(q * np.array(self.signs) * self.factors + self.offsets)
+        sources, factors, offsets = self._columns
+        return item.resample(item.configurations()[:, sources] * factors + offsets)
 
 
 @dataclass(frozen=True)

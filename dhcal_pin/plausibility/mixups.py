@@ -2,39 +2,34 @@
 
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
 no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
-the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured positions
+the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured poses
 than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its
 evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed samples as it fits
-ordinary measurements. If none does, and no robot fits the file, each of the best ones is combined with a
-second one. Several hypotheses can describe the same change of the data, such as the sign of a joint and the
-zeros of two others; all of them are reported.
+ordinary measurements, with errors of ordinary size.
+
+If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
+closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
+the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong hypothesis
+makes of the measurements. Several hypotheses can describe the same change of the data, such as the sign of a
+joint and the zeros of two others; all of them are reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product, starmap
+from heapq import nsmallest
+from itertools import islice, permutations, product, starmap
 from typing import NamedTuple
 
 import numpy as np
 
-from ..estimation.initialization import positions_at_end
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .evidence import MANUFACTURED, Evidence, fit_evidence
-from .hypotheses import (
-    AxisChange,
-    AxisScale,
-    BothChanges,
-    Hypothesis,
-    JointChange,
-    LengthChange,
-    RowShift,
-    both,
-    list_hypotheses,
-)
+from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
+from .hypotheses import AxisScale, Hypothesis, JointChange, OtherNotation, RowShift, both, list_hypotheses
+from .misfit import MAX_MISFIT, nominal_misfits
 
 # Evidence of too few measurements: nothing is known about them.
 NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
@@ -47,18 +42,21 @@ _MIN_LOG_RATIO = 15.0
 _MIN_NAMED_RATIO = 2.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
-# Largest fall of the log evidence by undoing one of two mistakes, while the other one spoils all samples.
-_MAX_LOG_LOSS = 100.0
-# Number of hypotheses that are tried as the first of two mistakes, and of pairs by their misfit.
-_N_FIRST_OF_PAIR, _N_CLOSEST_PAIRS = 4, 12
+# Number of pairs of mistakes with the smallest misfits, and of those among them that change the samples
+# differently, whose evidence is computed.
+_N_NEAR_PAIRS, _N_CLOSEST_PAIRS = 60, 12
+# Number of changes whose misfits are computed together.
+_N_TOGETHER = 1024
+# Samples are equal if no coordinate differs by more than this [m], [rad].
+_TOLERANCE = 1e-6
 # Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
 # Positions this many times farther from the centre than the median are wrong by themselves.
 _MAX_DISTANCE_RATIO = 8.0
-# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor, but not
-# below the least limit, or if it exceeds the largest limit: no robot is so wrong. The misfit is computed from
-# at least this many rows per unknown of the frames.
-_MAX_MISFIT_RATIO, _MISFIT_LIMITS, _MIN_ROWS_PER_FRAME_UNKNOWN = 3.0, (0.01, 0.7), 2
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor and the
+# least limit, or if it exceeds the largest limit, which depends on the errors that the robot may have.
+_MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
+_LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Largest number of measurements that are examined, those with the most samples.
@@ -127,9 +125,9 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
     if not items:
         return Diagnosis(NO_EVIDENCE)
     diagnosis, trial = _find_single(chain, items, sets)
-    if diagnosis.hypotheses or trial is None:
+    if trial is None:
         return diagnosis
-    if len(items) > 1:
+    if len(items) > 1 and not trial.single.hypotheses:
         separate = [(item, _find_one_or_two(chain, item, sets)) for item in items]
         for item, one in separate:
             if one.hypotheses:
@@ -158,118 +156,141 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
+# Hypothesis, and samples after its change; None if it does not apply to them.
+_Change = tuple[Hypothesis, list[Measurement] | None]
+
+
+class _Candidate(NamedTuple):
+    """Hypothesis about samples, with the samples after its change."""
+
+    hypothesis: Hypothesis
+    changed: list[Measurement]
+    misfit: float  # Misfit of the nominal robot after the change
+
+
 class _Trial(NamedTuple):
-    """Suspicious samples, and the evidence of all single hypotheses."""
+    """Suspicious samples, and what single hypotheses say about them."""
 
     chain: Chain
     samples: Sequence[Measurement]
-    neighbourhood: Sequence[Measurement]
     sets: str
     before: Evidence
-    hypotheses: Sequence[Hypothesis]
-    scored: Sequence[_Scored]
+    misfit: float  # Misfit of the nominal robot
+    candidates: Sequence[_Candidate]
+    single: Diagnosis  # Decisive hypotheses, with which the robot needs large errors, if any
 
 
 def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[Diagnosis, _Trial | None]:
-    """Look for one mistake in all of the measurements; return what was tried if they remain suspicious."""
+    """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
     if not has_enough_rows(samples):
         return Diagnosis(NO_EVIDENCE), None
     before = fit_evidence(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before), None
-    listed = list(list_hypotheses(chain, samples))
-    scored = _score(chain, samples, neighbourhood, listed, sets)
-    trial = _Trial(chain, samples, neighbourhood, sets, before, listed, scored)
-    return _decisive(before, scored) or Diagnosis(before), trial
+    listed = list_hypotheses(chain, samples)
+    candidates = list(_candidates(chain, ((each, _apply(each, samples, neighbourhood)) for each in listed)))
+    misfit = float(nominal_misfits(chain, [samples])[0])
+    trial = _Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before))
+    largest = _largest_misfit(trial)
+    found = _decisive(trial, [each for each in candidates if each.misfit <= largest])
+    return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
 
 
 def _find_pair(trial: _Trial) -> Diagnosis:
     """Look for two mistakes in measurements with positions, by which pairs are compared."""
-    chain, samples, neighbourhood, sets, before, listed, scored = trial
-    if leaves_residuals(before) and nominal_misfit(chain, samples):
-        first = [each for each in scored if each.log > before.log - _MAX_LOG_LOSS]
-        first.sort(key=lambda each: -each.log)
-        trials = [_closest_pairs(chain, samples, neighbourhood, listed)]
-        for each in first[:_N_FIRST_OF_PAIR]:
-            trials.append([both(each.hypothesis, second) for second in listed if second != each.hypothesis])
-        for pairs in trials:
-            if found := _decisive(before, _score(chain, samples, neighbourhood, pairs, sets)):
-                return found
-    return Diagnosis(before)
+    is_plausible = trial.misfit <= _LARGEST_MISFITS[trial.sets] and not leaves_residuals(trial.before)
+    if not trial.misfit or (is_plausible and not trial.single.hypotheses):
+        return trial.single
+    pairs = _candidates(trial.chain, _changes_of_pairs(trial.candidates))
+    near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
+    largest, closest = _largest_misfit(trial, near), list[_Candidate]()
+    for pair in near:
+        is_new = not any(_are_equal(pair, other) for other in closest)
+        if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
+            closest.append(pair)
+    found = _decisive(trial, closest)
+    if _is_certain(found):
+        return found
+    far = [each.hypothesis for each in trial.candidates if each.misfit > largest]
+    return trial.single if set(trial.single.hypotheses).isdisjoint(far) else Diagnosis(trial.before)
 
 
 def _find_one_or_two(chain: Chain, item: Measurement, sets: str) -> Diagnosis:
     """Look for one mistake or two in one measurement."""
     diagnosis, trial = _find_single(chain, [item], sets)
-    return diagnosis if diagnosis.hypotheses or trial is None else _find_pair(trial)
+    return _find_pair(trial) if trial else diagnosis
 
 
-def _closest_pairs(
-    chain: Chain,
-    samples: Sequence[Measurement],
-    neighbourhood: Sequence[Measurement],
-    hypotheses: Sequence[Hypothesis],
-) -> list[Hypothesis]:
-    """Return the pairs of mistakes whose changes bring the nominal robot nearest to the measured poses.
+def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
+    """Yield pairs of mistakes with the samples after both changes, in one order if the order does not matter.
 
-    Units and axes of positions do not change this misfit; changes of joints may follow all others.
+    Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
+    are listed if the coordinates as they were read suggest them. Rotations have one notation.
     """
-    of_joints = [each for each in hypotheses if isinstance(each.change, JointChange | RowShift)]
-    others = [
-        each
-        for each in hypotheses
-        if not isinstance(each.change, JointChange | RowShift | LengthChange | AxisChange | AxisScale)
-    ]
-    pairs = [*permutations(of_joints, 2), *product(others, of_joints), *permutations(others, 2)]
-    found = []
-    for pair in starmap(both, pairs):
-        changed = _apply(pair, samples, neighbourhood)
-        if changed is not None:
-            found.append((nominal_misfit(chain, changed), pair))
-    return [pair for _, pair in sorted(found, key=lambda each: each[0])[:_N_CLOSEST_PAIRS]]
+    shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
+    joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
+    values = [each for each in singles if not isinstance(each.hypothesis.change, RowShift | JointChange)]
+    yield from starmap(_then, product(shifts, [*joints, *values]))
+    moved = [change.joints for each in joints if isinstance(change := each.hypothesis.change, JointChange)]
+    for i, j in permutations(range(len(joints)), 2):
+        if i < j or moved[i] & moved[j]:
+            yield _then(joints[i], joints[j])
+    for joint, value in product(joints, values):
+        # The change of joints is the faster one.
+        yield both(joint.hypothesis, value.hypothesis), joint.hypothesis.apply(value.changed)
+    for first, second in permutations(values, 2):
+        changes = first.hypothesis.change, second.hypothesis.change
+        if not isinstance(changes[1], AxisScale) and not all(isinstance(c, OtherNotation) for c in changes):
+            yield _then(first, second)
 
 
-class _Scored(NamedTuple):
-    """Evidence of samples after the change of a hypothesis."""
-
-    hypothesis: Hypothesis
-    after: Evidence
-    log: float  # Logarithm of the evidence, comparable with that of the samples as they were read
+def _then(first: _Candidate, second: _Candidate) -> _Change:
+    """Return the hypothesis that two mistakes were made, with the samples after both changes."""
+    return both(first.hypothesis, second.hypothesis), second.hypothesis.apply(first.changed)
 
 
-def _score(
-    chain: Chain,
-    samples: Sequence[Measurement],
-    neighbourhood: Sequence[Measurement],
-    hypotheses: Sequence[Hypothesis],
-    sets: str,
-) -> list[_Scored]:
-    """Compute the evidence of the hypotheses that apply and bring the nominal robot near the positions."""
-    changes = [(each, _apply(each, samples, neighbourhood)) for each in hypotheses]
-    candidates = [
-        (nominal_misfit(chain, changed), hypothesis, changed)
-        for hypothesis, changed in changes
-        if changed is not None
-    ]
-    smallest = min([nominal_misfit(chain, samples), *(misfit for misfit, _, _ in candidates)])
-    largest, scored = np.clip(_MAX_MISFIT_RATIO * smallest, *_MISFIT_LIMITS), []
-    for misfit, hypothesis, changed in candidates:
-        if misfit <= largest:
-            after = fit_evidence(chain, changed, sets)
-            log = after.log * _count(samples) / _count(changed) + hypothesis.log_jacobian(samples)
-            scored.append(_Scored(hypothesis, after, log))
-    return scored
+def _candidates(chain: Chain, changes: Iterable[_Change]) -> Iterator[_Candidate]:
+    """Compute the misfits of the changes that apply, of some of them at a time."""
+    pairs = ((hypothesis, changed) for hypothesis, changed in changes if changed is not None)
+    while part := list(islice(pairs, _N_TOGETHER)):
+        misfits = nominal_misfits(chain, [changed for _, changed in part])
+        yield from (_Candidate(*pair, misfit) for pair, misfit in zip(part, misfits.tolist(), strict=True))
 
 
-def _decisive(before: Evidence, scored: Sequence[_Scored]) -> Diagnosis | None:
-    """Return the diagnosis of the best hypotheses if a robot fits the samples after their change."""
-    best = max((each.log for each in scored), default=-np.inf)
-    ties = [each for each in scored if each.log >= best - _MAX_LOG_TIE]
-    ties = [each for each in ties if not leaves_residuals(each.after)]
-    if best - before.log < _MIN_LOG_RATIO or not ties:
-        return None
-    return Diagnosis(before, tuple(each.hypothesis for each in ties), ties[0].after)
+def _largest_misfit(trial: _Trial, others: Sequence[_Candidate] = ()) -> float:
+    """Return the largest misfit of a hypothesis that is tried."""
+    smallest = min(trial.misfit, *(each.misfit for each in (*trial.candidates, *others)))
+    return float(np.clip(_MAX_MISFIT_RATIO * smallest, _MIN_MISFIT, _LARGEST_MISFITS[trial.sets]))
+
+
+def _are_equal(first: _Candidate, second: _Candidate) -> bool:
+    """Return whether two hypotheses change the samples alike."""
+    one, two = (
+        [array for item in each.changed for array in (item.q, item.positions(), item.rotations())]
+        for each in (first, second)
+    )
+    return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
+
+
+def _decisive(trial: _Trial, candidates: Sequence[_Candidate]) -> Diagnosis:
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
+    scored = []
+    for hypothesis, changed, _ in candidates:
+        after = fit_evidence(trial.chain, changed, trial.sets)
+        log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
+        scored.append((log, hypothesis, after))
+    best = max((log for log, _, _ in scored), default=-np.inf)
+    ties = [(hypothesis, after) for log, hypothesis, after in scored if log >= best - _MAX_LOG_TIE]
+    ties = [(hypothesis, after) for hypothesis, after in ties if not leaves_residuals(after)]
+    if best - trial.before.log < _MIN_LOG_RATIO or not ties:
+        return Diagnosis(trial.before)
+    return Diagnosis(trial.before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
+
+
+def _is_certain(diagnosis: Diagnosis) -> bool:
+    """Return whether a robot with errors of ordinary size fits the samples after the change."""
+    return diagnosis.after is not None and not is_suspicious(diagnosis.after)
 
 
 def is_suspicious(evidence: Evidence) -> bool:
@@ -282,45 +303,6 @@ def leaves_residuals(evidence: Evidence) -> bool:
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
 
 
-def nominal_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
-    """Compute how far the nominal robot is from measured poses, with any base, tool and unit of length.
-
-    A position p of a target at t in the tip frame, which has the rotation R and the position p_tip, fulfils
-
-        A·p + b - R·t = p_tip
-
-    with A = Q/f for the orientation Q of the instrument and a unit of length f. All elements of A, b and t
-    are free here, which makes the equation linear and the error too small rather than too large. Its mean
-    square per degree of freedom counts relative to that of p_tip about its mean. A measured rotation M
-    fulfils Q·M = R·B with the rotation B of the tool. With free matrices of unit norm, both sides differ by
-    the mean square 1 - σ for the largest singular value σ of the mean of M⊗R, a third of that of the angles.
-    The two mean squares are added.
-    """
-    arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
-    squares = spreads = turns = 0.0
-    count = 0
-    for item in data:
-        p, measured = positions_at_end(item), item.rotations()
-        if item.configurations_per_row != 1 or len(p) != len(item.rows):
-            continue
-        tip = arm.poses(item.conditions().of_arm)
-        directions = np.broadcast_to(np.eye(3), (len(p), 3, 3))
-        rows = np.concatenate(
-            [*(p[:, [i], None] * directions for i in range(3)), directions, -tip[:, :3, :3]], 2
-        ).reshape(3 * len(p), -1)
-        if len(rows) < _MIN_ROWS_PER_FRAME_UNKNOWN * rows.shape[1]:
-            continue
-        target = tip[:, :3, 3].ravel()
-        error = target - rows @ np.linalg.lstsq(rows, target, rcond=None)[0]
-        squares += float(error @ error) * len(rows) / (len(rows) - rows.shape[1])
-        spreads += float(np.sum((tip[:, :3, 3] - tip[:, :3, 3].mean(0)) ** 2))
-        if len(measured) and item.conditions().base_motion is None:
-            products = np.einsum("mij,mkl->ikjl", measured, tip[:, :3, :3]).reshape(9, 9)
-            turns += max(0.0, len(p) - float(np.linalg.norm(products, 2)))
-        count += len(p)
-    return float(np.sqrt(squares / spreads + turns / count)) if spreads else 0.0
-
-
 def _count(data: Sequence[Measurement]) -> int:
     """Return the number of samples."""
     return sum(len(item.rows) for item in data)
@@ -330,9 +312,7 @@ def _apply(
     hypothesis: Hypothesis, samples: Sequence[Measurement], neighbourhood: Sequence[Measurement]
 ) -> list[Measurement] | None:
     """Apply a hypothesis to the samples; None if it does not apply to most of them."""
-    changes = hypothesis.change
-    steps = (changes.first, changes.second) if isinstance(changes, BothChanges) else (hypothesis,)
-    if not any(isinstance(step.change, RowShift) for step in steps):
+    if not isinstance(hypothesis.change, RowShift):
         return hypothesis.apply(samples)
     shifted = hypothesis.apply(neighbourhood)
     if shifted is None:

@@ -16,6 +16,7 @@ from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 from dhcal_pin.measurements.pose import PoseMeasurement
 from dhcal_pin.plausibility.hypotheses import mend
+from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.plausibility.mixups import diagnose_mixups
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.chain import joint_frame
@@ -268,12 +269,14 @@ def test_many_honest_measurements_are_accepted():
     check_honest(range(424), 0.03)
 
 
-def judge_pair(seed: int) -> str:
-    """Return "named" if undoing what is named, at most twice, mends two random mistakes."""
-    rng = np.random.default_rng([seed, 77])
-    chain = arm(ARMS[seed % len(ARMS)])
-    names = rng.choice([name for name, mistake in MISTAKES.items() if mistake.key], 2, replace=False)
-    made = [MISTAKES[name] for name in names]
+# Largest misfit of the true robot to mended measurements. Changes that are equivalent for the nominal arm are
+# so for the true one up to its errors of 1 %.
+MAX_MISFIT = 0.05
+
+
+def judge_two(names: tuple[str, ...], robot: str, rng: np.random.Generator) -> str:
+    """Return "named" if undoing what is named, at most twice, mends two mistakes: the true robot fits."""
+    chain, made = arm(robot), [MISTAKES[name] for name in names]
     kind = Pose if Pose in [mistake.kind for mistake in made] else Position
     true = with_errors(chain, 2e-3, np.deg2rad(0.3), rng)
     data = kind.simulate(true, configurations(chain, int(rng.integers(40, 100)), rng), NOISE, rng)
@@ -284,17 +287,47 @@ def judge_pair(seed: int) -> str:
         keys.append(found.hypotheses[0].key)
         data = mend(chain, data, keys[-1])
         found = diagnose_mixups(chain, [data])
-    outcome = "false" if keys else "not named"
-    return "named" if keys and not found.is_suspicious else f"{outcome}: {seed}: {', '.join(names)}: {keys}"
+    if keys and not found.is_suspicious and nominal_misfits(true, [[data]])[0] < MAX_MISFIT:
+        return "named"
+    return f"{'false' if keys else 'not named'}: {robot}: {', '.join(names)}: {keys}"
 
 
-@pytest.mark.parametrize("seed", [4, 5, 231])
-def test_two_mistakes_are_named(seed):
-    assert judge_pair(seed) == "named"
+def judge_pair(seed: int) -> str:
+    """Judge two random mistakes."""
+    rng = np.random.default_rng([seed, 77])
+    names = rng.choice([name for name, mistake in MISTAKES.items() if mistake.key], 2, replace=False)
+    return judge_two(tuple(names.tolist()), ARMS[seed % len(ARMS)], rng)
+
+
+@pytest.mark.parametrize(
+    ("names", "robot"),
+    [
+        # With errors of 16 cm, the arm fits exactly if the zero of joint 5 is changed by 180 deg instead.
+        (("sign of joint 4", "zero of joint 3 by 180 deg"), "panda"),
+        (("zero of joint 3 by 180 deg", "one joint in degrees"), "panda"),
+        (("inverse poses", "millimetres as metres"), "ur10"),
+        (("rows shifted up", "order of quaternions"), "kinova"),
+    ],
+)
+def test_two_mistakes_are_named(names, robot):
+    assert judge_two(names, robot, np.random.default_rng(3)) == "named"
+
+
+def test_a_mistake_in_all_files_of_an_arm_with_large_errors_is_named_for_all():
+    """The arm needs large errors also without the mistake."""
+    rng = np.random.default_rng(3)
+    true = with_errors(arm("ur10"), 10e-3, np.deg2rad(2.0), rng)
+    data = [Position.simulate(true, configurations(true, 40, rng), NOISE, rng) for _ in range(2)]
+    wrong = [
+        MISTAKES["sign of joint 2"].apply(item).replace(source=f"{i}.csv") for i, item in enumerate(data)
+    ]
+    found = diagnose_mixups(arm("ur10"), wrong)
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["sign:shoulder_lift_joint"]
+    assert found.source == ""
 
 
 @pytest.mark.slow
 def test_two_random_mistakes_are_named_or_none_is():
-    outcomes = [judge_pair(seed) for seed in range(200, 300)]
+    outcomes = [judge_pair(seed) for seed in range(200, 450)]
     assert not [outcome for outcome in outcomes if outcome.startswith("false")]
-    assert outcomes.count("named") >= 0.8 * len(outcomes), outcomes
+    assert outcomes.count("named") >= 0.9 * len(outcomes), outcomes

@@ -15,17 +15,10 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.exceptions import RefusedCalibrationError
-from dhcal_pin.plausibility import mixups
 
 OUTPUTS = ("--json", "r.json", "--report", "r.html", "--report", "r.md", "--map", "m.csv")
 # One iteration does not solve the problem.
 UNFINISHED = ("--max-iterations", "1")
-
-
-@pytest.fixture
-def no_pairs(monkeypatch):
-    """Leave out pairs of mistakes, which take seconds and do not explain a wrong tip."""
-    monkeypatch.setattr(mixups, "_find_pair", lambda trial: mixups.Diagnosis(trial.before))
 
 
 def test_refused_robot_is_not_written(run, robot_folder, undrawn):
@@ -235,7 +228,7 @@ def test_joints_that_never_moved_are_refused(run, robot_folder, moving, reason):
     assert not Path("out.urdf").exists()
 
 
-def test_a_tip_inside_the_chain_is_refused_and_the_ignored_joints_are_named(run, robot_folder, no_pairs):
+def test_a_tip_inside_the_chain_is_refused_and_the_ignored_joints_are_named(run, robot_folder):
     write_columns(tracker_columns())
     command = ("calibrate", UR10, "data.csv", "--tip", "wrist_1_link", "-o", "out.urdf", "--json", "-")
     status, out, err = run(*command)
@@ -252,7 +245,7 @@ def test_a_tip_inside_the_chain_is_refused_and_the_ignored_joints_are_named(run,
 @pytest.mark.parametrize(
     ("has_moved", "change"), [(True, {}), (False, {"wrist_3_joint[deg]": np.full(60, 3.0)})]
 )
-def test_joints_behind_the_tip_are_named_if_they_move(run, robot_folder, no_pairs, has_moved, change):
+def test_joints_behind_the_tip_are_named_if_they_move(run, robot_folder, has_moved, change):
     write_columns(tracker_columns() | change)
     out = run("inspect", "data.csv", "--robot", UR10, "--tip", "wrist_2_link", "--json", "-")[1]
     assert ("behind the tip wrist_2_link are ignored: wrist_3_joint" in out) == has_moved
