@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from paper_arms import COMPLIANCE, PLAY, PaperArm, nominal_arm, photograph
@@ -11,6 +13,7 @@ from dhcal_pin import read_robot, select_parameters
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.calibration.cameras.gate import residual_jitter
 from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
+from dhcal_pin.calibration.cameras.target_points import with_free_points
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor
@@ -83,6 +86,17 @@ def test_rows_are_those_of_images_with_scaled_displacements(plain):
 def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
     """The geometry lacks play and sag: the temperature of N configurations is 1 + N/20."""
     assert plain.problem.temperature == 1 + plain.data[0].n_images / 20
+
+
+def test_corners_that_become_unknowns_have_no_bounds(plain):
+    bounds = np.outer([-1.0, 1.0], 1 + np.abs(plain.x))
+    problem = replace(plain.problem, bounds=bounds)
+    fit = Fit(plain.data, problem, plain.solution, plain.weights)
+    freed = with_free_points(fit, [plain.data[0].rig.boards[0].name])
+    n_more = len(freed.solution.x) - len(plain.x)
+    assert n_more > 0
+    expected = np.concatenate([bounds, np.outer([-np.inf, np.inf], np.ones(n_more))], 1)
+    np.testing.assert_array_equal(freed.problem.bounds, expected)
 
 
 def test_play_and_sag_are_selected_and_corrected(shot, plain, fit):

@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from robots import DATA, MAPS, missing, robot_file
-from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
 from scipy.stats import multivariate_normal
+from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, se3
