@@ -9,7 +9,11 @@ from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
 from dhcal_pin.cameras.intrinsics import _is_plausible, _without_centre, intrinsics_candidates
-from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
+from dhcal_pin.cameras.pose_from_points import (
+    agreeing_points,
+    determines_homography,
+    direct_linear_transform,
+)
 from dhcal_pin.exceptions import NotObservableError
 from dhcal_pin.measurements.images.camera_start import _well_fitting
 
@@ -44,6 +48,15 @@ def test_pose_of_points_that_are_not_flat(seed):
     estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
     assert estimate is not None
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_projective_maps_do_not_depend_on_the_origin(d):
+    rng = np.random.default_rng(d)
+    matrix, points = rng.uniform(0.5, 1, (3, d + 1)), rng.uniform(2, 3, (12, d))
+    image = points @ matrix[:, :d].T + matrix[:, d]
+    found = direct_linear_transform(points, image[:, :2] / image[:, 2:])
+    np.testing.assert_allclose(found / found[0, 0], matrix / matrix[0, 0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("count", [6, 8])

@@ -87,6 +87,7 @@ def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, re
             [(e.kind, e.of, e.place) for e in fit.session.events]
             == [("base" if is_fixed else "tool", of, f"between {first - 1}.png and {first}.png")]
             and abs(fit.session.events[0].size / (scale * 5e-3) - 1) < 0.2
+            and fit.session.events[0].std < scale * 3e-4
         )
         assert fit.verdict.status == "caution" or not named[-1]
         # The error without a motion, or at most a quarter of the nominal one.
