@@ -10,6 +10,7 @@ from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_e
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
 from dhcal_pin.cameras.intrinsics import _is_plausible, _without_centre, intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import (
+    _orthographic_pose,
     agreeing_points,
     determines_homography,
     direct_linear_transform,
@@ -48,6 +49,15 @@ def test_pose_of_points_that_are_not_flat(seed):
     estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
     assert estimate is not None
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
+def test_a_small_body_has_an_orthographic_image():
+    """The errors are those of second order: of the depth by the square of size over depth."""
+    rng = np.random.default_rng(3)
+    points = 1e-3 * rng.standard_normal((20, 3))
+    pose = se3.transform(se3.exp3(rng.normal(0, 2, 3)), [0.3, -0.2, 1.0])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(_orthographic_pose(points, local[:, :2] / local[:, 2:]), pose, atol=5e-3)
 
 
 @pytest.mark.parametrize("d", [2, 3])
