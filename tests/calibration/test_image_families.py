@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from servo_arms import SO101, TIP
 
 from dhcal_pin import read_robot, select_parameters
 from dhcal_pin.calibration import Result, calibrate
-from dhcal_pin.calibration.cameras.gate import residual_jitter
+from dhcal_pin.calibration.cameras.gate import _with_evidence, residual_jitter
 from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
 from dhcal_pin.calibration.cameras.target_points import with_free_points
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
+from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import CameraCorners
@@ -86,6 +88,25 @@ def test_rows_are_those_of_images_with_scaled_displacements(plain):
 def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
     """The geometry lacks play and sag: the temperature of N configurations is 1 + N/20."""
     assert plain.problem.temperature == 1 + plain.data[0].n_images / 20
+
+
+@pytest.mark.parametrize("temperature", [1.0, 5.0])
+def test_prior_widths_of_the_gate_have_the_greatest_evidence(plain, temperature):
+    problem, system, x = plain.problem.at_temperature(1.0), plain.solution.system, plain.x
+    errors = problem.errors
+    groups = PriorGroups.from_expected(errors, 1 / errors.priors, np.ones(len(errors.parameters), bool))
+    found = _with_evidence(Fit(plain.data, problem, plain.solution, plain.weights), groups, temperature, 1)
+    rows, best = system.scaled(temperature**-0.5), found.problem.prior_weights
+
+    def log_evidence(weights):
+        """Logarithm of the density of the residuals of the linear model."""
+        root = np.abs(np.diag(rows.with_priors(weights, x).r))
+        return np.sum(np.log(weights[groups.members])) - np.sum(np.log(root)) - rows.solve(weights, x)[1] / 2
+
+    for group, factor in product(range(len(groups.expected_weights)), (0.8, 1.25)):
+        weights = best.copy()
+        weights[groups.members[groups.group_index == group]] *= factor
+        assert log_evidence(weights) < log_evidence(best)
 
 
 def test_corners_that_become_unknowns_have_no_bounds(plain):

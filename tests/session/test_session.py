@@ -25,7 +25,7 @@ from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
-from dhcal_pin.session.robot_changes import JointPaths
+from dhcal_pin.session.robot_changes import JointPaths, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
 from dhcal_pin.session.search import WIDTHS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
@@ -169,6 +169,7 @@ def test_paths_of_joints_are_those_of_each_file():
         for each, f in zip(found, functions, strict=True):
             inner = slice(40 * i + 5, 40 * i + 35)
             np.testing.assert_allclose(each[inner, 1], 2 * f(t[5:35] + lag), atol=1e-4)
+    assert RobotChanges().is_empty
     # Times are no numbers of samples.
     np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
 
