@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -11,7 +12,7 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence
+from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence, find_shift
 from dhcal_pin.calibration.cameras.diagnosis import _without_rigid_motion
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
@@ -277,6 +278,14 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
         inside = (place >= 0) & (place <= 8)
         expected = [np.interp(place[inside], np.arange(9), column) for column in sequence.T]
         np.testing.assert_allclose(found.q, np.transpose(expected), atol=1e-12)
+
+
+def test_images_of_the_row_before_are_paired_again():
+    """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
+    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
+    assert find_shift(shifted, Causes()) == -1.0
 
 
 def test_a_rigid_motion_does_not_bend_a_board():

@@ -15,7 +15,9 @@ from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
+from dhcal_pin.calibration.cameras.gate import Gate, open_fit
 from dhcal_pin.calibration.cameras.image_session import find_image_session
+from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import Rig
 from dhcal_pin.estimation.parameters import LOW_COST, select_parameters
 from dhcal_pin.measurements import CameraCorners, Pose
@@ -164,6 +166,9 @@ def test_nothing_moved(seeds):
         fit = calibrate(setup.nominal, setup.images)
         assert fit.session is not None
         assert not fit.session.found, seed
+        # Noise alone is left, so that each image counts in full.
+        state, gate = Fit(fit.data, fit.problem, fit.solution, fit.weights), Gate(0.1, 1.0, 20, False, False)
+        assert open_fit(state, gate, 1)[1] == 1.0
 
 
 def test_derivatives_of_poses_with_covariance():
