@@ -387,7 +387,7 @@ def test_a_wrong_scale_is_found_and_mended(scales):
 def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
     """Computed on a grid of scales and of factors of the errors of the arm."""
     simulation = Simulation("ur10", 100, 6)
-    data = simulation.measure(Position, Changes(scales=(1.015,) * 3))
+    data = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015)))
     fit = calibrate(simulation.chain, data, extend="none", session="off")
     problem, x = fit.problem, fit.solution.x
     arm = [i for i, p in enumerate(problem.errors.parameters) if p.name[:4] not in ("base", "tool")]
