@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import _is_plausible, _without_centre, intrinsics_candidates
+from dhcal_pin.cameras.intrinsics import _in_plane, _is_plausible, _without_centre, intrinsics_candidates
 from dhcal_pin.cameras.pose_from_points import (
     _orthographic_pose,
     agreeing_points,
@@ -260,6 +261,13 @@ def test_focal_length_with_the_centre_in_the_middle():
     values = _without_centre(views)
     assert values is not None
     np.testing.assert_allclose(values, [1.3, 1.3, 0, 0], atol=1e-9)
+
+
+def test_a_flat_board_keeps_its_distances_in_its_plane():
+    points = (CHECKERBOARD + np.array([0.1, -0.2, 0.3])) @ se3.exp3(np.array([0.3, 0.5, 0.1])).T
+    plane = _in_plane(points)
+    assert plane is not None
+    np.testing.assert_allclose(pdist(plane), pdist(points), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,12 @@ def test_small_displacements_hardly_change_the_residuals():
     np.testing.assert_allclose(small, plain, atol=1e-9 * np.abs(plain).max())
 
 
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_images_are_counted(count):
+    images = setting("ur10", "pinhole", is_on_wrist=True, seed=3)[0].data[0]
+    assert images.take(images.image < count).n_images == count
+
+
 def test_units_and_priors_of_cameras_follow_from_their_names():
     camera = dh.cameras.Camera("c", "tip", 1280, 960, np.array([900.0, 900, 640, 480, 0, 0, 0, 0, 0]))
     found = {p.name.split(".")[1]: (p.unit, p.prior) for p in camera_parameters(camera)}

@@ -146,6 +146,14 @@ def test_no_derivative_remains_at_the_fit_even_with_narrow_priors():
     assert fit.score @ fit.covariance @ fit.score < 1
 
 
+def test_a_small_drift_has_its_time_constant():
+    search = search_of(Changes("base", 5e-4, at=None, time_constant=0.25))
+    search.run()
+    (cause,) = search.causes
+    assert isinstance(cause.shape, Drift)
+    assert 0.15 < cause.shape.time_constant / 59 < 0.5
+
+
 def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_order():
     search = search_of(Changes("base", 2e-3, at=0.45), n_cells=10)
     search.run()
@@ -408,6 +416,14 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
     assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
     assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
+
+
+def test_a_small_scale_is_found_with_an_accurate_arm():
+    simulation = Simulation("ur10", 100, 6, errors=(1e-4, 0.02 * DEGREE))
+    data = simulation.measure(Position, Changes(scales=(1.003, 1.003, 1.003)))
+    (scale,) = session_of(calibrate(simulation.chain, data, extend="none")).scales
+    assert scale.factor == pytest.approx(1.003, abs=3 * scale.std)
+    assert scale.std < 2e-4
 
 
 def test_a_coordinate_in_another_unit_is_no_scale():
