@@ -356,6 +356,8 @@ def test_two_robots_are_refused():
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
     assert fit.verdict.is_refused
     assert "Two robots were measured" in fit.verdict.reasons[0]
+    (event,) = [event for event in session_of(fit).events if event.kind == "robot"]
+    assert (event.before.line, event.after.line) == (50, 51)
 
 
 def test_a_lag_is_found_and_mended():
