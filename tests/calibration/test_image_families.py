@@ -17,6 +17,7 @@ from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
 from dhcal_pin.calibration.cameras.target_points import with_free_points
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
+from dhcal_pin.estimation.folds import NoisyRows
 from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import InvalidArgumentError
@@ -83,6 +84,9 @@ def test_rows_are_those_of_images_with_scaled_displacements(plain):
     for fold in folds:
         both = fold.fitted.at(1.0).merged(fold.held_out)
         assert both.cost < whole.at(1.0).cost
+    # The displacements of all folds and the corners are all rows.
+    corners = NoisyRows(tuple(one for one in whole.classes if not one.share)).at(1.0).cost
+    assert corners + sum(fold.held_out.cost for fold in folds) == pytest.approx(whole.at(1.0).cost)
 
 
 def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
