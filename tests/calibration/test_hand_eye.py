@@ -60,7 +60,9 @@ def check_cause(fit, fault):
     [("panda", "offsets", 22, False), ("xarm7", "distortion", 26, True), ("ur10", "lag", 27, True)],
 )
 def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
-    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20), fault)
+    # Images close together, between which a lag causes a small error.
+    spread = 0.02 if fault == "lag" else 0.5
+    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20, spread=spread), fault)
 
 
 def test_rejected_corners_do_not_hide_a_bent_board():

@@ -72,6 +72,8 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
     data = Pose(q, exact) if kind is Pose else Position(q, exact[:, :3, 3])
     errors = select_parameters(chain, "minimal,base,tool")
     layout = Layout.of(make_problem(errors, (data,), 1 / errors.priors, {}))
+    # A scale of all axes is no cause: the size of the robot imitates it.
+    assert [block.of for block in layout.blocks if block.kind == "scale"] == ["x", "y", "z"]
     rates = rng.normal(size=(4, n))
     rows = whitened_rows(layout, np.zeros(len(errors.parameters)), (data,), rates)
     to_base, twists = se3.inverse(chain.base), np.eye(6)
