@@ -283,6 +283,9 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
         inside = (place >= 0) & (place <= 8)
         expected = [np.interp(place[inside], np.arange(9), column) for column in sequence.T]
         np.testing.assert_allclose(found.q, np.transpose(expected), atol=1e-12)
+    # The size of another board changes nothing.
+    (board,) = apply_causes(hand_eye, Causes(sizes={"other": 1.1}), images).rig.boards
+    np.testing.assert_array_equal(board.points, images.rig.boards[0].points)
 
 
 def test_images_of_the_row_before_are_paired_again():
