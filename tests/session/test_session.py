@@ -149,10 +149,10 @@ def test_no_derivative_remains_at_the_fit_even_with_narrow_priors():
 
 
 @pytest.mark.parametrize(
-    ("size", "time_constant", "low", "high"), [(5e-4, 0.25, 0.15, 0.5), (3e-4, None, np.inf, np.inf)]
+    ("of", "time_constant", "low", "high"), [("base", 0.25, 0.15, 0.5), ("tool", None, np.inf, np.inf)]
 )
-def test_a_small_drift_has_its_time_constant(size, time_constant, low, high):
-    search = search_of(Changes("base", size, at=None, time_constant=time_constant))
+def test_a_small_drift_has_its_time_constant(of, time_constant, low, high):
+    search = search_of(Changes(of, 5e-4, at=None, time_constant=time_constant))
     search.run()
     (cause,) = search.causes
     assert isinstance(cause.shape, Drift)
