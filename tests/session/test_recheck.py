@@ -114,8 +114,10 @@ def test_large_changes_have_the_right_size():
     assert abs(first.size - zeros[2]) < 4 * first.std + 1e-6
     # Its standard deviation is that of the noise alone, and of the uncertainty of the calibrated arm.
     step = 1e-5 * np.eye(6)[2]
-    ends = [[(pose * sim.tool).translation for pose in sim.poses(q + zeros + k * step)] for k in (-1, 1)]
-    of_noise = NOISE / np.linalg.norm(np.subtract(*ends) / 2e-5)
+    before, after = (
+        np.array([(pose * sim.tool).translation for pose in sim.poses(q + zeros + k * step)]) for k in (-1, 1)
+    )
+    of_noise = NOISE / np.linalg.norm((after - before) / 2e-5)
     assert of_noise <= first.std < 1.5 * of_noise
     moved = pin.SE3(np.eye(3), np.array([0.03, -0.04, 0.0]))
     result = recheck(fit.chain, [measured(sim, q, Position, True, base=moved)], fit.uncertainty)
