@@ -25,7 +25,7 @@ from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
-from dhcal_pin.session.robot_changes import JointPaths, RobotChanges
+from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
 from dhcal_pin.session.search import WIDTHS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
@@ -166,6 +166,14 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
     fit = search.solve(search.first_rows, [])
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+
+
+@pytest.mark.parametrize("step", [4, 6, 8])
+def test_a_further_step_changes_no_pose(step):
+    motion = Motion((5,), motions(np.random.default_rng(0), 2, 0.1))
+    more, numbers = motion.with_steps([step, 5]), np.arange(10)
+    assert more.steps == tuple(sorted([step, 5]))
+    np.testing.assert_array_equal(more.poses[more.segments(numbers)], motion.poses[motion.segments(numbers)])
 
 
 def test_paths_of_joints_are_those_of_each_file():
