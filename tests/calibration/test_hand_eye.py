@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from slow_cases import some_slow
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence, find_shift
-from dhcal_pin.calibration.cameras.diagnosis import _without_rigid_motion
+from dhcal_pin.calibration.cameras.diagnosis import _lens_text, _without_rigid_motion
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
@@ -294,6 +296,16 @@ def test_images_of_the_row_before_are_paired_again():
     right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
     shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
     assert find_shift(shifted, Causes()) == -1.0
+
+
+def test_a_change_of_one_coefficient_is_one_of_the_distortion():
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=5)
+    camera = images.rig.cameras[0]
+    found = dict(zip(camera.lens.names, camera.values, strict=True))
+    found["k1"] += 0.1
+    state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    assert "distortion of camera" in _lens_text(hand_eye, state)[0]
 
 
 def test_a_rigid_motion_does_not_bend_a_board():
