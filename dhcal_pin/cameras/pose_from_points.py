@@ -114,7 +114,7 @@ def agreeing_points(points: Array, image: Array) -> Array:
     fits = _transfer_distances(source, image, chosen)
     # The map passes through the points that it is computed from: they do not count as a majority.
     majority = (len(points) + least + 1) // 2
-    distances = np.partition(fits, majority - 1, 1)[:, majority - 1]
+    distances = np.sort(fits, 1)[:, majority - 1]
     best = fits[np.argmin(distances)]
     return best <= max(_OUTLIER_RATIO * float(distances.min()), limit)
 

@@ -222,8 +222,7 @@ def read_servos(path: PathLike) -> ServoFile:
     table = TomlTable.read(path)
     head = table.some_values(HEAD_KEYS)
     keys = _NAME_KEYS if head["lerobot"] else MOTOR_KEYS
-    each = toml.table_of(keys, is_optional=False)
-    motors = table.table("motor", required=not head["lerobot"]).values_by_name(each)
+    motors = table.table("motor", required=not head["lerobot"]).values_by_name(toml.table_of(keys))
     table.finish()
     if head["lerobot"]:
         lerobot = os.path.join(os.path.dirname(path), head["lerobot"])

@@ -26,7 +26,8 @@ def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
     fitted = replace(timeline, data=(*problem.data, *timeline.data[timeline.n_fitted :]))
     numbers, times = timeline.fitted_numbers, timeline.fitted_times
     causes, changes = session.causes, session.changes
-    prior = np.concatenate([layout.weights, *(1 / cause.sizes for cause in causes)])
+    # The priors of the problem; those of the search are wide, for arms with large errors.
+    prior = np.concatenate([np.fmax(problem.weights, layout.weights), *(1 / c.sizes for c in causes)])
     ends = np.cumsum([len(x), *(len(cause.values) for cause in causes)])
     covariance = np.zeros((len(prior), len(prior)))
     for _ in range(N_STEPS):

@@ -588,19 +588,19 @@ class _Search:
         full = layout.errors_at(self.x)
         chain = layout.problem.errors.at(full[: len(layout.problem.errors.parameters)])
         values = layout.problem.instruments(full)
-        held_out = np.concatenate([np.empty(0, int), *timeline.numbers[timeline.n_fitted :]])
         for i, cause in enumerate(self.causes):
             if not isinstance(cause.shape, Step):
                 continue
             old = cause.shape.number
             last = self.numbers[self.numbers < old].max(initial=-1)
-            between = np.sort(held_out[(held_out > last) & (held_out < old)])
+            held_out = timeline.numbers[timeline.n_fitted :]
+            between = sorted(n for numbers in held_out for n in numbers.tolist() if last < n < old)
             costs = {}
-            for new in (old, *between.tolist()):
+            for new in (old, *between):
                 changes = self.changes.with_step(cause.block.kind, cause.block.index, old, new)
                 _, items = apply_changes(changes, self.chain, timeline, self.paths)
                 costs[new] = 0.0
-                for item, numbers in zip(items, timeline.numbers[timeline.n_fitted :], strict=True):
+                for item, numbers in zip(items, held_out, strict=True):
                     part = item.take(np.isin(numbers, between))
                     if len(part.rows):
                         u = np.array([values[parameter.name] for parameter in part.instrument_parameters])

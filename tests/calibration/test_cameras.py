@@ -14,7 +14,7 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
-from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, exchange_axes, reorder
+from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, _images_of, exchange_axes, reorder
 from dhcal_pin.calibration.cameras.gate import cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.cameras import Board
@@ -206,6 +206,7 @@ def test_first_values_of_one_file_are_not_those_of_another_rig():
     few, others = (images.take(part) for part in (images.image < 1, images.image >= 1))
     mixed = few, others.with_rig(replace(rig, cameras=(replace(camera, name="other"),)))
     assert all(a is b for a, b in zip(with_common_start(chain, mixed), mixed, strict=True))
+    assert [part.n_images for part in _images_of(mixed, "other")] == [9]
     start = [
         p.nominal for item in with_common_start(chain, (few, others)) for p in item.instrument_parameters
     ]

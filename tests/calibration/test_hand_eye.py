@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +14,8 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence
-from dhcal_pin.calibration.cameras.diagnosis import _without_rigid_motion
+from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence, find_shift
+from dhcal_pin.calibration.cameras.diagnosis import _lens_text, _without_rigid_motion
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
@@ -59,7 +62,9 @@ def check_cause(fit, fault):
     [("panda", "offsets", 22, False), ("xarm7", "distortion", 26, True), ("ur10", "lag", 27, True)],
 )
 def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
-    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20), fault)
+    # Images close together, between which a lag causes a small error.
+    spread = 0.02 if fault == "lag" else 0.5
+    check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20, spread=spread), fault)
 
 
 def test_rejected_corners_do_not_hide_a_bent_board():
@@ -87,9 +92,9 @@ def check_nothing(fit):
     assert fit.hand_eye.noise.distance == pytest.approx(fit.hand_eye.error.distance, rel=0.1)
 
 
-@pytest.mark.parametrize(("name", "is_on_wrist"), [("ur10", True), ("panda", False)])
-def test_noise_has_no_cause(name, is_on_wrist):
-    check_nothing(hand_eye(name, "nothing", 41, is_on_wrist, n_images=20))
+@pytest.mark.parametrize(("name", "is_on_wrist", "sigma"), [("ur10", True, SIGMA), ("panda", False, 2.0)])
+def test_noise_has_no_cause(name, is_on_wrist, sigma):
+    check_nothing(hand_eye(name, "nothing", 41, is_on_wrist, n_images=20, sigma=sigma))
 
 
 @pytest.mark.slow
@@ -114,14 +119,16 @@ def test_noise_of_few_images_is_predicted(n_seeds, step):
 
 def test_figures_of_the_causes_are_true():
     """The size of a board and the focal length are those of the simulation."""
-    chain, images, setup = faulty_setup("ur10", "size", 51, is_on_wrist=True, n_images=20)
+    chain, images, setup = faulty_setup("ur10", "size", 51, is_on_wrist=True, n_images=20, severity=0.1)
     fit = dh.calibrate(chain, images, "camera,board", loss="linear")
     check_cause(fit, "size")
     found = fit.hand_eye
     assert found is not None
-    size = 1e3 * setup.images.rig.boards[0].square * 0.97, 1e3 * setup.images.rig.boards[0].square * 1.03
-    text = found.causes[0].text
-    assert any(f"squares of {each:.3g}"[:14] in text for each in size)
+    # Errors of the arm explain the images as well, with more unknowns.
+    assert [cause.cause for cause in found.alternatives] == ["arm geometry"]
+    value = float(found.causes[0].text.split("squares of ")[1].split(" ")[0])
+    change = 1e-3 * value / setup.images.rig.boards[0].square - 1
+    assert abs(change) == pytest.approx(0.003, rel=0.1)
     chain, images, setup = faulty_setup("ur10", "focal", 52, is_on_wrist=True, n_images=20)
     fit = dh.calibrate(chain, images, "camera,board", loss="linear")
     check_cause(fit, "focal")
@@ -129,6 +136,7 @@ def test_figures_of_the_causes_are_true():
     assert found is not None
     value = float(found.causes[0].text.split(": ")[1].split(",")[0])
     assert value == pytest.approx(setup.exact.rig.cameras[0].values[0], rel=2e-3)
+    assert found.noise.pixels == pytest.approx(np.sqrt(2) * SIGMA, rel=0.05)
 
 
 def test_two_faults_are_named_in_turn():
@@ -159,32 +167,37 @@ def test_images_with_wrong_joint_values_are_counted(has_names):
     for first, second in ((3, 13), (8, 15)):
         swapped[np.all(images.q == q[first], 1)] = q[second]
         swapped[np.all(images.q == q[second], 1)] = q[first]
+    # The camera moved in one image, and in another one by less than five times the error of the others.
+    moved = images.values + sum(px * np.all(images.q == q[i], 1)[:, None] for i, px in ((6, 4.0), (10, 0.9)))
     names = [f"{np.flatnonzero(np.all(q == each, 1))[0]:04}.png" for each in images.q]
     image_names = names if has_names else None
-    data = CameraCorners(swapped, images.values, images.corner, images.rig, image_names=image_names)
+    data = CameraCorners(swapped, moved, images.corner, images.rig, image_names=image_names)
     fit = dh.calibrate(chain, data, "camera,board")
     assert fit.hand_eye is not None
-    assert fit.hand_eye.n_wrong_images == 4
+    assert fit.hand_eye.n_wrong_images == 5
     assert fit.hand_eye.is_noise
-    (text,) = [text for text in fit.verdict.reasons if "4 images do not fit the others" in text]
+    (text,) = [text for text in fit.verdict.reasons if "5 images do not fit the others" in text]
     listed = fit.hand_eye.to_dict()["wrong_image_names"]
     if image_names is None:
         assert "left out: check" in text
         assert listed == []
     else:
-        assert sorted(listed) == ["0003.png", "0008.png", "0013.png", "0015.png"]
-        assert f"left out ({', '.join(listed[:3])} and 1 more): check" in text
+        assert sorted(listed) == ["0003.png", "0006.png", "0008.png", "0013.png", "0015.png"]
+        assert f"left out ({', '.join(listed[:3])} and 2 more): check" in text
 
 
-def test_joint_values_that_are_wrong_at_random_displace_images():
+@pytest.mark.parametrize("has_joint_values", [True, False])
+def test_joint_values_that_are_wrong_at_random_displace_images(has_joint_values):
     """As of an arm that had not stopped; no cause that is tried explains the images."""
-    chain, images, _ = faulty_setup("ur10", "nothing", 61, is_on_wrist=True, n_images=10)
+    chain, images, _ = faulty_setup("ur10", "nothing", 61, is_on_wrist=True, n_images=8)
     wrong = np.random.default_rng(0).normal(0, 2e-3, (images.n_images, chain.n_joints))
-    data = images.replace(q=images.q + wrong[images.image])
+    data = images.replace(q=images.q + wrong[images.image], has_joint_values=has_joint_values)
     found = dh.calibrate(chain, data, "camera,board", loss="linear").hand_eye
     assert found is not None
     assert [cause.cause for cause in found.causes] == ["displaced images"]
     assert "all corners of an image are displaced together" in found.likely
+    # With joint values, errors of the geometry were tried.
+    assert ("errors of the arm of another kind" in found.likely) == has_joint_values
 
 
 def test_similar_rotations_are_named():
@@ -272,6 +285,27 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
         inside = (place >= 0) & (place <= 8)
         expected = [np.interp(place[inside], np.arange(9), column) for column in sequence.T]
         np.testing.assert_allclose(found.q, np.transpose(expected), atol=1e-12)
+    # The size of another board changes nothing.
+    (board,) = apply_causes(hand_eye, Causes(sizes={"other": 1.1}), images).rig.boards
+    np.testing.assert_array_equal(board.points, images.rig.boards[0].points)
+
+
+def test_images_of_the_row_before_are_paired_again():
+    """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
+    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
+    assert find_shift(shifted, Causes()) == -1.0
+
+
+def test_a_change_of_one_coefficient_is_one_of_the_distortion():
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=5)
+    camera = images.rig.cameras[0]
+    found = dict(zip(camera.lens.names, camera.values, strict=True))
+    found["k1"] += 0.1
+    state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    assert "distortion of camera" in _lens_text(hand_eye, state)[0]
 
 
 def test_a_rigid_motion_does_not_bend_a_board():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
 import pytest
 from paper_arms import COMPLIANCE, PLAY, PaperArm, nominal_arm, photograph
@@ -9,10 +12,13 @@ from servo_arms import SO101, TIP
 
 from dhcal_pin import read_robot, select_parameters
 from dhcal_pin.calibration import Result, calibrate
-from dhcal_pin.calibration.cameras.gate import residual_jitter
+from dhcal_pin.calibration.cameras.gate import _with_evidence, residual_jitter
 from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
+from dhcal_pin.calibration.cameras.target_points import with_free_points
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
+from dhcal_pin.estimation.folds import NoisyRows
+from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import CameraCorners
@@ -72,17 +78,50 @@ def test_rows_are_those_of_images_with_scaled_displacements(plain):
     rows = whole.at(1.0).rows
     np.testing.assert_allclose(rows.T @ rows, exact.T @ exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
     # The shares of the classes stand for displacements within a factor of the square root of two.
-    for noise in (0.3, 3.0):
+    for noise in (0.1, 0.3, 3.0):
         scaled = linearize_and_factor(with_jitter_times(problem, noise), x, small_angle=False)
-        assert whole.at(noise).cost == pytest.approx(scaled.cost, rel=0.1)
+        assert whole.at(noise).cost == pytest.approx(scaled.cost, rel=0.03)
     for fold in folds:
         both = fold.fitted.at(1.0).merged(fold.held_out)
         assert both.cost < whole.at(1.0).cost
+    # The displacements of all folds and the corners are all rows.
+    corners = NoisyRows(tuple(one for one in whole.classes if not one.share)).at(1.0).cost
+    assert corners + sum(fold.held_out.cost for fold in folds) == pytest.approx(whole.at(1.0).cost)
 
 
 def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
     """The geometry lacks play and sag: the temperature of N configurations is 1 + N/20."""
     assert plain.problem.temperature == 1 + plain.data[0].n_images / 20
+
+
+@pytest.mark.parametrize("temperature", [1.0, 5.0])
+def test_prior_widths_of_the_gate_have_the_greatest_evidence(plain, temperature):
+    problem, system, x = plain.problem.at_temperature(1.0), plain.solution.system, plain.x
+    errors = problem.errors
+    groups = PriorGroups.from_expected(errors, 1 / errors.priors, np.ones(len(errors.parameters), bool))
+    found = _with_evidence(Fit(plain.data, problem, plain.solution, plain.weights), groups, temperature, 1)
+    rows, best = system.scaled(temperature**-0.5), found.problem.prior_weights
+
+    def log_evidence(weights):
+        """Logarithm of the density of the residuals of the linear model."""
+        root = np.abs(np.diag(rows.with_priors(weights, x).r))
+        return np.sum(np.log(weights[groups.members])) - np.sum(np.log(root)) - rows.solve(weights, x)[1] / 2
+
+    for group, factor in product(range(len(groups.expected_weights)), (0.8, 1.25)):
+        weights = best.copy()
+        weights[groups.members[groups.group_index == group]] *= factor
+        assert log_evidence(weights) < log_evidence(best)
+
+
+def test_corners_that_become_unknowns_have_no_bounds(plain):
+    bounds = np.outer([-1.0, 1.0], 1 + np.abs(plain.x))
+    problem = replace(plain.problem, bounds=bounds)
+    fit = Fit(plain.data, problem, plain.solution, plain.weights)
+    freed = with_free_points(fit, [plain.data[0].rig.boards[0].name])
+    n_more = len(freed.solution.x) - len(plain.x)
+    assert n_more > 0
+    expected = np.concatenate([bounds, np.outer([-np.inf, np.inf], np.ones(n_more))], 1)
+    np.testing.assert_array_equal(freed.problem.bounds, expected)
 
 
 def test_play_and_sag_are_selected_and_corrected(shot, plain, fit):

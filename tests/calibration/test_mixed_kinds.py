@@ -7,12 +7,18 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from slow_cases import some_slow
 
 from dhcal_pin import read_robot
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.cameras import procedure
-from dhcal_pin.calibration.cameras.jitter import Jitter, _log_likelihood, _maximize_likelihood
+from dhcal_pin.calibration.cameras.jitter import (
+    Jitter,
+    _log_likelihood,
+    _maximize_likelihood,
+    _scatter,
+)
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.initialization import subsample
 from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
@@ -174,6 +180,16 @@ def test_displacements_are_as_large_as_those_of_which_the_fit_absorbed_a_half():
     images = list(zip(residuals, derivatives, strict=True))
     found = _maximize_likelihood(images, 1.0, n_determined=3 * m)
     np.testing.assert_allclose([found.position, found.rotation], [7e-4, 3e-4], rtol=0.04)
+    # What six displacements do not explain is the noise, 1 here; they explain all of three corners.
+    assert _scatter(images) == pytest.approx(1, rel=0.02)
+    assert _scatter([(residuals[0, :6], derivatives[0, :6])]) == 1.0
+
+
+def test_chance_hardly_makes_images_show_a_displacement():
+    """Twice the logarithm of the ratio of likelihoods has a chi-square distribution (Wilks)."""
+    ratios = 0.5 * chi2.isf([0.05, 1e-4], 3)
+    found = [Jitter(1.0, 0.0, 0.0, log_likelihood_ratio=ratio).is_significant for ratio in ratios]
+    assert found == [False, True]
 
 
 def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():

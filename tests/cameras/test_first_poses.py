@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import _is_plausible, _without_centre, intrinsics_candidates
-from dhcal_pin.cameras.pose_from_points import agreeing_points, determines_homography
+from dhcal_pin.cameras.intrinsics import _in_plane, _is_plausible, _without_centre, intrinsics_candidates
+from dhcal_pin.cameras.pose_from_points import (
+    _orthographic_pose,
+    agreeing_points,
+    determines_homography,
+    direct_linear_transform,
+)
 from dhcal_pin.exceptions import NotObservableError
 from dhcal_pin.measurements.images.camera_start import _well_fitting
 
@@ -44,6 +50,24 @@ def test_pose_of_points_that_are_not_flat(seed):
     estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
     assert estimate is not None
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
+def test_a_small_body_has_an_orthographic_image():
+    """The errors are those of second order: of the depth by the square of size over depth."""
+    rng = np.random.default_rng(3)
+    points = 1e-3 * rng.standard_normal((20, 3))
+    pose = se3.transform(se3.exp3(rng.normal(0, 2, 3)), [0.3, -0.2, 1.0])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(_orthographic_pose(points, local[:, :2] / local[:, 2:]), pose, atol=5e-3)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_projective_maps_do_not_depend_on_the_origin(d):
+    rng = np.random.default_rng(d)
+    matrix, points = rng.uniform(0.5, 1, (3, d + 1)), rng.uniform(2, 3, (12, d))
+    image = points @ matrix[:, :d].T + matrix[:, d]
+    found = direct_linear_transform(points, image[:, :2] / image[:, 2:])
+    np.testing.assert_allclose(found / found[0, 0], matrix / matrix[0, 0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("count", [6, 8])
@@ -237,6 +261,13 @@ def test_focal_length_with_the_centre_in_the_middle():
     values = _without_centre(views)
     assert values is not None
     np.testing.assert_allclose(values, [1.3, 1.3, 0, 0], atol=1e-9)
+
+
+def test_a_flat_board_keeps_its_distances_in_its_plane():
+    points = (CHECKERBOARD + np.array([0.1, -0.2, 0.3])) @ se3.exp3(np.array([0.3, 0.5, 0.1])).T
+    plane = _in_plane(points)
+    assert plane is not None
+    np.testing.assert_allclose(pdist(plane), pdist(points), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,16 @@ def test_values_without_width_are_held():
     np.testing.assert_allclose(fit.values[4], TRUE["pinhole"][4], atol=0.05)
 
 
+def test_views_that_repeat_the_errors_of_one_count_as_one():
+    values, std = stated_lens("pinhole", "stated")
+    rows = np.random.default_rng(0).standard_normal((8, 10))
+    gains = []
+    for count in (1, 3):
+        problem = _LensProblem([], LENSES["pinhole"], values, std, count)
+        gains.append(problem._cost([rows] * count, values) - problem._cost([rows / 2] * count, values))
+    assert gains[0] == pytest.approx(gains[1])
+
+
 def test_a_value_one_standard_deviation_off_costs_one():
     """The cost is minus twice the logarithm of the density, here with the same errors of the images."""
     values, std = stated_lens("pinhole", "stated")

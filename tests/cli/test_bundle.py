@@ -133,15 +133,17 @@ def continued(first, folder, *options) -> dict:
 
 
 def test_a_bundle_is_continued_with_more_measurements(first, tmp_path):
-    more, bundle = tmp_path / "laser.csv", tmp_path / "next.dhcal.zip"
+    more, bundle = [tmp_path / each / "day" / "laser.csv" for each in "ab"], tmp_path / "next.dhcal.zip"
     robot = str(URDF / "sim_6dof.dh.toml")
-    assert main(["simulate", robot, "-m", "9", "--noise", "0.1mm", "--seed", "5", "-o", str(more)]) == 0
-    found = continued(first, tmp_path, more, "--bundle", bundle)
-    assert found["samples"] == 29
-    # The name of the added file is another one in the bundle.
-    names = sorted(read_bundle(bundle).inputs)
-    assert len(names) == 3
-    assert {"laser.csv", "sim_6dof.dh.toml"} < set(names)
+    for seed, path in enumerate(more, 5):
+        path.parent.mkdir(parents=True)
+        words = ["-m", "9", "--noise", "0.1mm", "--seed", str(seed), "-o", str(path)]
+        assert main(["simulate", robot, *words]) == 0
+    found = continued(first, tmp_path, *more, "--bundle", bundle)
+    assert found["samples"] == 38
+    # The names of the added files are other ones in the bundle.
+    names = {"laser.csv", "sim_6dof.dh.toml", "a/day/laser.csv", "b/day/laser.csv"}
+    assert set(read_bundle(bundle).inputs) == names
     again = tmp_path / "again"
     again.mkdir()
     assert main(["calibrate", "--from", str(bundle), "-o", str(again / "out.urdf")]) == 0

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from servo_arms import RANGES, lerobot_degrees, lerobot_text
 
+from dhcal_pin.cli.servo_zeros import describe_moves
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_servos
 
@@ -77,6 +78,9 @@ def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
         for space in (" ", ""):
             by_hand = by_hand.replace(f'"homing_offset":{space}{before},', f'"homing_offset":{space}{after},')
     assert corrected.lerobot_content() == by_hand
+    assert describe_moves(servos, servos) == []
+    (sentence,) = describe_moves(servos, corrected)
+    assert "by whole counts: elbow_flex " in sentence
 
 
 def test_a_homing_offset_stays_within_the_register_of_a_feetech_motor(tmp_path):

@@ -77,6 +77,21 @@ def test_derivatives_of_every_unknown(name, model, is_on_wrist):
     assert n_checked > 0.6 * len(x)
 
 
+def test_small_displacements_hardly_change_the_residuals():
+    problem, _, x = setting("ur10", "pinhole", is_on_wrist=True, seed=3)
+    (images,) = problem.data
+    frames = problem.errors.at(x[: len(problem.errors.parameters)]).forward_kinematics(images.conditions())
+    u = problem.instrument_values_of(images, x)
+    plain, small = (images.with_jitter(k * images.jitter).residual(frames, u) for k in (0.0, 1e-6))
+    np.testing.assert_allclose(small, plain, atol=1e-9 * np.abs(plain).max())
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_images_are_counted(count):
+    images = setting("ur10", "pinhole", is_on_wrist=True, seed=3)[0].data[0]
+    assert images.take(images.image < count).n_images == count
+
+
 def test_units_and_priors_of_cameras_follow_from_their_names():
     camera = dh.cameras.Camera("c", "tip", 1280, 960, np.array([900.0, 900, 640, 480, 0, 0, 0, 0, 0]))
     found = {p.name.split(".")[1]: (p.unit, p.prior) for p in camera_parameters(camera)}

@@ -325,6 +325,10 @@ def test_unknown_conditions_of_python_are_refused(arm):
         data.with_conditions(temperature=[1, 2, 3])
     with pytest.raises(InvalidArgumentError, match="approach in row 2: 3 is not a direction"):
         data.with_conditions(approach=[[0] * 6, [3] * 6])
+    with pytest.raises(InvalidArgumentError, match="time in row 2: is earlier than the row before"):
+        data.with_conditions(time=[1.0, 0.0])
+    # Several targets are measured at the same time.
+    np.testing.assert_array_equal(data.with_conditions(time=[1.0, 1.0]).conditions().time, 1.0)
 
 
 def test_conditions_go_through_the_command_line(arm, tmp_path, monkeypatch, capsys):

@@ -81,6 +81,10 @@ def test_a_curve_that_turns_back_is_refused(arm):
     x[[p.name for p in errors.parameters].index("elbow_joint.sin32")] = 0.2
     with pytest.raises(ConvergenceError, match="joint 'elbow_joint': the errors are too large"):
         joint_corrections(errors.at(x))
+    # This one always rises, by 0.36 at least.
+    (table,) = joint_corrections(errors.at(0.1 * x))
+    commanded = table.values + table.corrections
+    np.testing.assert_allclose(commanded + 0.02 * np.sin(32 * commanded), table.values, atol=1e-14)
 
 
 def read(path: str) -> list[dict[str, str]]:

@@ -15,7 +15,9 @@ from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
+from dhcal_pin.calibration.cameras.gate import Gate, open_fit
 from dhcal_pin.calibration.cameras.image_session import find_image_session
+from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import Rig
 from dhcal_pin.estimation.parameters import LOW_COST, select_parameters
 from dhcal_pin.measurements import CameraCorners, Pose
@@ -87,6 +89,7 @@ def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, re
             [(e.kind, e.of, e.place) for e in fit.session.events]
             == [("base" if is_fixed else "tool", of, f"between {first - 1}.png and {first}.png")]
             and abs(fit.session.events[0].size / (scale * 5e-3) - 1) < 0.2
+            and fit.session.events[0].std < scale * 3e-4
         )
         assert fit.verdict.status == "caution" or not named[-1]
         # The error without a motion, or at most a quarter of the nominal one.
@@ -163,6 +166,9 @@ def test_nothing_moved(seeds):
         fit = calibrate(setup.nominal, setup.images)
         assert fit.session is not None
         assert not fit.session.found, seed
+        # Noise alone is left, so that each image counts in full.
+        state, gate = Fit(fit.data, fit.problem, fit.solution, fit.weights), Gate(0.1, 1.0, 20, False, False)
+        assert open_fit(state, gate, 1)[1] == 1.0
 
 
 def test_derivatives_of_poses_with_covariance():

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from robots import DATA, MAPS, missing, robot_file
+from scipy.stats import multivariate_normal
 from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
 from slow_cases import some_slow
 
@@ -24,7 +25,8 @@ from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
-from dhcal_pin.session.robot_changes import JointPaths
+from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
+from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
 from dhcal_pin.session.search import WIDTHS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
@@ -70,6 +72,8 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
     data = Pose(q, exact) if kind is Pose else Position(q, exact[:, :3, 3])
     errors = select_parameters(chain, "minimal,base,tool")
     layout = Layout.of(make_problem(errors, (data,), 1 / errors.priors, {}))
+    # A scale of all axes is no cause: the size of the robot imitates it.
+    assert [block.of for block in layout.blocks if block.kind == "scale"] == ["x", "y", "z"]
     rates = rng.normal(size=(4, n))
     rows = whitened_rows(layout, np.zeros(len(errors.parameters)), (data,), rates)
     to_base, twists = se3.inverse(chain.base), np.eye(6)
@@ -104,13 +108,13 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
 
 
-def search_of(changes, n_cells=60, is_ordered=True):
+def search_of(changes, n_cells=60, is_ordered=True, prior_factor=1.0):
     """Return the search of a session of 60 poses."""
     simulation = Simulation("ur10", 60, 3)
     data = simulation.measure(Pose, changes)
     chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
     errors = select_parameters(chain, "minimal,base,tool")
-    problem = make_problem(errors, (data,), 1 / errors.priors, {})
+    problem = make_problem(errors, (data,), 1 / (prior_factor * errors.priors), {})
     start, timeline = np.zeros(len(errors.parameters)), order_samples((data,), ())
     return _Search(problem, start, timeline, is_ordered, 60, n_cells)
 
@@ -139,6 +143,22 @@ def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
     assert cause.log_evidence == pytest.approx(expected, abs=0.25 * len(cause.values))
 
 
+def test_no_derivative_remains_at_the_fit_even_with_narrow_priors():
+    fit = search_of(Changes(), prior_factor=0.01).iterate()
+    assert fit.score @ fit.covariance @ fit.score < 1
+
+
+@pytest.mark.parametrize(
+    ("of", "time_constant", "low", "high"), [("base", 0.25, 0.15, 0.5), ("tool", None, np.inf, np.inf)]
+)
+def test_a_small_drift_has_its_time_constant(of, time_constant, low, high):
+    search = search_of(Changes(of, 5e-4, at=None, time_constant=time_constant))
+    search.run()
+    (cause,) = search.causes
+    assert isinstance(cause.shape, Drift)
+    assert low <= cause.shape.time_constant / 59 <= high
+
+
 def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_order():
     search = search_of(Changes("base", 2e-3, at=0.45), n_cells=10)
     search.run()
@@ -146,6 +166,14 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
     fit = search.solve(search.first_rows, [])
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+
+
+@pytest.mark.parametrize("step", [4, 6, 8])
+def test_a_further_step_changes_no_pose(step):
+    motion = Motion((5,), motions(np.random.default_rng(0), 2, 0.1))
+    more, numbers = motion.with_steps([step, 5]), np.arange(10)
+    assert more.steps == tuple(sorted([step, 5]))
+    np.testing.assert_array_equal(more.poses[more.segments(numbers)], motion.poses[motion.segments(numbers)])
 
 
 def test_paths_of_joints_are_those_of_each_file():
@@ -162,6 +190,7 @@ def test_paths_of_joints_are_those_of_each_file():
         for each, f in zip(found, functions, strict=True):
             inner = slice(40 * i + 5, 40 * i + 35)
             np.testing.assert_allclose(each[inner, 1], 2 * f(t[5:35] + lag), atol=1e-4)
+    assert RobotChanges().is_empty
     # Times are no numbers of samples.
     np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
 
@@ -320,6 +349,13 @@ def test_the_held_out_samples_beside_an_event_have_the_pose_of_their_side(size):
     assert fit.comparisons[0].after.groups["position"].rms < 2e-4
 
 
+def test_functions_of_a_free_drift_are_those_of_a_random_walk():
+    """Their covariance is that of a Wiener process that ends at 0."""
+    times = np.linspace(0, 1, 6)
+    values = FreeDrift(0.0, 1.0).values(np.arange(6), times)
+    np.testing.assert_allclose(values @ values.T, 1 - np.maximum(times, times[:, None]), atol=0.03)
+
+
 def test_errors_of_joints_along_a_path_are_no_change():
     """Residuals of a path change slowly; left-out blocks of time show that no cause explains them."""
     simulation = Simulation("ur10", 291, 52, is_path=True)
@@ -333,6 +369,8 @@ def test_two_robots_are_refused():
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(has_second_robot=True)))
     assert fit.verdict.is_refused
     assert "Two robots were measured" in fit.verdict.reasons[0]
+    (event,) = [event for event in session_of(fit).events if event.kind == "robot"]
+    assert (event.before.line, event.after.line) == (50, 51)
 
 
 def test_a_lag_is_found_and_mended():
@@ -367,6 +405,40 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
     assert not session_of(mended).scales
     assert simulation.true_error(mended.chain) < 0.3 * before
+
+
+def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
+    """Computed on a grid of scales and of factors of the errors of the arm."""
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015)))
+    fit = calibrate(simulation.chain, data, extend="none", session="off")
+    problem, x = fit.problem, fit.solution.x
+    arm = [i for i, p in enumerate(problem.errors.parameters) if p.name[:4] not in ("base", "tool")]
+    noise, change, *both = _responses(problem, x, np.array(arm))
+    root = fit.solution.system.sqrt_covariance(problem.weights)[0][arm]
+    np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
+    scale = find_scale(problem, x)
+    assert scale is not None
+    grid = scale.factor - 1 + scale.std * np.linspace(-8, 8, 81)
+    logs = np.array([
+        multivariate_normal(cov=a**2 * both[0] + b**2 * both[1] + noise, allow_singular=True).logpdf(
+            x[arm] - np.outer(grid, change)
+        )
+        for a, b in product(LENGTH_FACTORS, ANGLE_FACTORS)
+    ])  # fmt: skip
+    density = np.exp(logs - logs.max()).sum(0)
+    mean = np.average(grid, weights=density)
+    assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
+    assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
+    assert find_scale(problem, 0.1 * x) is None
+
+
+def test_a_small_scale_is_found_with_an_accurate_arm():
+    simulation = Simulation("ur10", 100, 6, errors=(1e-4, 0.02 * DEGREE))
+    data = simulation.measure(Position, Changes(scales=(1.003, 1.003, 1.003)))
+    (scale,) = session_of(calibrate(simulation.chain, data, extend="none")).scales
+    assert scale.factor == pytest.approx(1.003, abs=3 * scale.std)
+    assert scale.std < 2e-4
 
 
 def test_a_coordinate_in_another_unit_is_no_scale():

@@ -26,7 +26,7 @@ from ..._typing import Array
 from ...cameras.rig import Camera
 from ...estimation.robust import ZERO_WEIGHT
 from ...exceptions import DhcalError
-from ...formatting import Table, format_quantity
+from ...formatting import Quantity, Table, format_quantity
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.images.names import list_images
@@ -234,14 +234,14 @@ def _mm(value: float) -> str:
     """Format a length [m] in millimetres, up to the largest one that says something."""
     if value > MAX_STATED_DISTANCE:
         return f"more than {MAX_STATED_DISTANCE:.0f} m"
-    return format_quantity(value, "m", 0.1 * value, small=True)
+    return str(Quantity.error(value, "m"))
 
 
 def _px(value: float) -> str:
     """Format a number of pixels, up to the largest one that says something."""
     if value > MAX_STATED_PIXELS:
         return f"more than {MAX_STATED_PIXELS:.0f} px"
-    return format_quantity(value, "px", 0.1 * value)
+    return str(Quantity.error(value, "px"))
 
 
 def _error_dict(error: ImageError) -> dict[str, Any]:
