@@ -57,7 +57,9 @@ _FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 _OUTPUT = re.compile(r"<!-- output: last (\d+) -->\s*$")
 _NUMBER = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
 # Fewer photographs are enough for the same commands.
-SMALLER = {"howto/paper_arm.md": ("[:25]", "[:16]")}
+SMALLER = {"howto/paper_arm.md": ("[:25]", "[:12]")}
+# Pages that take long; `docs/evidence/tour.py` draws the figures of the tour whenever the pages are built.
+SLOW = {"evidence/tour.md"}
 _SIMULATE = "simulate ur10.urdf --tip tool0 -m"
 
 
@@ -149,7 +151,15 @@ def _write_foreign_file(header: list[str], rows: np.ndarray) -> None:
     Path("tracker.csv").write_text("\n".join([";".join(names), *lines]) + "\n")
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)], ids=page_name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if page_name(page) in SLOW else ())
+        for page in PAGES
+        if blocks(page)
+    ],
+    ids=page_name,
+)
 def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(shutil.copytree(examples, tmp_path / "page"))
     monkeypatch.syspath_prepend(tmp_path / "page")

@@ -263,6 +263,7 @@ SMALLER = {
         **{"in range(40)": "in range(12)", "uniform(-1, 1, 40)": "uniform(-1, 1, 12)"},
         'extend="none").validate': 'extend="none", session="off").validate',
     },
+    "06_webcam": {"[:25]": "[:18]"},
     "05_photographs": {"[:40], q[is_seen][40:]": "[:22], q[is_seen][22:]", "(400_000": "(200_000"},
 }
 

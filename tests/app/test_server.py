@@ -59,6 +59,7 @@ def test_inspection_is_that_of_the_command_line(app, example, monkeypatch, capsy
     assert result_of(messages)["result"] == json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_refusal_names_the_remedy_and_the_remedy_works(app, example):
     lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
     cells = [line.split(",") for line in lines]

@@ -18,7 +18,7 @@ from dhcal_pin.io.rig_file import rig_text
 
 cv2 = pytest.importorskip("cv2")
 
-N_IMAGES = 36
+N_IMAGES = 26
 # More corners, as errors of the arm by 0.05 mm are to be found.
 BOARD = replace(SMALL_BOARD, columns=9, rows=7, square=0.03, marker=0.022)
 

@@ -56,7 +56,9 @@ def test_evidence_and_its_best_noise_are_those_of_dense_matrices():
     noise = 1.0
     for _ in range(100):
         fitted = rows.at(noise)
-        noise = rows.noise_after(noise, fitted.solve(weights, 0.0)[0], fitted.sqrt_covariance(weights)[0])
+        root = fitted.sqrt_covariance(weights)[0]
+        n_determined = P - np.sum((root * weights[:, None]) ** 2)
+        noise = rows.noise_after(noise, fitted.solve(weights, 0.0)[0], root, n_determined)
     assert noise == pytest.approx(best, rel=1e-3)
 
 
@@ -67,7 +69,7 @@ def test_rows_of_unknown_noise_alone_have_that_of_their_residuals():
     fitted = rows.at(0.7)
     step, root = fitted.solve(np.zeros(P), 0.0)[0], fitted.sqrt_covariance(np.zeros(P))[0]
     misfit = np.sum((block[:, -1] - block[:, :-1] @ step) ** 2)
-    assert rows.noise_after(0.7, step, root) == pytest.approx(np.sqrt(misfit / (50 - P)))
+    assert rows.noise_after(0.7, step, root, P) == pytest.approx(np.sqrt(misfit / (50 - P)))
 
 
 def test_joined_parts_are_all_rows_class_by_class():

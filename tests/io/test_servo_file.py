@@ -80,7 +80,7 @@ def test_lerobot_keeps_every_byte_but_the_homing_offsets(tmp_path, text):
     assert corrected.lerobot_content() == by_hand
     assert describe_moves(servos, servos) == []
     (sentence,) = describe_moves(servos, corrected)
-    assert "by whole counts: elbow_flex " in sentence
+    assert "by counts: elbow_flex " in sentence
 
 
 def test_a_homing_offset_stays_within_the_register_of_a_feetech_motor(tmp_path):
