@@ -300,7 +300,7 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
     return np.array(out)
 
 
-@pytest.mark.parametrize(("criterion", "seeds"), some_slow([("D", 2), ("robust", 1), ("robust", 2)], {0, 1}))
+@pytest.mark.parametrize(("criterion", "seeds"), some_slow([("D", 2), ("robust", 1), ("robust", 2)], {0}))
 def test_planned_poses_of_a_series_are_as_good_as_all_of_it(criterion, seeds):
     assert planned_and_random(criterion, seeds, 1)[:, 0].max() <= 1.10
 

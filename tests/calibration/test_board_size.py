@@ -49,7 +49,8 @@ def test_large_errors_of_the_arm_are_not_taken_for_a_wrong_size(seed):
     assert fit.board_size is None
 
 
-@pytest.mark.parametrize("is_on_wrist", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("is_on_wrist", [True, False])
 def test_exchanged_links_are_named(is_on_wrist):
     """The rig states a camera on the wrist for a fixed one, or the other way round."""
     arm, images = photograph(0, 1e-3, is_on_wrist)

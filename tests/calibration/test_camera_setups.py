@@ -182,7 +182,7 @@ def split_setup(seed, *, is_arm_free):
 
 
 @pytest.mark.parametrize(
-    "seed", [26, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(32, 61))]
+    "seed", [pytest.param(seed, marks=pytest.mark.slow) for seed in (26, *range(32, 61))]
 )
 def test_wrong_arms_converge_without_a_guess(seed):
     """Two cameras with distortion see boards, most of which appear tilted the other way without it."""

@@ -224,7 +224,7 @@ def touched(truth: Chain, rng: np.random.Generator, n_places: int, m: int) -> Po
     return PointContact(np.concatenate(q), points)
 
 
-@pytest.mark.parametrize("holdout", [(), "region"])
+@pytest.mark.parametrize("holdout", some_slow([((),), "region"], {0}))
 def test_points_that_are_left_out_are_fitted_to_their_own_samples(holdout):
     arm, truth, rng = wrong_arm(0)
     fit = calibrate(arm, touched(truth, rng, 6, 20), "minimal,tool", extend="none", holdout=holdout)

@@ -144,7 +144,7 @@ def joint_errors(chain: Chain, q: np.ndarray) -> np.ndarray:
     return chain.actual_positions(Conditions(q))[0] - q.T
 
 
-@pytest.mark.parametrize("has_fine_lines", [True, False])
+@pytest.mark.parametrize("has_fine_lines", some_slow([True, False], {1}))
 def test_curves_of_high_order_have_a_prior_width_of_their_own(has_fine_lines):
     """Lines of order 40 and 55 that are a fifth of those of low order; without them their curves stay out."""
     arm, truth, data = with_curves(0, 220)

@@ -99,7 +99,7 @@ def projected(board, pose):
 
 
 @pytest.mark.parametrize(("blur", "noise"), some_slow([(0.7, 2.0), (1.2, 4.0)], {1}))
-@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.type)
+@pytest.mark.parametrize("board", some_slow(BOARDS, {0, 2}), ids=lambda board: board.type)
 def test_corners_of_rendered_boards(board, blur, noise, tmp_path):
     rng, path, errors = np.random.default_rng(1), str(tmp_path / "board.png"), []
     poses = views(board, 2, rng)

@@ -143,6 +143,7 @@ def test_named_curves_do_not_change_the_choice():
     assert found[0].curves == found[1].curves
 
 
+@pytest.mark.slow
 def test_curves_combine_with_another_criterion():
     chain, rng = Chain.from_dh(paper("sim_6dof")), np.random.default_rng(0)
     q, task = rng.uniform(-3, 3, (400, 6)), rng.uniform(-0.3, 0.3, (20, 6))

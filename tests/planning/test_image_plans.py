@@ -108,7 +108,7 @@ def opencv_view(arm: Chain, rig: MountedRig, q: np.ndarray) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize(
-    "name", some_slow(["ur10-wrist", "panda-fixed", "xarm7-fisheye", "talos_full_v2-head"], {2})
+    "name", some_slow(["ur10-wrist", "panda-fixed", "xarm7-fisheye", "talos_full_v2-head"], ())
 )
 def test_every_planned_pose_has_the_board_in_view(name):
     arm, rig = setup(name)
@@ -420,8 +420,8 @@ def test_unknown_corners_are_predicted_as_the_calibration_knows_them():
         assert value == pytest.approx(reached[name], rel=0.07), name
 
 
-@pytest.mark.parametrize("seeds", [6, pytest.param(40, marks=pytest.mark.slow)])
-def test_predicted_error_contains_that_of_unknown_corners(seeds):
+@pytest.mark.slow
+def test_predicted_error_contains_that_of_unknown_corners():
     """Calibrations of boards whose corners are 1 mm beside the stated places err as predicted."""
     arm, rig = setup("ur10-fixed")
     rig = small_board(rig)
@@ -430,7 +430,7 @@ def test_predicted_error_contains_that_of_unknown_corners(seeds):
     options = {"noise": Noise(), "parameters": SETS, "candidates": 60, "space": FLOOR, "task": task}
     found = plan(arm, 8, images=PlannedImages(rig), **options)
     squares = []
-    for _ in range(seeds):
+    for _ in range(40):
         truth = corners_beside(rig, 1e-3, rng)
         exact = images_at(arm, truth, found.q, 0.3)
         data = exact.replace(values=exact.values + 0.3 * rng.standard_normal(exact.values.shape))
@@ -444,8 +444,8 @@ def test_predicted_error_contains_that_of_unknown_corners(seeds):
     reached = float(np.sqrt(np.mean(squares)))
     exact_corners = plan(arm, 8, images=PlannedImages(with_points(rig, has_free_points=False)), **options)
     # The error has about ten directions, so that its RMS over n calibrations has a standard deviation of
-    # 1/√(20·n).
-    assert found.error == pytest.approx(reached, rel=max(3 / np.sqrt(20 * seeds), 0.1))
+    # 1/√(20·n), 3.5 % here.
+    assert found.error == pytest.approx(reached, rel=0.11)
     assert exact_corners.error < found.error
 
 

@@ -165,6 +165,7 @@ def ratios(name: str, kind: str, seeds: int) -> tuple[float, float]:
     return float(np.median([planned / random for planned, random in pairs])), found.relative_error
 
 
+@pytest.mark.slow
 def test_planned_poses_give_smaller_errors_than_random_ones():
     reached, predicted = ratios("ur10", "position", 12)
     assert reached <= 0.9

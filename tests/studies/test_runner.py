@@ -110,6 +110,7 @@ poses = 16
 """
 
 
+@pytest.mark.slow
 def test_planned_poses_have_the_predicted_error(tmp_path):
     """The same arms with poses at random and with those of `plan`, however the work is shared out."""
     one = table_of(tmp_path, "one", text=PLANNED)

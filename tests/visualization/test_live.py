@@ -17,6 +17,7 @@ import psutil
 import pytest
 from pages import LIVE_FIND
 from robots import URDF
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
@@ -72,7 +73,7 @@ def test_the_browser_shows_what_pinocchio_says(scene, browser, sim_6dof):
     page.close()
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("end", some_slow([signal.SIGKILL, signal.SIGSTOP], {1}))
 def test_a_server_that_is_gone_is_named_in_time(scene, end):
     assert TIMEOUT_MS < 3000
     for process in processes(scene):

@@ -233,7 +233,7 @@ def driven(chain: Chain, seed: int) -> Chain:
     return chain.with_transmission(Transmission(coefficients, chain.loads))
 
 
-@pytest.mark.parametrize("robot", ["ur10", "odd"])
+@pytest.mark.parametrize("robot", some_slow(["ur10", "odd"], {1}))
 def test_joints_that_miss_their_values_stand_where_pinocchio_has_them(window, tmp_path, robot):
     pair = perturbed(Chain.from_urdf(parse_urdf(WEIGHTS, "odd.urdf"), "e")) if robot == "odd" else arms(robot)
     nominal, calibrated = (driven(chain, seed) for seed, chain in enumerate(pair))
