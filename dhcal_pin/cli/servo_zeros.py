@@ -43,5 +43,7 @@ def describe_moves(before: ServoFile, after: ServoFile) -> list[str]:
     if not moves:
         return []
     counts = ", ".join(f"{name} {count:+d}" for name, count in moves.items())
-    limits = "; the position limits of LeRobot move, too: approach the ends slowly, keep the recorded ranges"
+    limits = (
+        "; the position limits of LeRobot move, too: approach the ends slowly, do not record the ranges again"
+    )
     return [f"zeros of the servos move by counts: {counts}{limits if after.lerobot else ''}"]

@@ -95,7 +95,7 @@ def _sight_of_pixel_corners(camera: Camera) -> Array:
 def _ideal_image(sight: Array, sheets: Sequence[tuple[_Print, Array]], n: int) -> Array:
     """Return the mean grey values of all pixels, (height, width), from n·n points per pixel at the edges.
 
-    With each print is the pose of the camera in its board.
+    Each print comes with the pose of the camera in the frame of its board.
     """
     shape = sight.shape[1] - 1, sight.shape[2] - 1
     flat = sight.reshape(2, -1)

@@ -228,8 +228,8 @@ class NoisyRows:
     def noise_after(self, noise: float, step: Array, root: Array, n_determined: float) -> float:
         """Return the noise that the rows show after a step (p,), from the noise before.
 
-        The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`. The rows
-        of all classes together determine a number of unknowns, the sum of the numbers of each class.
+        The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`;
+        `n_determined` is the number of unknowns that all rows together determine.
         """
         total = weight = smallest = 0.0
         others = [one.system.predicted_variance(root) / one.variance(noise) for one in self.classes[1:]]

@@ -42,9 +42,7 @@ class NormalEquations(TriangularSystem):
         Directions that the rows determine by less than a millionth of the norm of a column count as
         undetermined.
         """
-        scale = np.sqrt(np.diag(self.products)[:-1])
-        scale[scale == 0] = 1.0
-        matrix = self.products[:-1, :-1] / scale / scale[:, None]
+        matrix, scale = self._with_unit_diagonal(np.zeros(len(self.products) - 1))
         root, pivots, rank, _ = lapack.dpstrf(matrix, tol=_MIN_PIVOT)
         order, right = pivots - 1, self.products[:-1, -1] / scale
         rows = np.zeros((rank + 1, len(self.products)))
@@ -127,12 +125,7 @@ class NormalEquations(TriangularSystem):
         last = vars(self).get("_decomposition")
         if last is not None and np.array_equal(last[0], weights):
             return last[1:]
-        products = self.products[:-1, :-1]
-        scale = np.sqrt(np.diag(products) + weights**2)
-        scale[scale == 0] = 1.0
-        matrix = products / scale
-        matrix /= scale[:, None]
-        matrix.flat[:: len(matrix) + 1] += (weights / scale) ** 2
+        matrix, scale = self._with_unit_diagonal(weights)
         # LAPACK reads the transposed matrix, which is the same.
         root, info = lapack.dpotrf(matrix.T)
         if info:
@@ -142,6 +135,17 @@ class NormalEquations(TriangularSystem):
         vars(self)["_decomposition"] = weights, root, scale
         vars(self).pop("_inverse_root", None)
         return root, scale
+
+    def _with_unit_diagonal(self, weights: Array) -> tuple[Array, Array]:
+        """Return D⁻¹·(JᵀJ + W²)·D⁻¹, whose diagonal is 1, and the diagonal of D; 1 for a column of zeros."""
+        products = self.products[:-1, :-1]
+        # A difference of sums may be negative by rounding.
+        scale = np.sqrt(np.fmax(np.diag(products) + weights**2, 0.0))
+        scale[scale == 0] = 1.0
+        matrix = products / scale
+        matrix /= scale[:, None]
+        matrix.flat[:: len(matrix) + 1] += (weights / scale) ** 2
+        return matrix, scale
 
     def predicted_variance(self, root: Array) -> float:
         """Compute the variance of all rows that uncertain unknowns cause; the root is upper triangular."""

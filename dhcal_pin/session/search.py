@@ -588,12 +588,12 @@ class _Search:
         full = layout.errors_at(self.x)
         chain = layout.problem.errors.at(full[: len(layout.problem.errors.parameters)])
         values = layout.problem.instruments(full)
+        held_out = timeline.numbers[timeline.n_fitted :]
         for i, cause in enumerate(self.causes):
             if not isinstance(cause.shape, Step):
                 continue
             old = cause.shape.number
             last = self.numbers[self.numbers < old].max(initial=-1)
-            held_out = timeline.numbers[timeline.n_fitted :]
             between = sorted(n for numbers in held_out for n in numbers.tolist() if last < n < old)
             costs = {}
             for new in (old, *between):
