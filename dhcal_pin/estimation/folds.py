@@ -129,7 +129,7 @@ def count_rows(problem: Problem) -> int:
     return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
-def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple[FoldSystems, ...]:
+def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
     """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
     parts = [
@@ -137,23 +137,17 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple
         for masks in (*folds, rest)
         if np.any(np.concatenate(masks))
     ]
+    held_out = parts[: len(folds)]
     if uses_normal_equations(problem):
         equations = [normal_equations(part, x).products for part in parts]
         total = np.sum(equations, 0)
-        systems = [(NormalEquations(total - one), NormalEquations(one)) for one in equations]
-    else:
-        factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
-        systems = [
-            (
-                TriangularSystem(merge_r_factors([other for other in factors if other is not one])),
-                TriangularSystem(one),
-            )
-            for one in factors[: len(folds)]
-        ]
-    return tuple(
-        FoldSystems(*system, count_rows(part))
-        for system, part in zip(systems[: len(folds)], parts[: len(folds)], strict=True)
-    )
+        for part, one in zip(held_out, equations, strict=False):
+            yield FoldSystems(NormalEquations(total - one), NormalEquations(one), count_rows(part))
+        return
+    factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
+    for part, one in zip(held_out, factors, strict=False):
+        others = merge_r_factors([other for other in factors if other is not one])
+        yield FoldSystems(TriangularSystem(others), TriangularSystem(one), count_rows(part))
 
 
 def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:

@@ -16,14 +16,18 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 from .._typing import Array
-from .qr import TriangularSystem, merge_r_factors
+from .qr import TriangularSystem, is_well_conditioned, merge_r_factors
 
 # Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
 # squared pivot of such a matrix that counts.
 _DIAGONAL_SHIFT = _MIN_PIVOT = 1e-12
+# Attributes of normal equations that do not depend on the residuals.
+_OF_JACOBIAN = ("_decomposition", "_inverse_root")
+# Half the size of a triangular matrix below which LAPACK inverts it.
+_SMALL = 100
 
 
 class NormalEquations(TriangularSystem):
@@ -82,33 +86,27 @@ class NormalEquations(TriangularSystem):
         products[:-1, -1] -= self.products[:-1, :-1] @ step
         products[-1, :-1] = products[:-1, -1]
         products[-1, -1] = self.squared_error(step)
-        return NormalEquations(products)
+        # The decomposition of JᵀJ is the same.
+        system = NormalEquations(products)
+        vars(system).update({name: value for name, value in vars(self).items() if name in _OF_JACOBIAN})
+        return system
 
     def squared_error(self, step: Array) -> float:
         """Compute the cost after a step."""
         both = np.append(step, -1.0)
         return max(float(both @ self.products @ both), 0.0)
 
-    def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
-        """Build the triangular system of data and priors."""
-        root, scale = self._decompose(weights)
-        z, min_cost = self._right_side(weights, x)
-        rows = np.zeros_like(self.products)
-        np.multiply(root, scale, out=rows[:-1, :-1])
-        rows[:-1, -1], rows[-1, -1] = z, np.sqrt(min_cost)
-        return TriangularSystem(rows)
+    def with_priors(self, weights: Array, x: Array | float) -> DeterminedSystem:
+        """Build the system of data and priors."""
+        right = self.products[:-1, -1] - weights**2 * x
+        system = DeterminedSystem(self, weights**2, right, self.cost + float(np.sum((weights * x) ** 2)))
+        vars(system)["_cholesky"] = self._decompose(weights)
+        return system
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
         """Compute the best step with priors, and the cost after it; see `qr.TriangularSystem.solve`."""
-        root, scale = self._decompose(weights)
-        z, min_cost = self._right_side(weights, x)
-        return lapack.dtrtrs(root, z)[0] / scale, min_cost
-
-    def _right_side(self, weights: Array, x: Array | float) -> tuple[Array, float]:
-        """Return z, (p,), and ρ² of the system with priors."""
-        root, scale = self._decompose(weights)
-        z = lapack.dtrtrs(root, (self.products[:-1, -1] - weights**2 * x) / scale, trans=1)[0]
-        return z, max(self.cost + float(np.sum((weights * x) ** 2)) - float(z @ z), 0.0)
+        posterior = self.with_priors(weights, x)
+        return posterior.substitute(), posterior.min_cost
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
         """Compute a square root of the covariance of data and priors together; see `qr.TriangularSystem`.
@@ -117,38 +115,123 @@ class NormalEquations(TriangularSystem):
         """
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):
-            vars(self)["_inverse_root"] = lapack.dtrtri(root)[0] / scale[:, None]
+            vars(self)["_inverse_root"] = _inverse(root)
+            vars(self)["_inverse_root"] /= scale[:, None]
         return vars(self)["_inverse_root"], np.empty((len(weights), 0))
+
+    def covariance(self, weights: Array) -> Array:
+        """Compute the covariance of data and priors together, shape (p, p)."""
+        upper = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
+        return upper + np.triu(upper, 1).T
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
         """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution."""
         last = vars(self).get("_decomposition")
-        if last is not None and np.array_equal(last[0], weights):
-            return last[1:]
-        matrix, scale = self._with_unit_diagonal(weights)
+        if last is None or not np.array_equal(last[0], weights):
+            last = vars(self)["_decomposition"] = weights, *self.cholesky(weights**2)
+            vars(self).pop("_inverse_root", None)
+        return last[1:]
+
+    def cholesky(self, diagonal: Array) -> tuple[Array, Array]:
+        """Compute R and the diagonal of D of JᵀJ + diag(diagonal) = D·RᵀR·D."""
+        matrix, scale = self._with_unit_diagonal(diagonal)
         # LAPACK reads the transposed matrix, which is the same.
         root, info = lapack.dpotrf(matrix.T)
         if info:
             matrix.flat[:: len(matrix) + 1] += _DIAGONAL_SHIFT
             root, info = lapack.dpotrf(matrix.T, overwrite_a=1)
         assert info == 0
-        vars(self)["_decomposition"] = weights, root, scale
-        vars(self).pop("_inverse_root", None)
         return root, scale
 
-    def _with_unit_diagonal(self, weights: Array) -> tuple[Array, Array]:
-        """Return D⁻¹·(JᵀJ + W²)·D⁻¹, whose diagonal is 1, and the diagonal of D; 1 for a column of zeros."""
+    def _with_unit_diagonal(self, diagonal: Array) -> tuple[Array, Array]:
+        """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and the diagonal of D; 1 for a column of zeros."""
         products = self.products[:-1, :-1]
         # A difference of sums may be negative by rounding.
-        scale = np.sqrt(np.fmax(np.diag(products) + weights**2, 0.0))
+        scale = np.sqrt(np.fmax(np.diag(products) + diagonal, 0.0))
         scale[scale == 0] = 1.0
         matrix = products / scale
         matrix /= scale[:, None]
-        matrix.flat[:: len(matrix) + 1] += (weights / scale) ** 2
+        matrix.flat[:: len(matrix) + 1] += diagonal / scale**2
         return matrix, scale
 
     def predicted_variance(self, root: Array) -> float:
         """Compute the variance of all rows that uncertain unknowns cause; the root is upper triangular."""
         upper = lapack.dlauum(root)[0]
-        products = self.products[:-1, :-1]
-        return 2 * float(np.vdot(products, upper)) - float(np.diag(products) @ np.diag(upper))
+        # The products are symmetric. Both arrays are then read in the order of memory.
+        products = self.products[:-1, :-1].T
+        return 2 * float(np.einsum("ij,ij->", products, upper)) - float(np.diag(products) @ np.diag(upper))
+
+
+class DeterminedSystem(TriangularSystem):
+    """Triangular system of normal equations to which diagonal rows were appended: priors, and a damping."""
+
+    def __init__(self, equations: NormalEquations, diagonal: Array, right: Array, cost: float):
+        """Store the equations, the squares (p,) of the appended rows, and what both have on the right side.
+
+        That is Jᵀr of shape (p,), and ‖r‖².
+        """
+        vars(self).update(_equations=equations, _diagonal=diagonal, _right=right, _cost=cost)
+
+    @cached_property
+    def _cholesky(self) -> tuple[Array, Array]:
+        """R of unit columns, and the norms D of the columns."""
+        return self._equations.cholesky(self._diagonal)
+
+    @cached_property
+    def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """[R z; 0 ρ], upper triangular, shape (p+1, p+1)."""
+        rows = np.zeros((len(self.z) + 1,) * 2, order="F")
+        rows[:-1, :-1], rows[:-1, -1], rows[-1, -1] = self.r, self.z, np.sqrt(self.min_cost)
+        return rows
+
+    @cached_property
+    def r(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """R factor, upper triangular, shape (p, p)."""
+        root, scale = self._cholesky
+        return root * scale
+
+    @cached_property
+    def z(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Right-hand side, shape (p,)."""
+        root, scale = self._cholesky
+        return lapack.dtrtrs(root, self._right / scale, trans=1)[0]
+
+    @property
+    def min_cost(self) -> float:
+        """Cost ρ² that remains after the best step."""
+        return max(self._cost - float(self.z @ self.z), 0.0)
+
+    @property
+    def cost(self) -> float:
+        """Cost at the current x."""
+        return self._cost
+
+    def appended(self, diagonal: Array, right: Array) -> DeterminedSystem:
+        """Append the rows diag(diagonal)·δ = right."""
+        return DeterminedSystem(
+            self._equations,
+            self._diagonal + diagonal**2,
+            self._right + diagonal * right,
+            self._cost + float(right @ right),
+        )
+
+    def best_step(self) -> Array:
+        """Compute the best step, shape (p,)."""
+        return self.substitute() if is_well_conditioned(self._cholesky[0]) else super().best_step()
+
+    def substitute(self) -> Array:
+        """Compute the best step by back substitution, shape (p,)."""
+        root, scale = self._cholesky
+        return lapack.dtrtrs(root, self.z)[0] / scale
+
+
+def _inverse(root: Array) -> Array:
+    """Invert an upper triangular matrix in the order of Fortran; products of its parts are faster than LAPACK."""
+    half = len(root) // 2
+    if half < _SMALL:
+        return lapack.dtrtri(root)[0]
+    out = np.zeros_like(root)
+    out[:half, :half], out[half:, half:] = _inverse(root[:half, :half]), _inverse(root[half:, half:])
+    beside = blas.dtrmm(1.0, out[half:, half:], root[:half, half:], side=1)
+    out[:half, half:] = blas.dtrmm(-1.0, out[:half, :half], beside, overwrite_b=1)
+    return out

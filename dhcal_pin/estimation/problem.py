@@ -327,24 +327,24 @@ class StructuredRows:
 
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
-        c = len(self.dense)
+        c, m = len(self.dense), self.dense.shape[-1]
         out = np.empty((len(self.columns),) * 2)
         # Views of the products by kind of column: dense, and coefficients.
         flat, of_terms = self.dense.reshape(c, -1), out[c:, c:]
         out[:c, :c] = flat @ flat.T
         for i, (joint, block) in enumerate(self.blocks):
-            beside = np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint]) @ self.terms[block].T
+            terms = self.terms[block]
+            beside = np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint]) @ terms.T
             out[:c, c:][:, block], out[c:, :c][block] = beside, beside.T
-            for other_joint, other in self.blocks[: i + 1]:
+            weighted = work_array("weighted terms", len(terms), m)
+            for other_joint, other in self.blocks[:i]:
                 common = np.einsum("km,km->m", self.joint_rows[joint], self.joint_rows[other_joint])
-                if other == block:
-                    weighted = self.terms[block] * np.sqrt(common)
-                    of_terms[block, block] = weighted @ weighted.T
-                    continue
-                part = (self.terms[block] * common) @ self.terms[other].T
+                part = np.multiply(terms, common, out=weighted) @ self.terms[other].T
                 of_terms[block, other], of_terms[other, block] = part, part.T
+            np.multiply(terms, np.sqrt(np.einsum("km,km->m", *[self.joint_rows[joint]] * 2)), out=weighted)
+            of_terms[block, block] = weighted @ weighted.T
         order = np.argsort(self.columns)
-        return out[np.ix_(order, order)]
+        return out.take(order, 0).take(order, 1)
 
     def covariances(self, covariance: Array) -> Array:
         """Compute the covariance of the rows of each sample that uncertain unknowns cause."""
