@@ -37,7 +37,7 @@ from scipy.linalg import lstsq
 from .._typing import Array
 from . import qr
 from .normal_equations import NormalEquations
-from .problem import Problem, linearize_and_factor, normal_equations, uses_normal_equations
+from .problem import Problem, linearize_and_factor, normal_equations_by_part, uses_normal_equations
 from .qr import TriangularSystem, merge_r_factors
 
 # Mask of the held-out samples (m,) of each measurement.
@@ -131,6 +131,17 @@ def count_rows(problem: Problem) -> int:
 
 def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
     """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
+    if uses_normal_equations(problem):
+        # The last label is that of samples in no fold.
+        labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
+        equations = normal_equations_by_part(problem, x, labels)
+        total = np.sum([one.products for one in equations], 0)
+        for fold, one in zip(folds, equations, strict=False):
+            n_rows = sum(
+                item.residual_dim * int(mask.sum()) for item, mask in zip(problem.data, fold, strict=True)
+            )
+            yield FoldSystems(NormalEquations(total - one.products), one, n_rows)
+        return
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
     parts = [
         problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
@@ -138,12 +149,6 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Itera
         if np.any(np.concatenate(masks))
     ]
     held_out = parts[: len(folds)]
-    if uses_normal_equations(problem):
-        equations = [normal_equations(part, x).products for part in parts]
-        total = np.sum(equations, 0)
-        for part, one in zip(held_out, equations, strict=False):
-            yield FoldSystems(NormalEquations(total - one), NormalEquations(one), count_rows(part))
-        return
     factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
     for part, one in zip(held_out, factors, strict=False):
         others = merge_r_factors([other for other in factors if other is not one])

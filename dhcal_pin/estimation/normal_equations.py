@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from .._typing import Array
-from .qr import TriangularSystem, is_well_conditioned, merge_r_factors
+from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors
 
 # Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
 # squared pivot of such a matrix that counts.
@@ -28,6 +28,9 @@ _DIAGONAL_SHIFT = _MIN_PIVOT = 1e-12
 _OF_JACOBIAN = ("_decomposition", "_inverse_root")
 # Half the size of a triangular matrix below which LAPACK inverts it.
 _SMALL = 100
+# Largest number of refinements of a step, the relative change that ends them, and the largest ratio of two
+# successive changes with which they go on.
+_MAX_REFINEMENTS, _REFINED, _MAX_RATIO = 16, 1e-12, 0.1
 
 
 class NormalEquations(TriangularSystem):
@@ -208,16 +211,40 @@ class DeterminedSystem(TriangularSystem):
 
     def appended(self, diagonal: Array, right: Array) -> DeterminedSystem:
         """Append the rows diag(diagonal)·δ = right."""
-        return DeterminedSystem(
+        system = DeterminedSystem(
             self._equations,
             self._diagonal + diagonal**2,
             self._right + diagonal * right,
             self._cost + float(right @ right),
         )
+        vars(system)["_before"] = self
+        return system
 
     def best_step(self) -> Array:
         """Compute the best step, shape (p,)."""
+        before = vars(self).get("_before")
+        if before is not None and is_well_conditioned(before._cholesky[0]):
+            step = self._refined_step(*before._cholesky, before._diagonal)
+            if step is not None:
+                return step
         return self.substitute() if is_well_conditioned(self._cholesky[0]) else super().best_step()
+
+    def _refined_step(self, root: Array, scale: Array, diagonal: Array) -> Array | None:
+        """Compute the best step from the decomposition without the last rows; None if they are too large.
+
+        With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at A + E. A
+        damping is mostly so small that it takes some steps only.
+        """
+        added, right = (self._diagonal - diagonal) / scale**2, self._right / scale
+        step, change = lapack.dpotrs(root, right)[0], np.inf
+        for _ in range(_MAX_REFINEMENTS):
+            last, step = step, lapack.dpotrs(root, right - added * step)[0]
+            last_change, change = change, euclidean_norm(step - last)
+            if change <= _REFINED * euclidean_norm(step):
+                return step / scale
+            if change > _MAX_RATIO * last_change:
+                break
+        return None
 
     def substitute(self) -> Array:
         """Compute the best step by back substitution, shape (p,)."""

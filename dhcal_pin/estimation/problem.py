@@ -325,6 +325,11 @@ class StructuredRows:
         columns = np.concatenate([dense_columns, first + by_joint])
         return cls(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
 
+    def take(self, index: Array) -> StructuredRows:
+        """Return the rows of some samples, given by a mask or an index."""
+        parts = (self.dense[..., index], self.joint_rows[..., index], self.terms[:, index])
+        return StructuredRows(*parts, self.blocks, self.columns)
+
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
         c, m = len(self.dense), self.dense.shape[-1]
@@ -459,6 +464,26 @@ def normal_equations(problem: Problem, x: Array) -> NormalEquations:
 def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
     """Compute the inner products of a chunk; a module-level function can be sent to another process."""
     return linearization.structured_rows(chunk).products()
+
+
+def normal_equations_by_part(problem: Problem, x: Array, labels: Sequence[Array]) -> list[NormalEquations]:
+    """Compute the normal equations of the samples of each label 0, 1, …; the labels (m,) are per measurement."""
+    of_chunks = [
+        label[start : start + CHUNK_SIZE] for label in labels for start in range(0, len(label), CHUNK_SIZE)
+    ]
+    count = max(int(label.max(initial=-1)) for label in labels) + 1
+    function = partial(_chunk_products_by_part, problem.linearize(x), count)
+    products = problem.executor.map(function, zip(problem.chunks, of_chunks, strict=True))
+    return [NormalEquations(reduce(np.add, parts)) for parts in zip(*products, strict=True)]
+
+
+def _chunk_products_by_part(
+    linearization: Linearization, count: int, labelled: tuple[Chunk, Array]
+) -> list[Array]:
+    """Compute the inner products of the samples of each label of a chunk."""
+    chunk, label = labelled
+    rows = linearization.structured_rows(chunk)
+    return [rows.take(np.flatnonzero(label == i)).products() for i in range(count)]
 
 
 def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:

@@ -144,7 +144,8 @@ def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
 
 
 def test_no_derivative_remains_at_the_fit_even_with_narrow_priors():
-    fit = search_of(Changes(), prior_factor=0.01).iterate()
+    search = search_of(Changes(), prior_factor=0.01)
+    fit = search.iterate(search.first_fit)
     assert fit.score @ fit.covariance @ fit.score < 1
 
 
@@ -164,7 +165,7 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     search.run()
     assert [cause.shape for cause in search.causes] == [Step(27)]
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
-    fit = search.solve(search.first_rows, [])
+    fit = search.first_fit
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
 
 
