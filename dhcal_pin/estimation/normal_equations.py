@@ -124,8 +124,9 @@ class NormalEquations(TriangularSystem):
 
     def covariance(self, weights: Array) -> Array:
         """Compute the covariance of data and priors together, shape (p, p)."""
-        upper = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
-        return upper + np.triu(upper, 1).T
+        covariance = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
+        covariance += np.triu(covariance, 1).T
+        return covariance
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
         """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution."""
@@ -137,14 +138,14 @@ class NormalEquations(TriangularSystem):
 
     def cholesky(self, diagonal: Array) -> tuple[Array, Array]:
         """Compute R and the diagonal of D of JᵀJ + diag(diagonal) = D·RᵀR·D."""
-        matrix, scale = self._with_unit_diagonal(diagonal)
-        # LAPACK reads the transposed matrix, which is the same.
-        root, info = lapack.dpotrf(matrix.T)
-        if info:
-            matrix.flat[:: len(matrix) + 1] += _DIAGONAL_SHIFT
+        for shift in (0.0, _DIAGONAL_SHIFT):
+            matrix, scale = self._with_unit_diagonal(diagonal)
+            matrix.flat[:: len(matrix) + 1] += shift
+            # LAPACK reads the transposed matrix, which is the same.
             root, info = lapack.dpotrf(matrix.T, overwrite_a=1)
-        assert info == 0
-        return root, scale
+            if not info:
+                return root, scale
+        raise AssertionError("the matrix is not positive definite")
 
     def _with_unit_diagonal(self, diagonal: Array) -> tuple[Array, Array]:
         """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and the diagonal of D; 1 for a column of zeros."""

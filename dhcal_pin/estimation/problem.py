@@ -332,32 +332,28 @@ class StructuredRows:
 
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
-        c, m = len(self.dense), self.dense.shape[-1]
-        out = np.empty((len(self.columns),) * 2)
-        # Views of the products by kind of column: dense, and coefficients.
-        flat, of_terms = self.dense.reshape(c, -1), out[c:, c:]
+        c, m, n = len(self.dense), self.dense.shape[-1], len(self.columns)
+        out, scaled = work_array("products", n, n), work_array("scaled columns", n, m)
+        flat = self.dense.reshape(c, -1)
         out[:c, :c] = flat @ flat.T
         for i, (joint, block) in enumerate(self.blocks):
-            terms = self.terms[block]
-            beside = np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint]) @ terms.T
-            out[:c, c:][:, block], out[c:, :c][block] = beside, beside.T
-            weighted = work_array("weighted terms", len(terms), m)
+            terms, own = self.terms[block], slice(c + block.start, c + block.stop)
+            # All columns before those of this joint, times the motion of the joint.
+            np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint], out=scaled[:c])
+            common = np.einsum("jkm,km->jm", self.joint_rows, self.joint_rows[joint])
             for other_joint, other in self.blocks[:i]:
-                common = np.einsum("km,km->m", self.joint_rows[joint], self.joint_rows[other_joint])
-                part = np.multiply(terms, common, out=weighted) @ self.terms[other].T
-                of_terms[block, other], of_terms[other, block] = part, part.T
-            np.multiply(terms, np.sqrt(np.einsum("km,km->m", *[self.joint_rows[joint]] * 2)), out=weighted)
-            of_terms[block, block] = weighted @ weighted.T
-        order = np.argsort(self.columns)
-        return out.take(order, 0).take(order, 1)
+                np.multiply(self.terms[other], common[other_joint], out=scaled[c:][other])
+            beside = scaled[: own.start] @ terms.T
+            out[: own.start, own], out[own, : own.start] = beside, beside.T
+            weighted = np.multiply(terms, np.sqrt(common[joint]), out=scaled[own])
+            out[own, own] = weighted @ weighted.T
+        return _reordered(out, np.argsort(self.columns))
 
     def covariances(self, covariance: Array) -> Array:
         """Compute the covariance of the rows of each sample that uncertain unknowns cause."""
-        c, dense = len(self.dense), self.dense[:-1]
-        dense_columns, coefficients = self.columns[: c - 1], self.columns[c:]
-        of_dense = covariance[np.ix_(dense_columns, dense_columns)]
-        beside = covariance[np.ix_(dense_columns, coefficients)]
-        of_terms = covariance[np.ix_(coefficients, coefficients)]
+        c, dense = len(self.dense) - 1, self.dense[:-1]
+        covariance = _reordered(covariance, np.delete(self.columns, c))
+        of_dense, beside, of_terms = covariance[:c, :c], covariance[:c, c:], covariance[c:, c:]
         out = np.einsum("ckm,clm->mkl", dense, np.tensordot(of_dense, dense, 1))
         for i, (joint, block) in enumerate(self.blocks):
             terms = self.terms[block]
@@ -369,6 +365,12 @@ class StructuredRows:
             product = np.einsum("km,lm->mkl", half, self.joint_rows[joint])
             out += product + product.swapaxes(1, 2)
         return out
+
+
+def _reordered(matrix: Array, order: Array) -> Array:
+    """Return a symmetric matrix with its rows and columns in another order."""
+    rows = np.take(matrix, order, 0, work_array("reordered rows", *matrix.shape), mode="clip")
+    return np.take(rows, order, 1, mode="clip")
 
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
