@@ -762,8 +762,8 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     """Check whether neighbouring configurations share an error of the model."""
     if noise < MIN_CORRELATED_NOISE:
         return False
-    root = fit.solution.system.scaled(1 / noise).sqrt_covariance(fit.problem.weights)[0]
-    return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
+    system = fit.solution.system.scaled(1 / noise)
+    return find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights).is_significant
 
 
 def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:

@@ -148,7 +148,7 @@ class NormalEquations(TriangularSystem):
         raise AssertionError("the matrix is not positive definite")
 
     def _with_unit_diagonal(self, diagonal: Array) -> tuple[Array, Array]:
-        """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and the diagonal of D; 1 for a column of zeros."""
+        """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and D; 1 for a column of zeros."""
         products = self.products[:-1, :-1]
         # A difference of sums may be negative by rounding.
         scale = np.sqrt(np.fmax(np.diag(products) + diagonal, 0.0))
@@ -254,7 +254,7 @@ class DeterminedSystem(TriangularSystem):
 
 
 def _inverse(root: Array) -> Array:
-    """Invert an upper triangular matrix in the order of Fortran; products of its parts are faster than LAPACK."""
+    """Invert an upper triangular matrix in the order of Fortran. Products of parts are faster than LAPACK."""
     half = len(root) // 2
     if half < _SMALL:
         return lapack.dtrtri(root)[0]

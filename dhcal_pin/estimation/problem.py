@@ -436,9 +436,8 @@ def uses_normal_equations(problem: Problem) -> bool:
     They are accurate if all unknowns have priors. There are many transmission coefficients, and one
     configuration per row.
     """
-    n_coefficients = sum(parameter.coefficient_index is not None for parameter in problem.errors.parameters)
     return (
-        n_coefficients > MANY_COLUMNS
+        problem.errors.n_coefficients > MANY_COLUMNS
         and not problem.instrument_parameters
         and bool(problem.weights.all())
         and all(map(_is_structured, problem.data))
@@ -469,7 +468,7 @@ def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
 
 
 def normal_equations_by_part(problem: Problem, x: Array, labels: Sequence[Array]) -> list[NormalEquations]:
-    """Compute the normal equations of the samples of each label 0, 1, …; the labels (m,) are per measurement."""
+    """Compute the normal equations of the samples of each label 0, 1, …, given for each measurement, (m,)."""
     of_chunks = [
         label[start : start + CHUNK_SIZE] for label in labels for start in range(0, len(label), CHUNK_SIZE)
     ]

@@ -205,7 +205,7 @@ class TriangularSystem:
         return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T
 
     def covariance(self, weights: Array) -> Array:
-        """Compute the covariance of data and priors together, on the directions that they determine, (p, p)."""
+        """Compute the covariance of data and priors, on the directions that they determine, (p, p)."""
         root = self.sqrt_covariance(weights)[0]
         return root @ root.T
 

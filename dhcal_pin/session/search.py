@@ -242,10 +242,10 @@ class _Search:
         noise = np.maximum(noise * np.sqrt(variance), MIN_NOISE)
         out = rows / noise[..., None]
         out[..., -1] = after / noise
-        columns = columns / noise[..., None]
         equal, weighted = (
             inverse(information_with(each) + np.diag(prior**2)) for each in (np.ones(len(rows)), weights)
         )
+        columns = columns / noise[..., None]
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
         return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
 

@@ -134,8 +134,13 @@ def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
     factor = model / search.layout.weights
 
     def log_likelihood(width):
-        covariance = np.eye(len(model)) + factor @ factor.T + (step * (width * cause.sizes) ** 2) @ step.T
-        return -0.5 * (np.linalg.slogdet(covariance)[1] + values @ np.linalg.solve(covariance, values))
+        # With Q·R = [F; I], the covariance I + F·Fᵀ has the determinant of RᵀR. Its own condition is 1e11.
+        columns = np.hstack([factor, step * (width * cause.sizes)])
+        stacked = np.vstack([columns, np.eye(columns.shape[1])])
+        q, r = np.linalg.qr(stacked)
+        target = np.append(values, np.zeros(columns.shape[1]))
+        squares = np.sum((target - q @ (q.T @ target)) ** 2)
+        return -np.sum(np.log(np.abs(np.diag(r)))) - 0.5 * squares
 
     gain = max(map(log_likelihood, WIDTHS)) - log_likelihood(0.0)
     n_steps, n_causes = len(search.edges), len(search.layout.blocks)
