@@ -379,7 +379,10 @@ def _unknown_names(problem: Problem) -> list[str]:
 
 def prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
     """Return the weights of the priors (p,) of a problem with the expected widths for other widths."""
-    return problem.weights / np.array([widths.get(name, 1.0) for name in family])
+    factors = np.ones(len(family))
+    for name, width in widths.items():
+        factors[family == name] = width
+    return problem.weights / factors
 
 
 def _best_width(x: Array, determined: Array, expected: Array, members: Array) -> float:

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import lstsq
@@ -135,7 +136,7 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Itera
         # The last label is that of samples in no fold.
         labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
         equations = normal_equations_by_part(problem, x, labels)
-        total = np.sum([one.products for one in equations], 0)
+        total = reduce(np.add, (one.products for one in equations))
         for fold, one in zip(folds, equations, strict=False):
             n_rows = sum(
                 item.residual_dim * int(mask.sum()) for item, mask in zip(problem.data, fold, strict=True)

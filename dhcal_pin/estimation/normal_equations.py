@@ -20,6 +20,7 @@ from scipy.linalg import blas, lapack
 
 from .._typing import Array
 from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors
+from .solver_rules import EPS_MODEL
 
 # Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
 # squared pivot of such a matrix that counts.
@@ -199,6 +200,11 @@ class DeterminedSystem(TriangularSystem):
         """Right-hand side, shape (p,)."""
         root, scale = self._cholesky
         return lapack.dtrtrs(root, self._right / scale, trans=1)[0]
+
+    @property
+    def roundoff(self) -> float:
+        """Rounding error of the rows, EPS_MODEL·‖R‖."""
+        return EPS_MODEL * euclidean_norm(self._cholesky[1])
 
     @property
     def min_cost(self) -> float:
