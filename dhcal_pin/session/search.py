@@ -34,7 +34,7 @@ from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
-from .linear_model import Layout, inverse, whitened_rows
+from .linear_model import Layout, inverse, solve_information, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
@@ -203,7 +203,7 @@ class _Search:
         value = np.concatenate([self.x, held])
         is_row = self.groups >= 0
         labels = [self.groups == label for label in range(self.groups.max() + 1)]
-        products = [columns[chosen].T @ columns[chosen] for chosen in labels]
+        products = [part.T @ part for part in (columns[chosen] for chosen in labels)]
         noise, weights = np.ones(residual.shape), np.ones(len(rows))
 
         def information_with(weights: Array) -> Array:
@@ -694,7 +694,7 @@ def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[
 def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
     """Return the squared residuals with products `out`, for the fit of some columns to products `kept`."""
     matrix = kept[np.ix_(used, used)] + np.diag(prior[used] ** 2)
-    x = np.append(-inverse(matrix) @ kept[used, -1], 1.0)
+    x = np.append(-solve_information(matrix, kept[used, -1]), 1.0)
     chosen = np.append(used, len(kept) - 1)
     return float(x @ out[np.ix_(chosen, chosen)] @ x)
 
@@ -782,4 +782,5 @@ def _cell_products(rows: Array, edges: Array) -> Array:
     if np.ptp(np.diff(edges)) == 0:
         cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
         return cells.swapaxes(1, 2) @ cells
-    return np.array([_information(rows[a:b], np.ones((b - a, 1))) for a, b in pairwise(edges)])
+    cells = (rows[a:b].reshape(-1, rows.shape[-1]) for a, b in pairwise(edges))
+    return np.array([cell.T @ cell for cell in cells])
