@@ -190,13 +190,13 @@ class DeterminedSystem(TriangularSystem):
         return rows
 
     @cached_property
-    def r(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def r(self) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """R factor, upper triangular, shape (p, p)."""
         root, scale = self._cholesky
         return root * scale
 
     @cached_property
-    def z(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def z(self) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Right-hand side, shape (p,)."""
         root, scale = self._cholesky
         return lapack.dtrtrs(root, self._right / scale, trans=1)[0]
@@ -230,19 +230,19 @@ class DeterminedSystem(TriangularSystem):
     def best_step(self) -> Array:
         """Compute the best step, shape (p,)."""
         before = vars(self).get("_before")
-        if before is not None and is_well_conditioned(before._cholesky[0]):
-            step = self._refined_step(*before._cholesky, before._diagonal)
-            if step is not None:
-                return step
+        step = self._refined_step(before) if before and is_well_conditioned(before._cholesky[0]) else None
+        if step is not None:
+            return step
         return self.substitute() if is_well_conditioned(self._cholesky[0]) else super().best_step()
 
-    def _refined_step(self, root: Array, scale: Array, diagonal: Array) -> Array | None:
+    def _refined_step(self, before: DeterminedSystem) -> Array | None:
         """Compute the best step from the decomposition without the last rows; None if they are too large.
 
-        With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at A + E. A
-        damping is mostly so small that it takes some steps only.
+        With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at the solution
+        for A + E. A damping is mostly so small that it takes some steps only.
         """
-        added, right = (self._diagonal - diagonal) / scale**2, self._right / scale
+        root, scale = before._cholesky
+        added, right = (self._diagonal - before._diagonal) / scale**2, self._right / scale
         step, change = lapack.dpotrs(root, right)[0], np.inf
         for _ in range(_MAX_REFINEMENTS):
             last, step = step, lapack.dpotrs(root, right - added * step)[0]
