@@ -41,6 +41,7 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
+from .normal_equations import NormalEquations
 from .priors import effective_parameters
 from .problem import (
     CHUNK_SIZE,
@@ -314,14 +315,14 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     is uncertain there.
     """
     system, model = solution.system, problem.linearize(solution.x)
+    if solution.converged and not isinstance(system, NormalEquations):
+        # The system was linearized one step earlier, where other directions may be unobservable. With the
+        # wide priors of frames and instruments its covariance would then not fit these rows.
+        system = linear_system(problem, solution.x)
     if uses_normal_equations(problem):
         covariance = system.covariance(problem.weights)
         chunks = problem.map_chunks(partial(_structured_covariance, model, covariance))
     else:
-        if solution.converged:
-            # The system was linearized one step earlier, where other directions may be unobservable. With the
-            # wide priors of frames and instruments its covariance would then not fit these rows.
-            system = linear_system(problem, solution.x)
         root = system.sqrt_covariance(problem.weights)[0]
         chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
     out = []
