@@ -37,11 +37,14 @@ _MAX_REFINEMENTS, _REFINED, _MAX_RATIO = 16, 1e-12, 0.1
 class NormalEquations(TriangularSystem):
     """Triangular system of the whitened rows [J | r] at one x, which is given by their inner products."""
 
-    products: Array  # [J | r]ᵀ·[J | r], shape (p+1, p+1)
+    def __init__(self, products: Array, factor: float = 1.0):
+        """Store inner products (p+1, p+1), and the factor of the rows to theirs."""
+        vars(self).update(_unscaled=products, _factor=factor)
 
-    def __init__(self, products: Array):
-        """Store the inner products."""
-        vars(self)["products"] = products
+    @cached_property
+    def products(self) -> Array:
+        """Inner products [J | r]ᵀ·[J | r], shape (p+1, p+1)."""
+        return self._unscaled if self._factor == 1 else self._factor**2 * self._unscaled
 
     @cached_property
     def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -63,16 +66,16 @@ class NormalEquations(TriangularSystem):
     @property
     def cost(self) -> float:
         """Cost at the current x: sum of the squared rows."""
-        return float(self.products[-1, -1])
+        return self._factor**2 * float(self._unscaled[-1, -1])
 
     @property
     def is_unobserved(self) -> Array:
         """Unknowns that no row depends on, (p,)."""
-        return np.diag(self.products)[:-1] == 0
+        return np.diag(self._unscaled)[:-1] == 0
 
     def scaled(self, factor: float) -> NormalEquations:
         """Return the system of the rows times a factor."""
-        return NormalEquations(factor**2 * self.products)
+        return NormalEquations(self._unscaled, factor * self._factor)
 
     def merged(self, other: TriangularSystem) -> TriangularSystem:
         """Compute the system of the rows of two systems of the same unknowns."""
@@ -102,7 +105,7 @@ class NormalEquations(TriangularSystem):
 
     def with_priors(self, weights: Array, x: Array | float) -> DeterminedSystem:
         """Build the system of data and priors."""
-        right = self.products[:-1, -1] - weights**2 * x
+        right = self._factor**2 * self._unscaled[:-1, -1] - weights**2 * x
         system = DeterminedSystem(self, weights**2, right, self.cost + float(np.sum((weights * x) ** 2)))
         vars(system)["_cholesky"] = self._decompose(weights)
         return system
@@ -150,14 +153,14 @@ class NormalEquations(TriangularSystem):
 
     def _with_unit_diagonal(self, diagonal: Array) -> tuple[Array, Array]:
         """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and D; 1 for a column of zeros."""
-        products = self.products[:-1, :-1]
+        products, diagonal = self._unscaled[:-1, :-1], diagonal / self._factor**2
         # A difference of sums may be negative by rounding.
         scale = np.sqrt(np.fmax(np.diag(products) + diagonal, 0.0))
         scale[scale == 0] = 1.0
         matrix = products / scale
         matrix /= scale[:, None]
         matrix.flat[:: len(matrix) + 1] += diagonal / scale**2
-        return matrix, scale
+        return matrix, self._factor * scale
 
     def predicted_variance(self, root: Array) -> float:
         """Compute the variance of all rows that uncertain unknowns cause; the root is upper triangular."""
