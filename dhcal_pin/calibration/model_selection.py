@@ -65,6 +65,7 @@ from typing import Any
 
 import numpy as np
 
+from .._kernels.work_arrays import UnbufferedRows
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
@@ -573,6 +574,7 @@ def _region_errors(problem: Problem, x: Array, noise: float, temperature: float)
     return _RegionErrors(n_rows, squares / noise**2, temperature * variances, noise)
 
 
+@UnbufferedRows()
 def extend(
     fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
 ) -> tuple[Fit, Extension]:

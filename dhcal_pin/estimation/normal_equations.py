@@ -123,7 +123,7 @@ class NormalEquations(TriangularSystem):
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):
             vars(self)["_inverse_root"] = _inverse(root)
-            vars(self)["_inverse_root"] /= scale[:, None]
+            vars(self)["_inverse_root"] *= 1 / scale[:, None]
         return vars(self)["_inverse_root"], np.empty((len(weights), 0))
 
     def covariance(self, weights: Array) -> Array:
@@ -157,8 +157,8 @@ class NormalEquations(TriangularSystem):
         # A difference of sums may be negative by rounding.
         scale = np.sqrt(np.fmax(np.diag(products) + diagonal, 0.0))
         scale[scale == 0] = 1.0
-        matrix = products / scale
-        matrix /= scale[:, None]
+        matrix = products * (1 / scale)
+        matrix *= 1 / scale[:, None]
         matrix.flat[:: len(matrix) + 1] += diagonal / scale**2
         return matrix, self._factor * scale
 
