@@ -9,6 +9,8 @@ differences of P belong to the union and the difference of sets of samples. With
 with R from the Cholesky decomposition. JᵀJ has the square of the condition number of J. This is accurate
 enough here: in units of the prior standard deviations no eigenvalue of RᵀR is below 1, and its largest one λ
 is the square of the ratio of prior to remaining uncertainty. The relative error of R is about 1e-16·λ.
+
+`DeterminedSystem` is the system with priors. Its damped steps use the decomposition without damping.
 """
 
 from __future__ import annotations
@@ -85,7 +87,7 @@ class NormalEquations(TriangularSystem):
 
     def _with_columns(self, kept: Array) -> NormalEquations:
         """Return the system of some columns of [J | r], the last one included."""
-        return NormalEquations(self.products[np.ix_(kept, kept)])
+        return NormalEquations(self.products.take(kept, 0).take(kept, 1))
 
     def recentered(self, step: Array) -> NormalEquations:
         """Build the system at x + step, assuming that the model is linear over the step."""
@@ -128,8 +130,9 @@ class NormalEquations(TriangularSystem):
 
     def covariance(self, weights: Array) -> Array:
         """Compute the covariance of data and priors together, shape (p, p)."""
-        covariance = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
-        covariance += np.triu(covariance, 1).T
+        upper = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
+        covariance = upper + upper.T
+        covariance.flat[:: len(covariance) + 1] *= 0.5
         return covariance
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
