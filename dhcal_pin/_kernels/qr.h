@@ -319,3 +319,20 @@ static void append_diagonal(const double *r_in, Size p, const double *diagonal, 
         update_r_factor(r, (Lanes *)block, c, rows / LANES);
     }
 }
+
+/* Solve R·x = y by back substitution for s right-hand sides y (p, s); rows of r are `row` apart. */
+SIMD_CLONES static void solve_triangular(const double *r, Size row, Size p, Size s, const double *y, double *x)
+{
+    for (Size i = p; i--;) {
+        double *restrict to = x + i * s;
+        memcpy(to, y + i * s, s * sizeof(double));
+        for (Size j = i + 1; j < p; j++) {
+            const double f = r[i * row + j], *restrict from = x + j * s;
+            VECTORIZE (t, s)
+                to[t] -= f * from[t];
+        }
+        const double pivot = r[i * row + i];
+        VECTORIZE (t, s)
+            to[t] /= pivot;
+    }
+}

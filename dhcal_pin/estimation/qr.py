@@ -251,7 +251,9 @@ def _merge_with(merged: Array | None, pending: Sequence[Array]) -> Array:
 
 def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
     """Append the rows diag(diagonal)·δ = right to a system."""
-    return TriangularSystem(append_diagonal(system.rows, diagonal, right)) if diagonal.any() else system
+    if not diagonal.any():
+        return system
+    return TriangularSystem(append_diagonal(system.rows[None], diagonal[None], right[None])[0])
 
 
 def _is_well_conditioned(r: Array) -> bool:
