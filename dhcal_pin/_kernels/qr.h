@@ -201,15 +201,16 @@ static int find_nonzero_columns(NonzeroColumns *nonzero, const ErrorTwists *e, c
         return 0;
     nonzero->same_columns_as = nonzero->counts + k, nonzero->columns = nonzero->same_columns_as + k,
     nonzero->positions = nonzero->columns + k * c;
-    /* The rows of all residuals fit into one block: one update takes less time than one per residual. */
+    /* If the rows of all residuals fit into one block, one update takes less time than one per residual. */
     const int is_small = k * m <= BLOCK_ROWS;
     for (Size i = 0; i < k; i++) {
         Size *columns = nonzero->columns + i * c, *positions = nonzero->positions + i * c, u = 0;
         const Sensitivity sensitivity = row_sensitivity(h, i);
+        const int has_terms = sensitivity.linear || sensitivity.angular;
         for (Size j = 0; j < c; j++) {
             const double *rows = given + (j - e->count) * column + i * residual;
-            const int is_nonzero =
-                is_small || (j < e->count ? is_observed(e, j, sensitivity) : !is_zero(rows, m));
+            const int is_nonzero = j < e->count ? (is_small ? has_terms : is_observed(e, j, sensitivity))
+                                                : is_small || !is_zero(rows, m);
             positions[j] = is_nonzero ? u : -1;
             if (is_nonzero)
                 columns[u++] = j;

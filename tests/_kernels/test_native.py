@@ -309,7 +309,9 @@ def test_shapes_indices_and_read_only_arrays_are_checked(sim_6dof):
     for error_frames in ([sim_6dof.tool_frame_index + 1], [-1], [2, 1]):
         terms = sim_6dof.body_from_urdf, sim_6dof.origins[None], np.eye(4)[None], np.array(error_frames)
         with pytest.raises(ValueError, match="shapes"):
-            native.perturb_frames(*terms, np.zeros((1, len(error_frames), 6)), np.zeros((1, len(error_frames))))
+            native.perturb_frames(
+                *terms, np.zeros((1, len(error_frames), 6)), np.zeros((1, len(error_frames)))
+            )
     with pytest.raises(ValueError, match="shapes"):
         native.propagate_frames(
             sim_6dof.link_transforms[None, 1:],

@@ -103,7 +103,7 @@ class ChainBatch:
 
     def forward_kinematics(self, q: Array) -> FrameBatch:
         """Compute all frames at joint positions (c, b, m, n)."""
-        chain, configurations = self.model.chain, len(q)
+        chain = self.model.chain
         independent = np.moveaxis(q, -1, 0).reshape(q.shape[-1], -1)
         positions = chain.mimic_matrix @ independent + chain.mimic_offset[:, None]
         links = chain.body_from_urdf @ self.origins @ chain.urdf_from_body
@@ -111,14 +111,9 @@ class ChainBatch:
         frames = np.empty((len(positions) + 2, 7, 3, *q.shape[:-1]))
         frames[0, :4] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
         frames = frames.reshape(*frames.shape[:3], -1)
-        # A member for each configuration of each chain.
-        members = np.broadcast_to(links, (configurations, *q.shape[1:2], *links.shape[1:]))
-        propagate_frames(
-            members.reshape(-1, *links.shape[1:]),
-            chain.prismatic,
-            JointState(positions, *cos_sin(positions)),
-            frames,
-        )
+        # A member of the kernel's batch for each configuration of each chain, or one that is equal for all.
+        members = links if len(links) == 1 else np.tile(links, (len(q), 1, 1, 1))
+        propagate_frames(members, chain.prismatic, JointState(positions, *cos_sin(positions)), frames)
         return FrameBatch(frames[:-1], frames[-1, :4])
 
 
