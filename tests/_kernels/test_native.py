@@ -60,6 +60,24 @@ def test_frames_and_jacobians_agree_with_numpy(seed, m):
     assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
 
 
+@pytest.mark.parametrize("kernels", [native, kinematics])
+@pytest.mark.parametrize("seed", range(4))
+def test_frames_of_a_batch_are_those_of_each_chain(kernels, seed):
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    chain = Chain.from_dh(table)
+    motion = chain.joint_state(random_joints(rng, table, 15))
+    links = chain.link_transforms @ se3.exp6(0.1 * rng.standard_normal((3, 1, 6)))
+    frames = np.empty((len(chain.moving_joints) + 2, 7, 3, 15))
+    frames[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
+    alone = frames.copy()
+    kernels.propagate_frames(links, chain.prismatic, motion, frames)
+    for member, link in enumerate(links):
+        kinematics.propagate_frames(link[None], chain.prismatic, motion, alone)
+        part = np.s_[:, :4, :, 5 * member : 5 * member + 5]
+        np.testing.assert_allclose(frames[part], alone[part], atol=1e-13)
+
+
 @given(SEEDS, SAMPLES, st.integers(1, 45), st.integers(1, 6))
 @settings(max_examples=100, deadline=None)
 def test_r_factor_agrees_with_lapack_up_to_signs(seed, m, columns, residuals):
