@@ -80,7 +80,9 @@ def _propagate_batch(
     """Compute the frames along several chains."""
     b, k = len(link_transforms), len(prismatic)
     by_member = frames.reshape(*frames.shape[:3], b, -1)
-    positions, cos, sin = (part.reshape(k, b, -1) for part in vars(joint_state).values())
+    positions, cos, sin = (
+        part.reshape(k, b, -1) for part in (joint_state.positions, joint_state.cos, joint_state.sin)
+    )
     for j, link in enumerate(link_transforms.swapaxes(0, 1)):
         parent, frame = by_member[j], by_member[j + 1]
         for column in range(4):
