@@ -52,8 +52,8 @@ typedef uint64_t Bits __attribute__((may_alias));
 typedef double Lanes __attribute__((vector_size(32), may_alias));
 /* LANES: doubles in `Lanes`. BLOCK_SAMPLES: samples that the functions of this file treat together.
    BLOCK_ROWS: rows of a block that is reduced by Householder reflectors. MAX_COLUMNS: columns that a pair of
-   reflectors is applied to at once. Blocks fit into the first-level cache. */
-enum { LANES = 4, BLOCK_SAMPLES = 64, BLOCK_ROWS = 128, MAX_COLUMNS = 6 };
+   reflectors is applied to at once. Blocks of 20 columns fit into the first-level cache. */
+enum { LANES = 4, BLOCK_SAMPLES = 64, BLOCK_ROWS = 192, MAX_COLUMNS = 6 };
 
 /* Evaluate a polynomial by Horner's rule; `count` coefficients, highest degree first. */
 static inline __attribute__((always_inline)) double polynomial(double u, const double *coefficients,

@@ -29,8 +29,8 @@ except ImportError:
     pytest.skip("the compiled kernels are not installed", allow_module_level=True)
 
 SEEDS = st.integers(0, 2**32 - 1)
-# Numbers of samples near the block sizes 64, 128 and 2048, and far from them.
-SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 127, 128, 129, 300, 2049])
+# Numbers of samples near the block sizes 64, 192 and 2048, and far from them.
+SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 191, 192, 193, 300, 2049])
 
 
 @given(SEEDS, SAMPLES)
