@@ -13,24 +13,28 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import shutil
 import signal
 import sys
 import time
 import traceback
 from collections.abc import Callable
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
 import numpy as np
 import psutil
 from command_line import positions_csv
 from PIL import Image
+from recordings import POSES, Recording, write_bag
 from robots import URDF
 from signal_steps import SignalAtStep, count_steps
 
 from dhcal_pin.cli import main as main_of_cli
 from dhcal_pin.cli import outputs
 from dhcal_pin.cli.main import main as dhcal
+from dhcal_pin.io import check_history, read_robot
 
 FLEET = """
 extend = "none"
@@ -64,6 +68,8 @@ square_mm = {square}
 QUICK = ("--extend", "none", "--loss", "linear")
 CALIBRATE = ("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", *QUICK)
 PROGRAM = ("--export", "x.trajectory.csv", "--json", "sub/x.json")
+HISTORY = ("--history", "h.jsonl", "--plot", "h.html")
+DEMO = "result.json summary.md scene.html report.html experiment.urdf experiment_calibrated.urdf".split()
 # Words of each command, and the names of its outputs.
 COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "calibrate": (CALIBRATE, ("out.urdf", "out.calibration.toml")),
@@ -111,9 +117,28 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("d.csv", "sub/d.json"),
     ),
     "board": (("board", "rig.toml", "-o", "b.pdf", "--json", "sub/b.json"), ("b.pdf", "sub/b.json")),
+    "recheck": (
+        ("recheck", "../calibrated.urdf", "data.csv", "--size", "2cm", *HISTORY, "--json", "sub/k.json"),
+        ("h.jsonl", "h.html", "sub/k.json"),
+    ),
+    "demo": (
+        ("demo", "-o", "demo", "--no-open", "--json", "sub/d.json"),
+        (*(f"demo/{name}" for name in DEMO), "sub/d.json"),
+    ),
+    "iso9283": (
+        ("plan", "arm.dh.toml", "--iso9283", "--cube", "100mm", "-o", "p.csv", *PROGRAM),
+        ("p.csv", "x.trajectory.csv", "sub/x.json"),
+    ),
+    "recording": (
+        ("convert", "../arm.bag", "c.csv", "--pose-topic", POSES, "--json", "sub/c.json"),
+        ("c.csv", "sub/c.json"),
+    ),
+    "doctor": (("doctor", "--json", "sub/d.json"), ("sub/d.json",)),
 }
 # Files that a command may leave for the next run, which continues with them.
 JOURNALS = {"study": "s.csv.part"}
+# What differs in the outputs of equal runs.
+VOLATILE = {"doctor": rb"[\d.]+ s\b"}
 
 
 class Interruption:
@@ -131,6 +156,7 @@ class Interruption:
         self.words, self.names = COMMANDS[command]
         os.chdir(root)
         self._make_inputs(old=True)
+        self._make_other_files()
         # The modules are loaded here once, and not in each child.
         with contextlib.redirect_stderr(io.StringIO()):
             assert dhcal(self.words) == 0
@@ -140,6 +166,9 @@ class Interruption:
         self._make_inputs(old=False)
         self._run_alone()
         self.new = self.read()
+        if self.old == self.new:
+            # The outputs of the command depend on no input.
+            self.old = {name: b"older " + (content or b"") for name, content in self.old.items()}
         assert all(self.old.values())
         assert all(self.new.values())
         assert self.old != self.new
@@ -158,6 +187,15 @@ class Interruption:
         sides = (180, 180) if old else (170, 190)
         picture = np.pad(squares, ((140, 140), sides), constant_values=255)
         Image.fromarray(picture.astype(np.uint8)).save("i.png")
+
+    def _make_other_files(self) -> None:
+        """Make inputs that are the same for the old run and the new one, beside the folder."""
+        if self.command == "recheck":
+            with contextlib.redirect_stderr(io.StringIO()):
+                assert dhcal(["calibrate", "arm.urdf", "data.csv", "-o", "../calibrated.urdf", *QUICK]) == 0
+        if self.command == "recording":
+            stops = np.random.default_rng(0).uniform(-1, 1, (4, 3))
+            write_bag(Path("../arm.bag"), Recording(read_robot("arm.dh.toml"), stops))
 
     def _run_alone(self) -> None:
         status = self._in_child(lambda: dhcal(self.words))
@@ -204,7 +242,10 @@ class Interruption:
     def read(self) -> dict[str, bytes | None]:
         """Return the content of each output."""
         paths = {name: self.root / name for name in self.names}
-        return {name: path.read_bytes() if path.exists() else None for name, path in paths.items()}
+        contents = {name: path.read_bytes() if path.exists() else None for name, path in paths.items()}
+        if pattern := VOLATILE.get(self.command):
+            contents = {name: content and re.sub(pattern, b"", content) for name, content in contents.items()}
+        return contents
 
     def reset_inputs(self) -> None:
         """Remove everything that a run has left, and make the inputs of the old run."""
@@ -286,7 +327,10 @@ class Interruption:
             assert next_status == 2 or self.read() in (self.old, self.new), details
         # The next run leaves its own files only.
         self._run_alone()
-        if self.command != "in place":
+        if self.command == "recheck" and found["h.jsonl"] == self.new["h.jsonl"]:
+            # The history is an input, too.
+            assert len(check_history.read_history("h.jsonl")) == 3, details
+        elif self.command != "in place":
             assert self.read() == self.new, details
         hidden = [path.name for path in self.files() if path.name.startswith(".dhcal-")]
         assert hidden == [], (details, hidden)
@@ -299,6 +343,14 @@ def _session(process: psutil.Process) -> int:
         return os.getsid(process.pid) if process.status() != psutil.STATUS_ZOMBIE else 0
     except (psutil.NoSuchProcess, ProcessLookupError):
         return 0
+
+
+class _FixedTime(datetime):
+    """Clock that stands still: the checks of a history have a time."""
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> _FixedTime:
+        return cls(2026, 3, 1, tzinfo=tz or UTC)
 
 
 def _announce_start(pipe: int) -> None:
@@ -314,9 +366,9 @@ def _announce_start(pipe: int) -> None:
 
 def _replace_write_outputs(function: Callable[..., object]) -> None:
     """Replace the function that saves, in all modules that have imported it."""
-    from dhcal_pin.cli import fleet, run_job
+    from dhcal_pin.cli import fleet, iso_plan, run_job
 
-    for module in (outputs, run_job, fleet):
+    for module in (outputs, run_job, fleet, iso_plan):
         module.write_outputs = function  # pyright: ignore
 
 
@@ -327,6 +379,7 @@ def main(folder: str, command: str, name: str, n_steps: str, n_times: str, seed:
     os.fsync = lambda descriptor: None
     spawn = multiprocessing.get_context
     multiprocessing.get_context = lambda method=None: spawn("fork" if method == "spawn" else method)
+    check_history.datetime = _FixedTime
     root = Path(folder).resolve() / "run"
     root.mkdir(parents=True, exist_ok=True)
     interruption = Interruption(root, command)

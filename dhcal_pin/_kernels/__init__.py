@@ -24,6 +24,7 @@ try:
         r_factor,
         r_factors,
         right_jacobian_inverse_batch,
+        solve_triangular,
     )
 except ImportError:
     from .kinematics import (
@@ -35,7 +36,7 @@ except ImportError:
         propagate_frames,
         right_jacobian_inverse_batch,
     )
-    from .qr import append_diagonal, factor_jacobian, r_factor, r_factors
+    from .qr import append_diagonal, factor_jacobian, r_factor, r_factors, solve_triangular
 
 __all__ = [
     "append_diagonal",
@@ -49,4 +50,5 @@ __all__ = [
     "r_factor",
     "r_factors",
     "right_jacobian_inverse_batch",
+    "solve_triangular",
 ]

@@ -128,23 +128,28 @@ static PyObject *py_cos_sin(PyObject *self, PyObject *args)
 static PyObject *py_propagate_frames(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const ArraySpec specs[] = {{"link_transforms", 3, 'd'}, {"prismatic", 1, '?'}, {"values", 2, 'd'},
+    static const ArraySpec specs[] = {{"link_transforms", 4, 'd'}, {"prismatic", 1, '?'}, {"values", 2, 'd'},
                                       {"cosines", 2, 'd'},         {"sines", 2, 'd'},     {"frames", 4, 'D'}};
     Array a[6];
     if (!get_arrays(a, args, specs, 6))
         return NULL;
     const Array *link_transforms = a, *values = a + 2, *frames = a + 5;
-    const Size k = values->view.shape[0], m = values->view.shape[1];
-    int ok = has_shape(link_transforms, k + 1, 4, 4, 0) && has_shape(a + 1, k, 0, 0, 0) &&
-             has_shape(a + 3, k, m, 0, 0) && has_shape(a + 4, k, m, 0, 0) &&
-             has_shape(frames, k + 2, frames->view.shape[1], 3, m) && frames->view.shape[1] >= 4 &&
+    const Size b = link_transforms->view.shape[0], k = values->view.shape[0], n = values->view.shape[1],
+               m = b ? n / b : 0;
+    int ok = m * b == n && has_shape(link_transforms, b, k + 1, 4, 4) && has_shape(a + 1, k, 0, 0, 0) &&
+             has_shape(a + 3, k, n, 0, 0) && has_shape(a + 4, k, n, 0, 0) &&
+             has_shape(frames, k + 2, frames->view.shape[1], 3, n) && frames->view.shape[1] >= 4 &&
              frames->stride[1] == 3 * frames->stride[2];
     for (int i = 0; i < 5; i++)
         ok = ok && is_contiguous(a + i);
     if (ok) {
         Py_BEGIN_ALLOW_THREADS;
-        propagate_frames(k + 1, m, link_transforms->data, a[1].data, values->data, a[3].data, a[4].data,
-                         frames->data, frames->stride[0], frames->stride[2]);
+        /* Samples of member i start at i·m. */
+        for (Size i = 0; i < b; i++)
+            propagate_frames(k + 1, m, (double *)link_transforms->data + i * 16 * (k + 1), a[1].data,
+                             (double *)values->data + i * m, (double *)a[3].data + i * m,
+                             (double *)a[4].data + i * m, n, (double *)frames->data + i * m,
+                             frames->stride[0], frames->stride[2]);
         Py_END_ALLOW_THREADS;
     }
     return finish(a, 6, ok);
@@ -243,23 +248,28 @@ static PyObject *py_apply_observation_matrix(PyObject *self, PyObject *args)
 static PyObject *py_perturb_frames(PyObject *self, PyObject *args)
 {
     (void)self;
-    static const ArraySpec specs[] = {{"body_from_urdf", 3, 'd'}, {"origins", 3, 'd'},    {"tool", 2, 'd'},
-                                      {"error_frames", 1, 's'},   {"twists", 2, 'd'},     {"x", 1, 'd'},
-                                      {"displacements", 3, 'D'},  {"body_twists", 2, 'D'}};
+    static const ArraySpec specs[] = {{"body_from_urdf", 3, 'd'}, {"origins", 4, 'd'},    {"tool", 3, 'd'},
+                                      {"error_frames", 1, 's'},   {"twists", 3, 'd'},     {"x", 2, 'd'},
+                                      {"displacements", 4, 'D'},  {"body_twists", 3, 'D'}};
     Array a[8];
     if (!get_arrays(a, args, specs, 8))
         return NULL;
-    const Size b = a->view.shape[0], p = a[3].view.shape[0], *error_frames = a[3].data;
-    int ok = has_shape(a, b, 4, 4, 0) && has_shape(a + 1, b, 4, 4, 0) && has_shape(a + 2, 4, 4, 0, 0) &&
-             has_shape(a + 4, p, 6, 0, 0) && has_shape(a + 5, p, 0, 0, 0) &&
-             has_shape(a + 6, 2 * b + 2, 4, 4, 0) && has_shape(a + 7, p, 6, 0, 0);
+    /* Origins, tool and twists are those of each of b members, or one of each for all. */
+    const Size n = a->view.shape[0], p = a[3].view.shape[0], b = a[5].view.shape[0],
+               given = a[1].view.shape[0], *error_frames = a[3].data;
+    int ok = has_shape(a, n, 4, 4, 0) && has_shape(a + 1, given, n, 4, 4) && has_shape(a + 2, given, 4, 4, 0) &&
+             has_shape(a + 4, given, p, 6, 0) && (given == b || given == 1) && has_shape(a + 5, b, p, 0, 0) &&
+             has_shape(a + 6, b, 2 * n + 2, 4, 4) && has_shape(a + 7, b, p, 6, 0);
     for (int i = 0; i < 8; i++)
         ok = ok && is_contiguous(a + i);
     for (Size i = 0; ok && i < p; i++)
-        ok = error_frames[i] >= (i ? error_frames[i - 1] : 0) && error_frames[i] < 2 * b + 2;
-    if (ok)
-        perturb_frames(b, p, a->data, a[1].data, a[2].data, error_frames, a[4].data, a[5].data, a[6].data,
-                       a[7].data);
+        ok = error_frames[i] >= (i ? error_frames[i - 1] : 0) && error_frames[i] < 2 * n + 2;
+    for (Size i = 0; ok && i < b; i++) {
+        const Size own = given == b ? i : 0;
+        perturb_frames(n, p, a->data, (double *)a[1].data + own * 16 * n, (double *)a[2].data + own * 16,
+                       error_frames, (double *)a[4].data + own * 6 * p, (double *)a[5].data + i * p,
+                       (double *)a[6].data + i * 16 * (2 * n + 2), (double *)a[7].data + i * 6 * p);
+    }
     return finish(a, 8, ok);
 }
 
@@ -370,17 +380,35 @@ static PyObject *py_append_diagonal(PyObject *self, PyObject *args)
 {
     (void)self;
     static const ArraySpec specs[] = {
-        {"r_factor", 2, 'd'}, {"diagonal", 1, 'd'}, {"target", 1, 'd'}, {"work", 1, 'D'}, {"out", 2, 'D'}};
+        {"r_factors", 3, 'd'}, {"diagonal", 2, 'd'}, {"target", 2, 'd'}, {"work", 1, 'D'}, {"out", 3, 'D'}};
     Array a[5];
     if (!get_arrays(a, args, specs, 5))
         return NULL;
-    const Size p = a[1].view.shape[0];
-    const int ok = has_shape(a, p + 1, p + 1, 0, 0) && is_contiguous(a) && has_shape(a + 2, p, 0, 0, 0) &&
-                   a[3].view.shape[0] >= work_size(p + 1, 1, 0) && has_shape(a + 4, p + 1, p + 1, 0, 0) &&
+    const Size b = a[1].view.shape[0], p = a[1].view.shape[1], size = (p + 1) * (p + 1);
+    const int ok = has_shape(a, b, p + 1, p + 1, 0) && is_contiguous(a) && is_contiguous(a + 1) &&
+                   has_shape(a + 2, b, p, 0, 0) && is_contiguous(a + 2) &&
+                   a[3].view.shape[0] >= work_size(p + 1, 1, 0) && has_shape(a + 4, b, p + 1, p + 1, 0) &&
                    is_contiguous(a + 4);
-    if (ok)
-        append_diagonal(a->data, p, a[1].data, a[2].data, a[4].data, a[3].data);
+    for (Size i = 0; ok && i < b; i++)
+        append_diagonal((double *)a->data + i * size, p, (double *)a[1].data + i * p,
+                        (double *)a[2].data + i * p, (double *)a[4].data + i * size, a[3].data);
     return finish(a, 5, ok);
+}
+
+static PyObject *py_solve_triangular(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const ArraySpec specs[] = {{"r_factors", 3, 'd'}, {"sides", 3, 'd'}, {"out", 3, 'D'}};
+    Array a[3];
+    if (!get_arrays(a, args, specs, 3))
+        return NULL;
+    const Size b = a->view.shape[0], p = a->view.shape[1], s = a[1].view.shape[2];
+    const int ok = has_shape(a, b, p, p, 0) && has_shape(a + 1, b, p, s, 0) && is_contiguous(a + 1) &&
+                   has_shape(a + 2, b, p, s, 0) && is_contiguous(a + 2);
+    for (Size i = 0; ok && i < b; i++)
+        solve_triangular((double *)a->data + i * a->stride[0], a->stride[1], p, s,
+                         (double *)a[1].data + i * p * s, (double *)a[2].data + i * p * s);
+    return finish(a, 3, ok);
 }
 
 static PyMethodDef methods[] = {
@@ -395,6 +423,7 @@ static PyMethodDef methods[] = {
     {"r_factors", py_r_factors, METH_VARARGS, NULL},
     {"factor_jacobian", py_factor_jacobian, METH_VARARGS, NULL},
     {"append_diagonal", py_append_diagonal, METH_VARARGS, NULL},
+    {"solve_triangular", py_solve_triangular, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -44,16 +44,19 @@ def cos_sin(angles: Array) -> tuple[Array, Array]:
 def propagate_frames(
     link_transforms: Array, prismatic: Array, joint_state: JointState, frames: Array
 ) -> None:
-    """Compute the frames along a chain, from the base to the tool.
+    """Compute the frames along the chains of a batch, from the base to the tool.
 
-    `frames`, shape (k+2, 7, 3, m), has columns x, y, z, p of each frame and three columns of work memory.
-    Frame 0 is given; the others are filled. The last of the constant transforms, shape (k+1, 4, 4), leads to
-    the tool.
+    `frames`, shape (k+2, 7, 3, b·m), has columns x, y, z, p of each frame and three columns of work memory.
+    Frame 0 is given; the others are filled. The last of the constant transforms, shape (b, k+1, 4, 4), leads
+    to the tool. The samples are those of member 1, then those of member 2, and so on.
     """
+    if len(link_transforms) > 1:
+        _propagate_batch(link_transforms, prismatic, joint_state, frames)
+        return
     # The columns of F·L are linear combinations of the columns of F: one small matrix product for all
     # samples. A rotation by q about z maps x to cos q·x + sin q·y and y to cos q·y - sin q·x.
     mixing, columns = (
-        _ROTATION_MIX @ np.swapaxes(link_transforms, 1, 2),
+        _ROTATION_MIX @ np.swapaxes(link_transforms[0], 1, 2),
         frames.reshape(*frames.shape[:2], -1),
     )
     steps = zip(mixing, columns[:, :4], columns[1:, :6], frames[1:], prismatic.tolist(), strict=False)
@@ -69,6 +72,31 @@ def propagate_frames(
             rotated_axes *= joint_state.sin[j]
             axes += rotated_axes
     np.matmul(mixing[-1, :4], columns[-2, :4], out=columns[-1, :4])
+
+
+def _propagate_batch(
+    link_transforms: Array, prismatic: Array, joint_state: JointState, frames: Array
+) -> None:
+    """Compute the frames along several chains."""
+    b, k = len(link_transforms), len(prismatic)
+    by_member = frames.reshape(*frames.shape[:3], b, -1)
+    positions, cos, sin = (
+        part.reshape(k, b, -1) for part in (joint_state.positions, joint_state.cos, joint_state.sin)
+    )
+    for j, link in enumerate(link_transforms.swapaxes(0, 1)):
+        parent, frame = by_member[j], by_member[j + 1]
+        for column in range(4):
+            coefficients = link[:, :, column].T[:, :, None]
+            np.multiply(parent[0], coefficients[0], out=frame[column])
+            frame[column] += parent[1] * coefficients[1]
+            frame[column] += parent[2] * coefficients[2]
+        frame[3] += parent[3]
+        if j < k and prismatic[j]:
+            frame[3] += frame[2] * positions[j]
+        elif j < k:
+            x, y = frame[0].copy(), frame[1].copy()
+            frame[0] = x * cos[j] + y * sin[j]
+            frame[1] = y * cos[j] - x * sin[j]
 
 
 @UnbufferedRows()
@@ -133,54 +161,57 @@ def apply_observation_matrix(jacobian: Array, observation: ObservationMatrix, ou
 
 
 def error_frame_poses(body_from_urdf: Array, origins: Array, tool: Array, displacements: Array) -> Array:
-    """Compute the pose of each error frame in its body, before its own displacement, shape (2b+2, 4, 4).
+    """Compute the pose of each error frame in its body, before its own displacement, shape (..., 2b+2, 4, 4).
 
-    The URDF link frames in their bodies and the origins without joint motions have shape (b, 4, 4), the
-    displacements of the error frames (2b+2, 4, 4).
+    The URDF link frames in their bodies and the origins without joint motions have shape (..., b, 4, 4), the
+    displacements of the error frames (..., 2b+2, 4, 4).
     """
     frames = np.empty(displacements.shape)
     # The frame of body 0 lies behind the displacement of the base.
-    frames[0] = se3.inverse(displacements[0])
-    frames[1:-1:2] = body_from_urdf
-    np.matmul(body_from_urdf @ displacements[1:-1:2], origins, out=frames[2::2])
-    frames[-1] = frames[-2] @ displacements[-2] @ tool
+    frames[..., 0, :, :] = se3.inverse(displacements[..., 0, :, :])
+    frames[..., 1:-1:2, :, :] = body_from_urdf
+    np.matmul(body_from_urdf @ displacements[..., 1:-1:2, :, :], origins, out=frames[..., 2::2, :, :])
+    frames[..., -1, :, :] = frames[..., -2, :, :] @ displacements[..., -2, :, :] @ tool
     return frames
 
 
 def perturb_frames(
     body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
-    """Displace the error frames of a chain, and express the errors as twists of bodies.
+    """Displace the error frames of the chains of a batch, and express the errors as twists of bodies.
 
     The displacement of error frame s is the product of exp(x_i·ξ_i) over the errors i at s, in their order.
-    The derivative of the chain by x_i is the twist Ad(F·E)·ξ_i of the frame's body, where F is the pose of
+    The derivative of a chain by x_i is the twist Ad(F·E)·ξ_i of the frame's body, where F is the pose of
     the error frame in the body and E the product over the preceding errors at s. The error frames, shape
-    (p,), ascend. The result is all displacements, shape (2b+2, 4, 4), and the twists in body frames, shape
-    (p, 6).
+    (p,), ascend. Of n members have origins (n, b, 4, 4), tool (n, 4, 4) and twists (n, p, 6) one or each
+    its own; x has shape (n, p). The result is all displacements, shape (n, 2b+2, 4, 4), and the twists in
+    body frames, shape (n, p, 6).
     """
-    displacements, preceding = np.empty((2 * len(body_from_urdf) + 2, 4, 4)), np.empty((len(x), 4, 4))
+    n, p = x.shape
+    displacements, preceding = np.empty((n, 2 * len(body_from_urdf) + 2, 4, 4)), np.empty((n, p, 4, 4))
     displacements[:] = _IDENTITY
-    for i, (frame, step) in enumerate(zip(error_frames.tolist(), _exponentials(twists, x), strict=True)):
-        preceding[i] = displacements[frame]
-        np.matmul(preceding[i], step, out=displacements[frame])
-    frames = error_frame_poses(body_from_urdf, origins, tool, displacements)[error_frames] @ preceding
+    exponentials = _exponentials(twists, x)
+    for i, frame in enumerate(error_frames.tolist()):
+        preceding[:, i] = displacements[:, frame]
+        np.matmul(preceding[:, i], exponentials[:, i], out=displacements[:, frame])
+    frames = error_frame_poses(body_from_urdf, origins, tool, displacements)[:, error_frames] @ preceding
     return displacements, (se3.adjoint(frames) @ twists[..., None])[..., 0]
 
 
 def _exponentials(twists: Array, x: Array) -> Array:
-    """Compute exp(x·ξ) (p, 4, 4) of values x (p,) and twists ξ (p, 6) in a third of the time of `se3.exp6`.
+    """Compute exp(x·ξ) (..., 4, 4) of values x (...) and twists ξ (..., 6), faster than `se3.exp6`.
 
     With the matrix A of ξ/|ω| and θ = x·|ω|: exp = I + θ·A + (1 - cos θ)·A² + (θ - sin θ)·A³, because A⁴ =
     -A². The term 1 - cos θ is computed as 2·sin²(θ/2), which does not cancel. For ω = 0 the exponential is I
     + x·ξ.
     """
-    matrices = np.zeros((len(x), 4, 4))
-    matrices[:, :3, :3], matrices[:, :3, 3] = se3.skew(twists[:, 3:]), twists[:, :3]
-    size = np.sqrt(np.einsum("ij,ij->i", twists[:, 3:], twists[:, 3:]))
-    unit = matrices / np.where(size > 0, size, 1.0)[:, None, None]
+    matrices = np.zeros((*twists.shape[:-1], 4, 4))
+    matrices[..., :3, :3], matrices[..., :3, 3] = se3.skew(twists[..., 3:]), twists[..., :3]
+    size = np.sqrt(np.einsum("...j,...j->...", twists[..., 3:], twists[..., 3:]))
+    unit = matrices / np.where(size > 0, size, 1.0)[..., None, None]
     angle, square = size * x, unit @ unit
-    first, second = x[:, None, None] * matrices, (2 * np.sin(0.5 * angle) ** 2)[:, None, None] * square
-    return _IDENTITY + first + second + (angle - np.sin(angle))[:, None, None] * (square @ unit)
+    first, second = x[..., None, None] * matrices, (2 * np.sin(0.5 * angle) ** 2)[..., None, None] * square
+    return _IDENTITY + first + second + (angle - np.sin(angle))[..., None, None] * (square @ unit)
 
 
 def log_rotations(rotations: Array) -> Array:

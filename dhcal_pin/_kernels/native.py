@@ -45,8 +45,8 @@ def perturb_frames(
     body_from_urdf: Array, origins: Array, tool: Array, error_frames: Array, twists: Array, x: Array
 ) -> tuple[Array, Array]:
     """Displace the error frames of a chain; see `kinematics.perturb_frames`."""
-    displacements = np.empty((2 * len(body_from_urdf) + 2, 4, 4))
-    body_twists = np.empty(twists.shape)
+    displacements = np.empty((len(x), 2 * len(body_from_urdf) + 2, 4, 4))
+    body_twists = np.empty((len(x), *twists.shape[1:]))
     _native.perturb_frames(body_from_urdf, origins, tool, error_frames, twists, x, displacements, body_twists)
     return displacements, body_twists
 
@@ -91,9 +91,16 @@ def factor_jacobian(
 
 
 def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
-    """Append a diagonal block of rows to an R factor; see `qr.append_diagonal`."""
+    """Append a diagonal block of rows to R factors; see `qr.append_diagonal`."""
     out = np.empty(r.shape)
-    _native.append_diagonal(r, diagonal, target, _work_array(len(r), 1, 0), out)
+    _native.append_diagonal(r, diagonal, target, _work_array(r.shape[1], 1, 0), out)
+    return out
+
+
+def solve_triangular(r: Array, sides: Array) -> Array:
+    """Solve upper triangular systems; see `qr.solve_triangular`."""
+    out = np.empty(sides.shape)
+    _native.solve_triangular(r, sides, out)
     return out
 
 

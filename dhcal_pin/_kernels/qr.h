@@ -201,12 +201,16 @@ static int find_nonzero_columns(NonzeroColumns *nonzero, const ErrorTwists *e, c
         return 0;
     nonzero->same_columns_as = nonzero->counts + k, nonzero->columns = nonzero->same_columns_as + k,
     nonzero->positions = nonzero->columns + k * c;
+    /* If the rows of all residuals fit into one block, one update takes less time than one per residual. */
+    const int is_small = k * m <= BLOCK_ROWS;
     for (Size i = 0; i < k; i++) {
         Size *columns = nonzero->columns + i * c, *positions = nonzero->positions + i * c, u = 0;
         const Sensitivity sensitivity = row_sensitivity(h, i);
+        const int has_terms = sensitivity.linear || sensitivity.angular;
         for (Size j = 0; j < c; j++) {
             const double *rows = given + (j - e->count) * column + i * residual;
-            const int is_nonzero = j < e->count ? is_observed(e, j, sensitivity) : !is_zero(rows, m);
+            const int is_nonzero = j < e->count ? (is_small ? has_terms : is_observed(e, j, sensitivity))
+                                                : is_small || !is_zero(rows, m);
             positions[j] = is_nonzero ? u : -1;
             if (is_nonzero)
                 columns[u++] = j;
@@ -317,5 +321,22 @@ static void append_diagonal(const double *r_in, Size p, const double *diagonal, 
             block[p * rows + i] = target[start + i];
         }
         update_r_factor(r, (Lanes *)block, c, rows / LANES);
+    }
+}
+
+/* Solve R·x = y by back substitution for s right-hand sides y (p, s); rows of r are `row` apart. */
+SIMD_CLONES static void solve_triangular(const double *r, Size row, Size p, Size s, const double *y, double *x)
+{
+    for (Size i = p; i--;) {
+        double *restrict to = x + i * s;
+        memcpy(to, y + i * s, s * sizeof(double));
+        for (Size j = i + 1; j < p; j++) {
+            const double f = r[i * row + j], *restrict from = x + j * s;
+            VECTORIZE (t, s)
+                to[t] -= f * from[t];
+        }
+        const double pivot = r[i * row + i];
+        VECTORIZE (t, s)
+            to[t] /= pivot;
     }
 }

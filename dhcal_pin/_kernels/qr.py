@@ -73,17 +73,23 @@ def factor_jacobian(
 
 
 def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
-    """Compute the R factor of [R | z] with rows diag(diagonal)·δ = target below it.
+    """Compute the R factors of [R | z] with rows diag(diagonal)·δ = target below it, for a batch.
 
-    R has the right-hand side z in its last column, shape (p+1, p+1), like the result.
+    R has the right-hand side z in its last column, shape (b, p+1, p+1), like the result. Diagonal and target
+    have shape (b, p).
     """
-    p = len(diagonal)
-    stacked = np.zeros((p + 1, 2 * p + 1))
-    stacked[:, : p + 1] = r.T
+    b, p = diagonal.shape
+    stacked = np.zeros((b, p + 1, 2 * p + 1))
+    stacked[:, :, : p + 1] = r.swapaxes(1, 2)
     # `stacked` is transposed: entry i of the diagonal is at [i, p + 1 + i].
-    stacked.reshape(-1)[p + 1 : 2 * p * (p + 1) : 2 * p + 2] = diagonal
-    stacked[p, p + 1 :] = target
-    return _qr(stacked)
+    stacked.reshape(b, -1)[:, p + 1 : 2 * p * (p + 1) : 2 * p + 2] = diagonal
+    stacked[:, p, p + 1 :] = target
+    return _qr(stacked[0])[None] if b == 1 else r_factors(stacked[:, :, None])
+
+
+def solve_triangular(r: Array, sides: Array) -> Array:
+    """Solve upper triangular systems R·x = y of a batch; R has shape (b, p, p), y and x (b, p, s)."""
+    return np.linalg.solve(r, sides)
 
 
 def _factor_nonzero_columns(rows: Array) -> Array:

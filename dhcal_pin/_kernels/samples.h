@@ -52,8 +52,8 @@ typedef uint64_t Bits __attribute__((may_alias));
 typedef double Lanes __attribute__((vector_size(32), may_alias));
 /* LANES: doubles in `Lanes`. BLOCK_SAMPLES: samples that the functions of this file treat together.
    BLOCK_ROWS: rows of a block that is reduced by Householder reflectors. MAX_COLUMNS: columns that a pair of
-   reflectors is applied to at once. Blocks fit into the first-level cache. */
-enum { LANES = 4, BLOCK_SAMPLES = 64, BLOCK_ROWS = 128, MAX_COLUMNS = 6 };
+   reflectors is applied to at once. Blocks of 20 columns fit into the first-level cache. */
+enum { LANES = 4, BLOCK_SAMPLES = 64, BLOCK_ROWS = 192, MAX_COLUMNS = 6 };
 
 /* Evaluate a polynomial by Horner's rule; `count` coefficients, highest degree first. */
 static inline __attribute__((always_inline)) double polynomial(double u, const double *coefficients,
@@ -110,18 +110,18 @@ SIMD_CLONES static void sincos_batch(Size m, const double *restrict angle, doubl
 /* Compute the columns x, y, z, p of frames 1 ... n_links of a chain; frame 0 is given.
 
    link_transforms (n_links, 4, 4), prismatic (n_links - 1), joint values, cosines and sines (n_links - 1, m).
-   `body` and `row` are the strides of frames and of component rows. */
+   `joint`, `body` and `row` are the strides of joints, frames and component rows. */
 SIMD_CLONES static void propagate_frames(Size n_links, Size m, const double *link_transforms,
                                          const char *prismatic, const double *values, const double *cosine,
-                                         const double *sine, double *frames, Size body, Size row)
+                                         const double *sine, Size joint, double *frames, Size body, Size row)
 {
     for (Size start = 0; start < m; start += BLOCK_SAMPLES) {
         const Size n = m - start < BLOCK_SAMPLES ? m - start : BLOCK_SAMPLES;
         for (Size j = 0; j < n_links; j++) {
             double link[12];
             memcpy(link, link_transforms + 16 * j, sizeof link);
-            const double *restrict q = values + j * m + start;
-            const double *restrict c = cosine + j * m + start, *restrict s = sine + j * m + start;
+            const double *restrict q = values + j * joint + start;
+            const double *restrict c = cosine + j * joint + start, *restrict s = sine + j * joint + start;
             for (Size i = 0; i < 3; i++) {
                 const double *from = frames + j * body + i * row + start;
                 const double *restrict x = from, *restrict y = from + 3 * row, *restrict z = from + 6 * row,

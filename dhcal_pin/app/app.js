@@ -99,6 +99,7 @@ async function addFiles(added) {
     setRole(file.name, roles[i]);
   });
   filesChanged();
+  await showPhotographSize(added);
 }
 
 function filesChanged() {
@@ -112,6 +113,7 @@ function filesChanged() {
   const hasRig = named("rig").length > 0;
   if (hasRig && !$("parameters").disabled) $("holdout").value = $("parameters").value = "";
   $("parameters").disabled = hasRig;
+  if (named("images").length) $("rig-maker").open = !hasRig;
   $("parameters").options[0].text = hasRig ? "Arm, camera, board, lens" : "Joint origins, base, tool (default)";
   check();
 }
@@ -165,6 +167,57 @@ function showHoldoutFiles() {
   }
   $("holdout").value = before;
   if ($("holdout").selectedIndex < 0) $("holdout").selectedIndex = 0;
+}
+
+// --- rig file and board ----------------------------------------------------------------------------
+
+function writeRig() {
+  const place = $("rig-place").value, square = $("rig-square").value || "30";
+  $("rig-text").value = `[camera.camera]
+link = "${place}"
+width = ${$("rig-width").value}
+height = ${$("rig-height").value}
+
+[board.board]
+link = "${place === "tip" ? "world" : "tip"}"
+type = "charuco"
+columns = 8
+rows = 5
+square_mm = ${square}
+marker_mm = ${Number((22 / 30 * square).toFixed(2))}
+dictionary = "DICT_5X5_100"
+${$("rig-ruler").value ? `ruler_mm = ${$("rig-ruler").value}\n` : ""}`;
+}
+
+const rigFile = () => new File([$("rig-text").value], "rig.toml", { type: "text/plain" });
+
+// The size of the photographs is that of the first one.
+async function showPhotographSize(added) {
+  const photograph = added.find(({ name }) => files.get(name)?.role === "images");
+  try {
+    const { width, height } = await createImageBitmap(photograph);
+    [$("rig-width").value, $("rig-height").value] = [width, height];
+    writeRig();
+  } catch {
+    // There is none, or it is a video.
+  }
+}
+
+async function printBoard(paper) {
+  const body = new FormData();
+  body.append("request", JSON.stringify({ rig: "rig.toml", paper }));
+  body.append("file", rigFile());
+  $("rig-status").textContent = "";
+  showError("rig-error", "");
+  try {
+    await send("board", body, null, message => {
+      if (message.error) throw new Error(spoken(message.error));
+      downloadItem(message.files[0]).querySelector("a").click();
+      $("rig-status").textContent = "board.pdf is saved. Print it at its true size, then measure its ruler line.";
+    });
+  } catch (error) {
+    showError("rig-error", failure(error));
+  }
 }
 
 // --- requests --------------------------------------------------------------------------------------
@@ -419,6 +472,10 @@ for (const name of ["dragover", "dragleave", "drop"]) {
   });
 }
 $("tip").onchange = check;
+for (const field of document.querySelectorAll("#rig-maker .field > :is(select, input)")) field.oninput = writeRig;
+for (const button of document.querySelectorAll("[data-paper]")) button.onclick = () => printBoard(button.dataset.paper);
+$("rig-use").onclick = () => addFiles([rigFile()]);
+writeRig();
 $("example").onclick = async () => {
   try {
     const example = await (await fetch("example")).json();

@@ -23,6 +23,7 @@ from contextlib import aclosing, asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from ..exceptions import InvalidArgumentError
 from .upload import Upload
 
 # Module that is the command `dhcal`.
@@ -35,14 +36,15 @@ _PROGRESS = re.compile(r"progress: (.*) (\d+)/(\d+)")
 _PREFIX = re.compile(r"^dhcal( \w+)?: ")
 _SEE_HELP = re.compile(r"; see dhcal \w+ --help$")
 _REPORT, _SCENE, _RESULT, _RESIDUALS = "report.html", "scene.html", "result.json", "residuals.csv"
-# Corners that are found in photographs.
-_CORNERS = "corners.csv"
+# Corners that are found in photographs, and the page with a board.
+_CORNERS, _BOARD = "corners.csv", "board.pdf"
 # Phase of a search for corners.
 _DETECTING = {"phase": "finding the board in the photographs", "step": 1, "total": 1}
 
 
 async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
     """Yield messages about what the measurement files in a folder contain."""
+    upload.require_data()
     if upload.images:
         error = await _detect(upload, folder)
         yield error or {"result": _read_json(folder)}
@@ -69,8 +71,8 @@ async def _detect(upload: Upload, folder: Path) -> dict[str, str]:
 async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
     """Calibrate the robot with the files in a folder, and yield messages about it."""
     if not upload.robot:
-        yield {"error": "no robot file; add a URDF or a DH table"}
-        return
+        raise InvalidArgumentError("no robot file; add a URDF or a DH table")
+    upload.require_data()
     data = upload.data
     if upload.images:
         yield _DETECTING
@@ -110,11 +112,22 @@ async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, An
         "status": "refused" if run.status == _REFUSED else "done",
         "screen": "\n".join(screen),
         "files": [
-            {"name": file, "label": label, "content": base64.b64encode((folder / file).read_bytes()).decode()}
-            for file, label in labels.items()
-            if (folder / file).exists()
+            _content(folder / file, label) for file, label in labels.items() if (folder / file).exists()
         ],
     }
+
+
+async def board(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], None]:
+    """Draw the board of a rig file on a page to print, and yield the page."""
+    run = _Run(folder)
+    rig = [word.partition("=")[2] for word in upload.option("rig")]
+    await run.finish("board", *rig, *upload.option("paper"), "-o", _BOARD)
+    yield run.error() or {"result": {}, "files": [_content(folder / _BOARD, "Board to print")]}
+
+
+def _content(path: Path, label: str) -> dict[str, str]:
+    """Return a file for the page."""
+    return {"name": path.name, "label": label, "content": base64.b64encode(path.read_bytes()).decode()}
 
 
 def _read_json(folder: Path) -> Any:

@@ -148,7 +148,11 @@ class _Service:
 def _routes(service: _Service) -> list[tuple[Any, ...]]:
     """List the paths of the server."""
     pages = {"": "app.html", "app.css": "app.css", "app.js": "app.js"}
-    operations: dict[str, Operation] = {"inspect": command.inspect, "calibrate": command.calibrate}
+    operations: dict[str, Operation] = {
+        "inspect": command.inspect,
+        "calibrate": command.calibrate,
+        "board": command.board,
+    }
     return [
         ("example", _ExampleHandler),
         *((path, _PageHandler, {"file": file, "limit": service.limit}) for path, file in pages.items()),
@@ -232,18 +236,18 @@ class _RunHandler(_Handler):
     async def _run(self) -> None:
         """Send all messages of the operation."""
         try:
-            upload = Upload.from_form(self.request.headers.get("Content-Type", ""), bytes(self._body))
+            try:
+                upload = Upload.from_form(self.request.headers.get("Content-Type", ""), bytes(self._body))
+            finally:
+                self._body.clear()
+            with TemporaryDirectory(dir=self._service.folder) as name:
+                folder = Path(name)
+                upload.save(folder)
+                async with aclosing(self._operation(upload, folder)) as messages:
+                    async for message in messages:
+                        await self._send(message)
         except DhcalError as error:
             await self._send({"error": message_line(error)})
-            return
-        finally:
-            self._body.clear()
-        with TemporaryDirectory(dir=self._service.folder) as name:
-            folder = Path(name)
-            upload.save(folder)
-            async with aclosing(self._operation(upload, folder)) as messages:
-                async for message in messages:
-                    await self._send(message)
 
     async def _send(self, message: dict[str, Any]) -> None:
         self.write(json.dumps(message) + "\n")

@@ -22,7 +22,7 @@ _MAX_NAME_BYTES = 255
 # Largest number of files, and longest command line that is made of a request [bytes].
 MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
-_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos")
+_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper")
 _TOO_MANY_FILES = f"more than {MAX_FILES} files; join the rows of several measurement files in one"
 # Files of a request by their use, and what there is without any.
 _FILE_KEYS: Mapping[str, Any] = {"robot": "", "data": [], "images": []}
@@ -68,11 +68,8 @@ class Upload:
             files[name] = part["body"]
         robot, data, images = (request.pop(key, empty) for key, empty in _FILE_KEYS.items())
         options = _option_words(request)
-        if not isinstance(data, list) or not isinstance(images, list) or not data:
-            missing = (
-                "table of the joint values or counts of each photograph" if images else "measurement file"
-            )
-            raise InvalidArgumentError(f"no {missing}; add at least one")
+        if not isinstance(data, list) or not isinstance(images, list):
+            raise InvalidArgumentError("the form is malformed; load the page again")
         names = [*([robot] if robot else []), *data, *images]
         if unknown := [name for name in names if name not in files]:
             raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
@@ -88,6 +85,16 @@ class Upload:
     def option(self, name: str) -> list[str]:
         """Return the word of an option as a list; empty without it."""
         return [word for word in self.options if word.startswith(f"--{name}=")]
+
+    def require_data(self) -> None:
+        """Raise an error if there are no measurements."""
+        if not self.data:
+            what = (
+                "table of the joint values or counts of each photograph"
+                if self.images
+                else "measurement file"
+            )
+            raise InvalidArgumentError(f"no {what}; add at least one")
 
     @property
     def robot_name(self) -> str:

@@ -224,9 +224,8 @@ def calibrate(
     else:
         fit = start(data)
     # The confirmation of changes and the calibration itself often need the same fits.
-    reweighted = cache(
-        lambda fit, stages: reweight(fit, stages, _prior_groups(fit, priors), max_iterations, progress)
-    )
+    groups = _prior_groups(fit, priors)
+    reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
     found = None
     if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
@@ -244,7 +243,7 @@ def calibrate(
     data = fit.data
     if method != "lm":
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
-    groups, stages = _prior_groups(fit, priors), robust.LOSSES[loss].stages
+    stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = ImageFitting(groups, stages, max_iterations, progress, arm)
         images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)

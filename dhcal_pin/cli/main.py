@@ -57,9 +57,15 @@ class _LazyCommandParser(CommandParser):
         self._has_arguments = False
 
     def parse_known_args(self, *args: Any, **options: Any) -> Any:
-        """Declare the arguments of the command, then parse."""
+        """Declare the arguments of the command, then parse. Options may stand between the names of files."""
         self.declare_arguments()
-        return super().parse_known_args(*args, **options)
+        found, others = super().parse_known_args(*args, **options)
+        last = [action for action in self._actions if not action.option_strings][-1:]
+        if others and last and last[0].nargs in ("*", "+") and not any(w.startswith("-") for w in others):
+            # argparse ends a list of names at the first option.
+            setattr(found, last[0].dest, [*getattr(found, last[0].dest), *others])
+            others = []
+        return found, others
 
     def declare_arguments(self) -> None:
         """Declare the arguments of the command, once."""

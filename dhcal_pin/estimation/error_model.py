@@ -110,21 +110,21 @@ class ErrorModel:
         return bool(self._coefficient_indices.size) or self.chain.transmission is not None
 
     @cached_property
-    def _twists(self) -> Array:
+    def twists(self) -> Array:
         """Twists of the geometric errors in their error frames, shape (p-e, 6)."""
         return np.array([parameter.twist for parameter in self.parameters]).reshape(-1, 6)[
             : self._n_geometric
         ]
 
     @cached_property
-    def _error_frames(self) -> Array:
+    def error_frames(self) -> Array:
         """Error frames of the geometric errors, shape (p-e,)."""
         return np.array([parameter.error_frame for parameter in self.parameters], int)[: self._n_geometric]
 
     @cached_property
-    def _bodies(self) -> Array:
+    def bodies(self) -> Array:
         """Bodies that the geometric errors move, shape (p-e,)."""
-        return bodies_of_frames(self.chain, self._error_frames)
+        return bodies_of_frames(self.chain, self.error_frames)
 
     @property
     def priors(self) -> Array:
@@ -134,14 +134,15 @@ class ErrorModel:
     def _perturb_frames(self, x: Array) -> tuple[Array, Array]:
         """Compute the displacements of all error frames (2k+4, 4, 4) and the body twists (p-e, 6) at x."""
         chain = self.chain
-        return perturb_frames(
+        displacements, twists = perturb_frames(
             chain.body_from_urdf,
-            chain.origins,
-            chain.tool,
-            self._error_frames,
-            self._twists,
-            x[: self._n_geometric],
+            chain.origins[None],
+            chain.tool[None],
+            self.error_frames,
+            self.twists[None],
+            x[None, : self._n_geometric],
         )
+        return displacements[0], twists[0]
 
     def at(self, x: Array) -> Chain:
         """Build the chain with given errors.
@@ -179,7 +180,7 @@ class ErrorModel:
         """
         x = np.ascontiguousarray(x, float)
         displacements, twists = self._perturb_frames(x)
-        chain, bodies = self._with_transmission(self.chain.perturbed(displacements), x), self._bodies
+        chain, bodies = self._with_transmission(self.chain.perturbed(displacements), x), self.bodies
         if not self._coefficient_indices.size:
             return chain, bodies, twists
         entries = len(chain.moving_joints) + 1 + self._coefficient_indices

@@ -169,7 +169,7 @@ class TriangularSystem:
 
     def appended(self, diagonal: Array, right: Array) -> TriangularSystem:
         """Append the rows diag(diagonal)·δ = right."""
-        return TriangularSystem(append_diagonal(self.rows, diagonal, right))
+        return TriangularSystem(append_diagonal(self.rows[None], diagonal[None], right[None])[0])
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
         """Compute a square root of the covariance of data and priors together.

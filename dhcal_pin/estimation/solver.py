@@ -209,9 +209,16 @@ def levenberg_marquardt(
     while iteration < max_iterations and not converged and damping <= rules.MAX_DAMPING:
         start, accepted_system = x, None
         undamped = system.with_priors(problem.weights, x)
+        roundoff, residual_norm = undamped.roundoff, math.sqrt(cost)
+        if (
+            loose
+            and damping < rules.MAX_CONVERGED_DAMPING
+            and _is_stationary(problem, undamped, x, cost, last_change, roundoff, LOOSE_RTOL)
+        ):
+            state = DampingState(damping, scale, last_change)
+            return SolverResult(x, system, iteration, False, np.array(iterates), state)
         scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
         damping_scale = np.where(scale > 0, scale, 1.0)
-        roundoff, residual_norm = undamped.roundoff, math.sqrt(cost)
         # Whether steps have become negligible although the undamped step is not.
         stalled = False
         iteration += 1
@@ -225,9 +232,6 @@ def levenberg_marquardt(
                 and damping < rules.MAX_CONVERGED_DAMPING
                 and step_is_negligible(change, residual_norm, last_change, roundoff, LOOSE_RTOL)
             ):
-                if _is_stationary(problem, undamped, x, cost, last_change, roundoff, LOOSE_RTOL):
-                    state = DampingState(damping, scale, last_change)
-                    return SolverResult(x, system, iteration - 1, False, np.array(iterates), state)
                 stalled = last_undamped == 0
             is_negligible = step_is_negligible(change, residual_norm, last_change, roundoff)
             predicted = undamped.predicted_reduction(row_change)

@@ -429,14 +429,14 @@ class Chain:
         return self.body_from_urdf @ self.origins
 
     @cached_property
-    def _urdf_from_body(self) -> Array:
+    def urdf_from_body(self) -> Array:
         """Body frame of each joint in its URDF frame, and the identity for the tip, shape (k+1, 4, 4)."""
         return np.concatenate([self.axis_frames[1:], _IDENTITY[None]])
 
     @cached_property
     def link_transforms(self) -> Array:
         """Constant transforms L_0 … L_k between the joint motions, shape (k+1, 4, 4)."""
-        return self.next_from_body @ self._urdf_from_body
+        return self.next_from_body @ self.urdf_from_body
 
     @cached_property
     def _link_and_tool_transforms(self) -> Array:
@@ -482,7 +482,7 @@ class Chain:
             frames[0, :4] = self.base[:3].T[:, :, None]
         else:
             frames[0, :4] = (base_motion @ self.base)[:, :3].transpose(2, 1, 0)
-        _kernels.propagate_frames(self._link_and_tool_transforms, self.prismatic, state, frames)
+        _kernels.propagate_frames(self._link_and_tool_transforms[None], self.prismatic, state, frames)
         if tool_motion is not None:
             tool = np.einsum("acm,maj->jcm", frames[-1, :3], tool_motion[:, :3])
             tool[3] += frames[-1, 3]
@@ -765,7 +765,7 @@ class Chain:
         cached = {
             "axis_frames": self.axis_frames,
             "body_from_urdf": self.body_from_urdf,
-            "_urdf_from_body": self._urdf_from_body,
+            "urdf_from_body": self.urdf_from_body,
         }
         vars(chain).update(self.__getstate__(), **cached, **frames)
         if "origins" in frames:

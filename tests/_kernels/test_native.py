@@ -29,8 +29,8 @@ except ImportError:
     pytest.skip("the compiled kernels are not installed", allow_module_level=True)
 
 SEEDS = st.integers(0, 2**32 - 1)
-# Numbers of samples near the block sizes 64, 128 and 2048, and far from them.
-SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 127, 128, 129, 300, 2049])
+# Numbers of samples near the block sizes 64, 192 and 2048, and far from them.
+SAMPLES = st.sampled_from([1, 2, 3, 7, 63, 64, 65, 191, 192, 193, 300, 2049])
 
 
 @given(SEEDS, SAMPLES)
@@ -44,8 +44,9 @@ def test_frames_and_jacobians_agree_with_numpy(seed, m):
     k, p = len(chain.moving_joints), int(rng.integers(1, 30))
     reference, compiled = np.empty((2, k + 2, 7, 3, m))
     reference[0, :4] = compiled[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
-    kinematics.propagate_frames(chain.link_transforms, chain.prismatic, motion, reference)
-    native.propagate_frames(chain.link_transforms, chain.prismatic, motion, compiled)
+    links = chain.link_transforms[None]
+    kinematics.propagate_frames(links, chain.prismatic, motion, reference)
+    native.propagate_frames(links, chain.prismatic, motion, compiled)
     np.testing.assert_allclose(compiled[:, :4], reference[:, :4], atol=1e-14)
     at = np.sort(rng.integers(0, k + 1, p))
     twists = rng.standard_normal((p, 6)) * (rng.random((p, 6)) < 0.4)
@@ -57,6 +58,24 @@ def test_frames_and_jacobians_agree_with_numpy(seed, m):
     np.testing.assert_allclose(out, expected, atol=1e-13)
     assert np.isnan(wide[:, p]).all()
     assert np.isnan(wide[..., [0, 1, -3, -2, -1]]).all()
+
+
+@pytest.mark.parametrize("kernels", [native, kinematics])
+@pytest.mark.parametrize("seed", range(4))
+def test_frames_of_a_batch_are_those_of_each_chain(kernels, seed):
+    rng = np.random.default_rng(seed)
+    table = random_table(rng)
+    chain = Chain.from_dh(table)
+    motion = chain.joint_state(random_joints(rng, table, 15))
+    links = chain.link_transforms @ se3.exp6(0.1 * rng.standard_normal((3, 1, 6)))
+    frames = np.empty((len(chain.moving_joints) + 2, 7, 3, 15))
+    frames[0, :4] = se3.exp6(rng.standard_normal(6))[:3].T[:, :, None]
+    alone = frames.copy()
+    kernels.propagate_frames(links, chain.prismatic, motion, frames)
+    for member, link in enumerate(links):
+        kinematics.propagate_frames(link[None], chain.prismatic, motion, alone)
+        part = np.s_[:, :4, :, 5 * member : 5 * member + 5]
+        np.testing.assert_allclose(frames[part], alone[part], atol=1e-13)
 
 
 @given(SEEDS, SAMPLES, st.integers(1, 45), st.integers(1, 6))
@@ -96,12 +115,25 @@ def test_batched_r_factors_equal_single_ones():
 @pytest.mark.parametrize("p", [1, 2, 9])
 def test_a_diagonal_block_adds_the_products_of_its_rows(kernels, p):
     rng = np.random.default_rng(p)
-    r = np.triu(rng.standard_normal((p + 1, p + 1)))
-    diagonal, target = rng.uniform(1, 2, p), rng.standard_normal(p)
-    rows = np.column_stack([np.diag(diagonal), target])
-    found = kernels.append_diagonal(r, diagonal, target)
-    np.testing.assert_allclose(found.T @ found, r.T @ r + rows.T @ rows, atol=1e-12)
-    np.testing.assert_array_equal(np.tril(found, -1), 0)
+    for b in (1, 3):
+        r = np.triu(rng.standard_normal((b, p + 1, p + 1)))
+        diagonal, target = rng.uniform(1, 2, (b, p)), rng.standard_normal((b, p))
+        rows = np.concatenate([diagonal[:, :, None] * np.eye(p), target[:, :, None]], 2)
+        found = kernels.append_diagonal(r, diagonal, target)
+        wanted = r.swapaxes(1, 2) @ r + rows.swapaxes(1, 2) @ rows
+        np.testing.assert_allclose(found.swapaxes(1, 2) @ found, wanted, atol=1e-12)
+        np.testing.assert_array_equal(np.tril(found, -1), 0)
+
+
+@pytest.mark.parametrize("kernels", [native, qr])
+@pytest.mark.parametrize("sides", [1, 3, 8])
+def test_triangular_systems_are_solved(kernels, sides):
+    """The factors are a part of larger arrays, as in a triangular system."""
+    rng = np.random.default_rng(sides)
+    rows = np.triu(rng.standard_normal((4, 8, 8))) + 3 * np.eye(8)
+    x = rng.standard_normal((4, 7, sides))
+    found = kernels.solve_triangular(rows[:, :-1, :-1], rows[:, :-1, :-1] @ x)
+    np.testing.assert_allclose(found, x, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])
@@ -165,23 +197,26 @@ def test_factored_jacobian_agrees_with_explicit_rows(seed, m, ends, residuals, n
         np.testing.assert_allclose((r / scale).T @ (r / scale), wanted / np.outer(scale, scale), atol=1e-12)
 
 
-@given(SEEDS, st.integers(0, 30))
+@given(SEEDS, st.integers(0, 30), st.sampled_from([1, 3]), st.booleans())
 @settings(max_examples=60, deadline=None)
-def test_perturbed_frames_agree_with_numpy(seed, count):
+def test_perturbed_frames_agree_with_numpy(seed, count, members, is_shared):
     """Random twists, small and large, several per error frame, at base, joints and tool."""
+    given = 1 if is_shared else members
     rng = np.random.default_rng(seed)
     chain = Chain.from_dh(random_table(rng))
     error_frames = np.sort(rng.integers(0, chain.tool_frame_index + 1, count))
-    twists = rng.standard_normal((count, 6)) * (rng.random((count, 6)) < 0.4)
-    x = rng.standard_normal(count) * 10.0 ** rng.uniform(-9, 0, count)
-    tool = se3.exp6(rng.standard_normal(6))
-    terms = chain.body_from_urdf, chain.origins, tool, error_frames, twists, x
+    twists = rng.standard_normal((given, count, 6)) * (rng.random((given, count, 6)) < 0.4)
+    x = rng.standard_normal((members, count)) * 10.0 ** rng.uniform(-9, 0, count)
+    tool = se3.exp6(rng.standard_normal((given, 6)))
+    origins = np.stack([chain.origins @ se3.exp6(rng.standard_normal(6)) for _ in range(given)])
+    terms = chain.body_from_urdf, origins, tool, error_frames, twists, x
     reference, compiled = kinematics.perturb_frames(*terms), native.perturb_frames(*terms)
     for mine, other in zip(compiled, reference, strict=True):
         np.testing.assert_allclose(mine, other, atol=1e-13)
-    for station, motion in enumerate(compiled[0]):
-        steps = se3.exp6((x[:, None] * twists)[error_frames == station])
-        np.testing.assert_allclose(motion, functools.reduce(np.matmul, steps, np.eye(4)), atol=1e-13)
+    for member, motions in enumerate(compiled[0]):
+        for station, motion in enumerate(motions):
+            steps = se3.exp6((x[:, :, None] * twists)[member, error_frames == station])
+            np.testing.assert_allclose(motion, functools.reduce(np.matmul, steps, np.eye(4)), atol=1e-13)
 
 
 @pytest.mark.parametrize("size", [1e-9, 0.5, 1.0, 10.0, 1e3, 9.9e4, 1.1e5, 1e12])
@@ -290,12 +325,14 @@ def test_shapes_indices_and_read_only_arrays_are_checked(sim_6dof):
         with pytest.raises(ValueError, match="shapes"):
             native.factor_jacobian(*errors, observation, np.zeros((1, 2, 5)))
     for error_frames in ([sim_6dof.tool_frame_index + 1], [-1], [2, 1]):
-        terms = sim_6dof.body_from_urdf, sim_6dof.origins, np.eye(4), np.array(error_frames)
+        terms = sim_6dof.body_from_urdf, sim_6dof.origins[None], np.eye(4)[None], np.array(error_frames)
         with pytest.raises(ValueError, match="shapes"):
-            native.perturb_frames(*terms, np.zeros((len(error_frames), 6)), np.zeros(len(error_frames)))
+            native.perturb_frames(
+                *terms, np.zeros((1, len(error_frames), 6)), np.zeros((1, len(error_frames)))
+            )
     with pytest.raises(ValueError, match="shapes"):
         native.propagate_frames(
-            sim_6dof.link_transforms[1:],
+            sim_6dof.link_transforms[None, 1:],
             sim_6dof.prismatic,
             sim_6dof.joint_state(np.zeros((5, 6))),
             np.empty((8, 7, 3, 5)),

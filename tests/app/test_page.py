@@ -14,6 +14,8 @@ from pages import AXE, READY, VIEWPORT, listen
 from slow_cases import some_slow
 
 import dhcal_pin.app.server
+from dhcal_pin.cli.main import main
+from dhcal_pin.io.rig_file import read_rig
 
 # Width and colours of the looks at the page.
 LOOKS = tuple(product((390, 768, 1200), ("light", "dark")))
@@ -170,6 +172,39 @@ def test_the_example_ends_in_the_corrected_files_of_a_servo_arm(page):
     page.wait_for_selector("#check .card.problem")
 
 
+DROP_PHOTOGRAPH = """async () => {
+  const canvas = Object.assign(document.createElement("canvas"), { width: 320, height: 200 });
+  const blob = await new Promise(done => canvas.toBlob(done));
+  const data = new DataTransfer();
+  data.items.add(new File([blob], "photograph.png"));
+  dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+}"""
+
+
+def test_a_rig_file_is_made_and_its_board_is_printed(page, example, tmp_path, monkeypatch):
+    page.evaluate(DROP_PHOTOGRAPH)
+    page.wait_for_function("document.getElementById('rig-width').value === '320'")
+    page.select_option("#rig-place", "world")
+    page.fill("#rig-square", "25")
+    page.fill("#rig-ruler", "149.5")
+    with page.expect_download() as waiting:
+        page.click("[data-paper=letter]")
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(page.input_value("#rig-text"))
+    assert main("board rig.toml --paper letter -o board.pdf".split()) == 0
+    assert Path(waiting.value.path()).read_bytes() == Path("board.pdf").read_bytes()
+    rig = read_rig("rig.toml")
+    (camera,), (board,) = rig.cameras.values(), rig.boards.values()
+    assert (camera.link, board.link, camera.width, camera.height) == ("world", "tip", 320, 200)
+    page.click("#rig-use")
+    page.wait_for_selector('[aria-label="Remove rig.toml"]')
+    assert page.get_attribute("#rig-maker", "open") is None
+    page.evaluate("document.getElementById('rig-maker').open = true")
+    page.fill("#rig-square", "1000")
+    page.click("[data-paper=a4]")
+    page.wait_for_selector("#rig-error:not([hidden])")
+
+
 def test_errors_are_shown_as_one_line(page, example):
     drop(page, *example_files(example))
     page.fill("#tip", "nowhere")
@@ -249,7 +284,9 @@ def test_every_state_is_accessible_at_every_width(page, example, looks):
             if (width, scheme) in checked:
                 assert violations(page) == [], (width, scheme)
 
+    page.click("#rig-maker summary")
     check(looks[0])
+    page.click("#rig-maker summary")
     urdf, data = example_files(example)
     drop_with_tip(page, urdf, ("laser.csv", wrong_sign(example)))
     page.wait_for_selector("#check .card.warning")

@@ -7,20 +7,21 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 from slow_cases import some_slow
 
 from dhcal_pin import read_robot
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.cameras import procedure
+from dhcal_pin.calibration.cameras import jitter, procedure
 from dhcal_pin.calibration.cameras.jitter import (
     Jitter,
     _log_likelihood,
     _maximize_likelihood,
     _scatter,
+    estimate_jitter,
 )
 from dhcal_pin.estimation import select_parameters
-from dhcal_pin.estimation.initialization import subsample
+from dhcal_pin.estimation.initialization import make_problem, subsample
 from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
@@ -206,3 +207,36 @@ def test_likelihood_of_a_displacement_is_that_of_the_normal_distribution():
     assert _log_likelihood([(residual, derivative)], jitter) == pytest.approx(with_it - without, rel=1e-12)
     huge = 1e12 * derivative[:, [0, 0, 1, 1, 2, 2]]
     assert np.isfinite(_log_likelihood([(residual, huge)], jitter))
+
+
+@pytest.mark.parametrize("n_determined", [0.0, 20.0, 116.5])
+def test_noise_of_images_without_a_displacement_fits_the_residuals_unless_it_is_stated(
+    sim_6dof, n_determined, monkeypatch
+):
+    rng = np.random.default_rng(12)
+    q = rng.uniform(-2.5, 2.5, (10, 6))
+    images = KINDS["camera"].simulate(sim_6dof, q, Noise(1e-4), rng)
+    images = images.with_rig(mount_rig(simulated_rig(sim_6dof, q), sim_6dof)).replace(sigma=images.sigma / 4)
+    is_used = np.arange(len(images.rows)) != 7
+    problem = make_problem(select_parameters(sim_6dof, "base"), (images,), np.ones(1), {})
+    x = np.zeros(len(problem.errors.parameters) + len(problem.instrument_parameters))
+    # The same noise, stated and estimated.
+    stated, images = images.replace(sigma=2 * images.sigma), images.replace(has_stated_sigma=False)
+    monkeypatch.setattr(jitter, "_scatter", lambda images: 2.0)
+    given, found = (
+        estimate_jitter(problem, x, [item], [is_used.astype(float)], n_determined)
+        for item in (stated, images)
+    )
+    assert (given.noise, found.noise) == (1.0, 2.0)
+    np.testing.assert_allclose([found.position, found.rotation], [given.position, given.rotation])
+    frames = sim_6dof.forward_kinematics(images.conditions())
+    residual = stated.residual(frames, problem.instrument_values_of(stated, x))[:, is_used]
+    # Independent residuals of this sum of squares, as many as the fit leaves, with the noise that fits and 1.
+    n_free = residual.size - n_determined
+    size = np.sqrt(np.sum(residual**2) / n_free)
+    gain = n_free * (norm.logpdf(size, scale=size) - norm.logpdf(size))
+    assert gain > 1
+    assert given.log_likelihood_ratio - found.log_likelihood_ratio == pytest.approx(gain, rel=1e-9)
+    # A fit may determine as many parameters as there are rows.
+    alone = estimate_jitter(problem, x, [images], [is_used.astype(float)], residual.size)
+    assert np.isfinite(alone.log_likelihood_ratio)

@@ -6,6 +6,7 @@ from argparse import ArgumentTypeError
 
 import pytest
 
+from dhcal_pin.cli.main import build_parser
 from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders, split_commas
 from dhcal_pin.estimation import LOSSES, PARAMETER_SETS, Loss
 from dhcal_pin.estimation.parameters import EXTENSIONS
@@ -51,3 +52,25 @@ def test_integer_type():
 def test_split_commas():
     assert split_commas(" a, b,,c ") == ["a", "b", "c"]
     assert split_commas("") == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate a.urdf --tip t 1.csv 2.csv -o o.urdf",
+        "calibrate a.urdf 1.csv --tip t 2.csv -o o.urdf",
+        "validate a.urdf 1.csv --tip t 2.csv",
+        "recheck a.urdf --tip t 1.csv 2.csv",
+        "inspect 1.csv --robot a.urdf 2.csv --tip t",
+    ],
+)
+def test_options_may_stand_between_names_of_files(words):
+    found = build_parser().parse_args(words.split())
+    assert (found.robot, found.tip, found.data) == ("a.urdf", "t", ["1.csv", "2.csv"])
+
+
+@pytest.mark.parametrize("words", ["export a.urdf b.urdf -o m.h", "validate a.urdf 1.csv --tipp t 2.csv"])
+def test_words_without_a_meaning_are_refused(words, capsys):
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(words.split())
+    assert "unrecognized arguments" in capsys.readouterr().err

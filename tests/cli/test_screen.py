@@ -219,6 +219,8 @@ def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, errors, is_kept
     assert ("; the arm is kept" in unfolded(err)) == is_kept
     assert ("estimated: placement" in err) != is_kept
     if is_kept:
+        # Nothing is wrong: the rows that are left out name no causes.
+        assert "more rows of tried causes; see --verbose" in unfolded(err)
         verbose = run(*command, "--verbose")[2]
         assert "x, RMS" in verbose
         assert "error at the board" in verbose

@@ -47,8 +47,8 @@ def test_frames_and_derivatives_agree_with_those_of_single_chains(sets, seed):
     q = random_joints(rng, table, 2 * 4 * 3).reshape(2, 4, 3, -1)
     chains, bodies, twists = ChainBatch.from_models(models).derivative(x)
     frames = chains.forward_kinematics(q)
-    jacobian, members = np.empty((len(x[0]), 6, 2 * 4 * 3)), np.ascontiguousarray(twists.swapaxes(0, 1))
-    kinematics.batch_point_jacobian(frames.columns, frames.tool[3], bodies, members, 2, jacobian)
+    jacobian = np.empty((len(x[0]), 6, 2 * 4 * 3))
+    kinematics.batch_point_jacobian(frames.columns, frames.tool[3], bodies, twists, 2, jacobian)
     jacobian = jacobian.reshape(-1, 6, 2, 4, 3)
     for i, model in enumerate(models):
         chain, own_bodies, own_twists = model.derivative(x[i])

@@ -196,6 +196,39 @@ def test_hidden_joints_are_named():
     assert recheck(chain, [shifted]).residual_rms == pytest.approx(5e-3)
 
 
+def test_only_single_changes_have_a_size():
+    """The robot and a wrong sample have none; the other sizes are those of a change of everything."""
+    sim, fit, q = calibrated("ur10", 7, Position)
+    moved = pin.SE3(np.eye(3), np.array([0.003, 0.0, -0.004]))
+    found = recheck(fit.chain, [measured(sim, q, Position, True, tool=moved)], fit.uncertainty).hypotheses
+    assert {each.kind for each in found} == {"joint", "base", "tool", "robot", "sample"}
+    for each in found:
+        if each.kind in ("robot", "sample"):
+            assert (each.size, each.std, each.unit) == (0.0, 0.0, "m")
+        else:
+            assert abs(each.size) > 0
+            assert each.std > 0
+            assert each.unit == ("rad" if each.kind == "joint" else "m")
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_size_of_a_motion_of_the_base_is_as_uncertain_as_near_points_show_it(is_stated):
+    """Points that are near to each other show turns poorly, and so the motion of the base far from them."""
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    q = np.array([0.3, -1.2, 1.5, -0.5, 0.7, 0.2]) + rng.uniform(-0.3, 0.3, (12, 6))
+    points = chain.poses(q)[:, :3, 3]
+    moved = points + np.array([0.003, 0.004, 0.0]) + rng.normal(0, NOISE, points.shape)
+    first = recheck(chain, [Position(q, moved, NOISE if is_stated else None)]).hypotheses[0]
+    # Motion v + ω x p of the points p, and the size of v.
+    rows = np.concatenate([np.concatenate([np.eye(3), -pin.skew(point)], 1) for point in points])
+    covariance = NOISE**2 * np.linalg.inv(rows.T @ rows)
+    along = np.linalg.lstsq(rows, (moved - points).ravel())[0][:3]
+    expected = np.sqrt(along @ covariance[:3, :3] @ along) / np.linalg.norm(along)
+    assert (first.kind, first.unit) == ("base", "m")
+    assert first.std == pytest.approx(expected, rel=0.01 if is_stated else 0.5)
+    assert abs(first.size - 0.005) < 4 * first.std
+
+
 def test_lengths_of_wires_are_refused():
     simulation = Simulation("ur10", 10, 3)
     with pytest.raises(InvalidArgumentError, match="of the kind wires; expected position or pose"):

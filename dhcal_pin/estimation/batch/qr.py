@@ -4,16 +4,17 @@
 
     ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost
 
-The formulas are those of `qr`; the decompositions are NumPy's, which loop over the stack in compiled code.
+The formulas are those of `qr`; kernels and NumPy loop over the stack in compiled code.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from ..._kernels import r_factors
+from ..._kernels import append_diagonal, solve_triangular
 from ..._typing import Array
 from ..qr import RANK_RTOL
 from ..solver_rules import EPS_MODEL, step_is_negligible
@@ -22,7 +23,7 @@ from ..solver_rules import EPS_MODEL, step_is_negligible
 # of 1000 to the rank cut covers the error of the estimate.
 MAX_CONDITION = 1e-3 / RANK_RTOL
 # Random unit vectors from which the condition number is estimated.
-N_PROBES = 4
+N_PROBES = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,45 +33,54 @@ class TriangularSystemBatch:
     `qr.TriangularSystem` documents the members that both classes share, and why there are two.
     """
 
-    r: Array  # R factors of the Jacobians, upper triangular, shape (b, p, p)
-    z: Array  # Right-hand sides, shape (b, p)
-    min_cost: Array  # Costs that remain after the best steps, shape (b,)
+    rows: Array  # [R z; 0 ρ], upper triangular, shape (b, p+1, p+1)
 
-    @classmethod
-    def from_r_factors(cls, rows: Array) -> TriangularSystemBatch:
-        """Split the R factors of [J | r]."""
-        return cls(rows[:, :-1, :-1], rows[:, :-1, -1], rows[:, -1, -1] ** 2)
+    @property
+    def r(self) -> Array:
+        """R factors of the Jacobians, upper triangular, shape (b, p, p)."""
+        return self.rows[:, :-1, :-1]
 
-    @classmethod
-    def from_columns(cls, columns: Array) -> TriangularSystemBatch:
-        """Factor whitened rows."""
-        return cls.from_r_factors(r_factors(np.ascontiguousarray(columns)[:, :, None]))
+    @property
+    def z(self) -> Array:
+        """Right-hand sides, shape (b, p)."""
+        return self.rows[:, :-1, -1]
+
+    @property
+    def min_cost(self) -> Array:
+        """Costs that remain after the best steps, shape (b,)."""
+        return self.rows[:, -1, -1] ** 2
 
     @property
     def cost(self) -> Array:
         """Costs at the current x, shape (b,)."""
-        return self.min_cost + np.sum(self.z**2, -1)
+        return _squared_norms(self.rows[:, :, -1])
+
+    @property
+    def column_norms(self) -> Array:
+        """Norms of the columns of the R factors, shape (b, p)."""
+        return np.sqrt(np.einsum("bij,bij->bj", self.r, self.r))
+
+    @property
+    def _norms(self) -> Array:
+        """Frobenius norms of the R factors, shape (b,)."""
+        return np.sqrt(np.einsum("bij,bij->b", self.r, self.r))
 
     @property
     def roundoff(self) -> Array:
         """Rounding errors of the rows, EPS_MODEL·‖R‖, shape (b,)."""
-        return EPS_MODEL * _frobenius_norms(self.r)
+        return EPS_MODEL * self._norms
 
     def take(self, members: Array) -> TriangularSystemBatch:
         """Select problems."""
-        return TriangularSystemBatch(self.r[members], self.z[members], self.min_cost[members])
+        return TriangularSystemBatch(self.rows[members])
 
     def assign(self, members: Array, other: TriangularSystemBatch) -> None:
         """Replace the systems of some problems in place."""
-        self.r[members], self.z[members], self.min_cost[members] = other.r, other.z, other.min_cost
+        self.rows[members] = other.rows
 
     def with_damping(self, diagonal: Array) -> TriangularSystemBatch:
         """Append the rows diag(diagonal)·δ = 0."""
-        b, p = self.z.shape
-        columns = np.zeros((b, p + 1, 2 * p))
-        columns[:, :p, :p], columns[:, p, :p] = self.r.swapaxes(1, 2), self.z
-        columns[:, np.arange(p), np.arange(p, 2 * p)] = diagonal
-        return TriangularSystemBatch.from_columns(columns)
+        return TriangularSystemBatch(append_diagonal(self.rows, diagonal, np.zeros(diagonal.shape)))
 
     def solve(self, min_singular_value: Array | float = 0.0) -> Array:
         """Compute the minimum-norm least-squares solutions R⁺·z.
@@ -80,15 +90,14 @@ class TriangularSystemBatch:
         condition number.
         """
         p = self.z.shape[1]
-        size, out = _frobenius_norms(self.r), np.empty_like(self.z)
+        size, out = self._norms, np.empty(self.z.shape)
         # The smallest diagonal element of a triangular matrix bounds its smallest singular value from above.
         diagonal = np.abs(np.diagonal(self.r, axis1=1, axis2=2))
         candidates = np.flatnonzero(diagonal.min(1) > RANK_RTOL * size)
-        probes = np.random.default_rng(0).standard_normal((p, N_PROBES))
-        probes /= np.linalg.norm(probes, axis=0)
-        sides = np.concatenate([self.z[candidates, :, None], np.tile(probes, (len(candidates), 1, 1))], 2)
-        solved = np.linalg.solve(self.r[candidates], sides)
-        condition = size[candidates] * np.linalg.norm(solved[..., 1:], axis=1).max(1)
+        sides = np.empty((len(candidates), p, N_PROBES + 1))
+        sides[:, :, 0], sides[:, :, 1:] = self.z[candidates], _probes(p)
+        solved = solve_triangular(self.r[candidates], sides)
+        condition = size[candidates] * np.sqrt(np.einsum("bps,bps->bs", solved, solved)[:, 1:].max(1))
         is_regular = (condition < MAX_CONDITION) | (min_singular_value > RANK_RTOL * size)[candidates]
         out[candidates[is_regular]] = solved[is_regular, :, 0]
         others = np.setdiff1d(np.arange(len(out)), candidates[is_regular])
@@ -106,7 +115,7 @@ class TriangularSystemBatch:
 
     def predicted_reduction(self, change: Array) -> Array:
         """Compute by how much the linear models reduce the costs."""
-        return np.sum(self.z**2, -1) - np.sum((change - self.z) ** 2, -1)
+        return _squared_norms(self.z) - _squared_norms(change - self.z)
 
     def is_stationary(self, cost: Array, last_change: Array) -> Array:
         """Check whether the undamped steps of the problems (b,) are negligible, too, at costs (b,)."""
@@ -123,6 +132,13 @@ class TriangularSystemBatch:
         return out
 
 
-def _frobenius_norms(matrices: Array) -> Array:
-    """Compute the norms of stacked matrices, shape (b,)."""
-    return np.sqrt(np.einsum("bij,bij->b", matrices, matrices))
+def _squared_norms(vectors: Array) -> Array:
+    """Compute the squared norms of stacked vectors, shape (b,)."""
+    return np.einsum("bi,bi->b", vectors, vectors)
+
+
+@lru_cache(maxsize=64)
+def _probes(p: int) -> Array:
+    """Return random unit vectors, shape (p, N_PROBES)."""
+    probes = np.random.default_rng(0).standard_normal((p, N_PROBES))
+    return probes / np.linalg.norm(probes, axis=0)

@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..._kernels import factor_jacobian
+from ..._kernels import append_diagonal, factor_jacobian, r_factors
 from ..._kernels.types import twists_before
 from ..._typing import Array
 from ...exceptions import InvalidArgumentError, UnknownNameError
@@ -166,8 +166,7 @@ class BatchProblem:
             Systems at x.
         """
         chains, bodies, twists = self.chains.derivative(x)
-        b, p = x.shape
-        twists, factors = np.ascontiguousarray(twists.swapaxes(0, 1)), []
+        factors = []
         for item in self.data:
             frames = chains.forward_kinematics(self._configurations(item))
             u = self._instrument_values(item)
@@ -180,14 +179,12 @@ class BatchProblem:
             factors.append(
                 factor_jacobian(frames.columns, frames.tool[3], bodies, moving, observation, residual[None])
             )
-        if (with_prior := np.flatnonzero(weights)).size:
-            rows = np.zeros((b, len(with_prior), p + 1))
-            rows[:, np.arange(len(with_prior)), with_prior] = weights[with_prior]
-            rows[:, :, p] = -(weights * x)[:, with_prior]
-            factors.append(rows)
-        if len(factors) == 1:
-            return TriangularSystemBatch.from_r_factors(factors[0])
-        return TriangularSystemBatch.from_columns(np.concatenate(factors, 1).swapaxes(1, 2))
+        rows = factors[0]
+        if len(factors) > 1:
+            rows = r_factors(np.ascontiguousarray(np.concatenate(factors, 1).swapaxes(1, 2))[:, :, None])
+        if weights.any():
+            rows = append_diagonal(rows, np.tile(weights, (len(x), 1)), -weights * x)
+        return TriangularSystemBatch(rows)
 
 
 def _padded(item: Measurement, count: int) -> Measurement:
@@ -310,7 +307,7 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
         undamped, start_cost = systems.take(active), cost[active]
         new = active[is_new[active]]
         iterations[new] += 1
-        scale[new] = np.maximum(scale[new], np.linalg.norm(systems.r[new], axis=1))
+        scale[new] = np.maximum(scale[new], systems.take(new).column_norms)
         damping_scale = np.where(scale[active] > 0, scale[active], 1.0)
         damping_rows = np.sqrt(damping[active])[:, None] * damping_scale
         step = undamped.with_damping(damping_rows).solve(damping_rows.min(1))
