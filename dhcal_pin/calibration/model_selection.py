@@ -60,11 +60,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from .._kernels.work_arrays import UnbufferedRows
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
@@ -258,7 +259,7 @@ def _percent(ratio: float) -> str:
     return f"{100 * (ratio - 1):+.0f} %"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """Selected families, with the hyperparameters of greatest evidence.
 
@@ -285,6 +286,7 @@ class _Candidates:
         family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
         rows: Rows of all data.
         folds: Rows of random folds of whole configurations; empty if nothing is selected.
+        cv_errors: Error of the random folds with the families of each model that was asked for.
     """
 
     problem: Problem
@@ -292,6 +294,7 @@ class _Candidates:
     family: Array
     rows: NoisyRows
     folds: tuple[NoisyFold, ...] = ()
+    cv_errors: dict[Model, float] = field(default_factory=dict)
 
     @classmethod
     def with_folds(cls, problem: Problem, x: Array, family: Array, factor: FactorFolds) -> _Candidates:
@@ -341,9 +344,12 @@ class _Candidates:
 
     def cv_error(self, model: Model) -> float:
         """Compute the RMS error of the random folds with the families of a model."""
-        weights, columns = self.weights(model.widths), self.columns(model.widths)
-        squares = [fold.squared_error(model.noise, weights, self.x, columns) for fold in self.folds]
-        return float(np.sqrt(sum(squares) / sum(fold.n_rows for fold in self.folds)))
+        if model not in self.cv_errors:
+            weights, columns = self.weights(model.widths), self.columns(model.widths)
+            squares = [fold.squared_error(model.noise, weights, self.x, columns) for fold in self.folds]
+            n_rows = sum(fold.n_rows for fold in self.folds)
+            self.cv_errors[model] = float(np.sqrt(sum(squares) / n_rows))
+        return self.cv_errors[model]
 
     def trial(self, name: str, current: Model) -> tuple[FamilyTrial, Model]:
         """Try a family on top of those of a model; return the model with it, too."""
@@ -359,7 +365,7 @@ def _factor_folds(
     problem: Problem, x: Array, folds: Sequence[Fold]
 ) -> tuple[NoisyRows, tuple[NoisyFold, ...]]:
     """Factor rows of unknown noise."""
-    systems, n_rows = factor_partition(problem, x, folds), count_rows(problem)
+    systems, n_rows = tuple(factor_partition(problem, x, folds)), count_rows(problem)
     whole = systems[0].fitted.merged(systems[0].held_out)
     return NoisyRows((NoiseClass(whole, n_rows),)), tuple(
         NoisyFold(NoisyRows((NoiseClass(one.fitted, n_rows - one.n_rows),)), one.held_out, one.n_rows)
@@ -374,7 +380,10 @@ def _unknown_names(problem: Problem) -> list[str]:
 
 def prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
     """Return the weights of the priors (p,) of a problem with the expected widths for other widths."""
-    return problem.weights / np.array([widths.get(name, 1.0) for name in family])
+    factors = np.ones(len(family))
+    for name, width in widths.items():
+        factors[family == name] = width
+    return problem.weights / factors
 
 
 def _best_width(x: Array, determined: Array, expected: Array, members: Array) -> float:
@@ -549,37 +558,23 @@ class _RegionErrors:
         return self.noise * float(np.sqrt(np.sum(self.n_rows * self.squares) / np.sum(self.n_rows)))
 
 
-class _Regions:
-    """Left-out regions of joint space, and fits of the other samples at any temperature."""
-
-    def __init__(self, problem: Problem, x: Array, noise: float):
-        """Factor the rows of the regions."""
-        self._x, self._noise, self._weights = x, noise, problem.weights * noise
-        self._folds = [
-            fold
-            for folds in region_partitions(problem.data, contact_groups(problem, x))
-            for fold in factor_partition(problem, x, folds)
-            if fold.n_rows
-        ]
-
-    def __len__(self) -> int:
-        """Return the number of regions."""
-        return len(self._folds)
-
-    def errors(self, temperature: float) -> _RegionErrors:
-        """Fit the other samples of each region at a temperature, and compare errors and predictions."""
-        weights = self._weights * np.sqrt(temperature)
-        columns = np.ones(len(weights), bool)
-        squares = [fold.error(weights, self._x, columns) ** 2 for fold in self._folds]
-        std = [fold.prediction_std(weights, columns) for fold in self._folds]
-        return _RegionErrors(
-            np.array([fold.n_rows for fold in self._folds], float),
-            np.array(squares) / self._noise**2,
-            temperature * np.array(std) ** 2,
-            self._noise,
-        )
+def _region_errors(problem: Problem, x: Array, noise: float, temperature: float) -> _RegionErrors | None:
+    """Fit the other samples of each region at a temperature; None if no region can be left out."""
+    weights, columns = problem.weights * noise * np.sqrt(temperature), np.ones(len(x), bool)
+    # Rows, squared error and predicted variance. The systems of one region are in memory at a time.
+    found = [
+        (fold.n_rows, fold.error(weights, x, columns) ** 2, fold.prediction_std(weights, columns) ** 2)
+        for folds in region_partitions(problem.data, contact_groups(problem, x))
+        for fold in factor_partition(problem, x, folds)
+        if fold.n_rows
+    ]
+    if not found:
+        return None
+    n_rows, squares, variances = np.array(found, float).T
+    return _RegionErrors(n_rows, squares / noise**2, temperature * variances, noise)
 
 
+@UnbufferedRows()
 def extend(
     fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
 ) -> tuple[Fit, Extension]:
@@ -606,10 +601,10 @@ def extend(
         temperature = design_effect(different_configurations(judged.data)[0], is_prismatic)
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
-    if regions := _Regions(extended.without_rejected().problem, extended.solution.x, noise):
-        errors = regions.errors(temperature)
-        geometry = _Regions(judged.problem, fit.solution.x, _noise(judged))
-        region_ratio = errors.rms / geometry.errors(1.0).rms
+    errors = _region_errors(extended.without_rejected().problem, extended.solution.x, noise, temperature)
+    geometry = _region_errors(judged.problem, fit.solution.x, _noise(judged), 1.0)
+    if errors and geometry:
+        region_ratio = errors.rms / geometry.rms
         if temperature > 1:
             scale = float(np.clip(errors.prediction_scale, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
     extension = Extension(trials, temperature, n_configurations, scale, random_ratio, region_ratio)
@@ -772,8 +767,8 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     """Check whether neighbouring configurations share an error of the model."""
     if noise < MIN_CORRELATED_NOISE:
         return False
-    root = fit.solution.system.scaled(1 / noise).sqrt_covariance(fit.problem.weights)[0]
-    return find_residual_correlation(fit.problem, fit.solution.x, root, noise, fit.weights).is_significant
+    system = fit.solution.system.scaled(1 / noise)
+    return find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights).is_significant
 
 
 def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:

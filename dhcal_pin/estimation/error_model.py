@@ -100,6 +100,11 @@ class ErrorModel:
         )
 
     @property
+    def n_coefficients(self) -> int:
+        """Number of unknown transmission coefficients."""
+        return len(self._coefficient_indices)
+
+    @property
     def has_transmission(self) -> bool:
         """Whether the joints have transmission errors, known or unknown."""
         return bool(self._coefficient_indices.size) or self.chain.transmission is not None

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import lstsq
@@ -37,7 +38,7 @@ from scipy.linalg import lstsq
 from .._typing import Array
 from . import qr
 from .normal_equations import NormalEquations
-from .problem import Problem, linearize_and_factor, normal_equations, uses_normal_equations
+from .problem import Problem, linearize_and_factor, normal_equations_by_part, uses_normal_equations
 from .qr import TriangularSystem, merge_r_factors
 
 # Mask of the held-out samples (m,) of each measurement.
@@ -129,31 +130,30 @@ def count_rows(problem: Problem) -> int:
     return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
-def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> tuple[FoldSystems, ...]:
+def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
     """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
+    if uses_normal_equations(problem):
+        # The last label is that of samples in no fold.
+        labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
+        equations = normal_equations_by_part(problem, x, labels)
+        total = reduce(np.add, (one.products for one in equations))
+        for fold, one in zip(folds, equations, strict=False):
+            n_rows = sum(
+                item.residual_dim * int(mask.sum()) for item, mask in zip(problem.data, fold, strict=True)
+            )
+            yield FoldSystems(NormalEquations(total - one.products), one, n_rows)
+        return
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
     parts = [
         problem.with_data([item.take(mask) for item, mask in zip(problem.data, masks, strict=True)])
         for masks in (*folds, rest)
         if np.any(np.concatenate(masks))
     ]
-    if uses_normal_equations(problem):
-        equations = [normal_equations(part, x).products for part in parts]
-        total = np.sum(equations, 0)
-        systems = [(NormalEquations(total - one), NormalEquations(one)) for one in equations]
-    else:
-        factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
-        systems = [
-            (
-                TriangularSystem(merge_r_factors([other for other in factors if other is not one])),
-                TriangularSystem(one),
-            )
-            for one in factors[: len(folds)]
-        ]
-    return tuple(
-        FoldSystems(*system, count_rows(part))
-        for system, part in zip(systems[: len(folds)], parts[: len(folds)], strict=True)
-    )
+    held_out = parts[: len(folds)]
+    factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
+    for part, one in zip(held_out, factors, strict=False):
+        others = merge_r_factors([other for other in factors if other is not one])
+        yield FoldSystems(TriangularSystem(others), TriangularSystem(one), count_rows(part))
 
 
 def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:

@@ -9,6 +9,8 @@ differences of P belong to the union and the difference of sets of samples. With
 with R from the Cholesky decomposition. JᵀJ has the square of the condition number of J. This is accurate
 enough here: in units of the prior standard deviations no eigenvalue of RᵀR is below 1, and its largest one λ
 is the square of the ratio of prior to remaining uncertainty. The relative error of R is about 1e-16·λ.
+
+`DeterminedSystem` is the system with priors. Its damped steps use the decomposition without damping.
 """
 
 from __future__ import annotations
@@ -16,24 +18,35 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import blas, lapack
 
 from .._typing import Array
-from .qr import TriangularSystem, merge_r_factors
+from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors
+from .solver_rules import EPS_MODEL
 
 # Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
 # squared pivot of such a matrix that counts.
 _DIAGONAL_SHIFT = _MIN_PIVOT = 1e-12
+# Attributes of normal equations that do not depend on the residuals.
+_OF_JACOBIAN = ("_decomposition", "_inverse_root")
+# Half the size of a triangular matrix below which LAPACK inverts it.
+_SMALL = 100
+# Largest number of refinements of a step, the relative change that ends them, and the largest ratio of two
+# successive changes with which they go on.
+_MAX_REFINEMENTS, _REFINED, _MAX_RATIO = 16, 1e-12, 0.1
 
 
 class NormalEquations(TriangularSystem):
     """Triangular system of the whitened rows [J | r] at one x, which is given by their inner products."""
 
-    products: Array  # [J | r]ᵀ·[J | r], shape (p+1, p+1)
+    def __init__(self, products: Array, factor: float = 1.0):
+        """Store inner products (p+1, p+1), and the factor of the rows to theirs."""
+        vars(self).update(_unscaled=products, _factor=factor)
 
-    def __init__(self, products: Array):
-        """Store the inner products."""
-        vars(self)["products"] = products
+    @cached_property
+    def products(self) -> Array:
+        """Inner products [J | r]ᵀ·[J | r], shape (p+1, p+1)."""
+        return self._unscaled if self._factor == 1 else self._factor**2 * self._unscaled
 
     @cached_property
     def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -55,16 +68,16 @@ class NormalEquations(TriangularSystem):
     @property
     def cost(self) -> float:
         """Cost at the current x: sum of the squared rows."""
-        return float(self.products[-1, -1])
+        return self._factor**2 * float(self._unscaled[-1, -1])
 
     @property
     def is_unobserved(self) -> Array:
         """Unknowns that no row depends on, (p,)."""
-        return np.diag(self.products)[:-1] == 0
+        return np.diag(self._unscaled)[:-1] == 0
 
     def scaled(self, factor: float) -> NormalEquations:
         """Return the system of the rows times a factor."""
-        return NormalEquations(factor**2 * self.products)
+        return NormalEquations(self._unscaled, factor * self._factor)
 
     def merged(self, other: TriangularSystem) -> TriangularSystem:
         """Compute the system of the rows of two systems of the same unknowns."""
@@ -74,7 +87,7 @@ class NormalEquations(TriangularSystem):
 
     def _with_columns(self, kept: Array) -> NormalEquations:
         """Return the system of some columns of [J | r], the last one included."""
-        return NormalEquations(self.products[np.ix_(kept, kept)])
+        return NormalEquations(self.products.take(kept, 0).take(kept, 1))
 
     def recentered(self, step: Array) -> NormalEquations:
         """Build the system at x + step, assuming that the model is linear over the step."""
@@ -82,33 +95,27 @@ class NormalEquations(TriangularSystem):
         products[:-1, -1] -= self.products[:-1, :-1] @ step
         products[-1, :-1] = products[:-1, -1]
         products[-1, -1] = self.squared_error(step)
-        return NormalEquations(products)
+        # The decomposition of JᵀJ is the same.
+        system = NormalEquations(products)
+        vars(system).update({name: value for name, value in vars(self).items() if name in _OF_JACOBIAN})
+        return system
 
     def squared_error(self, step: Array) -> float:
         """Compute the cost after a step."""
         both = np.append(step, -1.0)
         return max(float(both @ self.products @ both), 0.0)
 
-    def with_priors(self, weights: Array, x: Array | float) -> TriangularSystem:
-        """Build the triangular system of data and priors."""
-        root, scale = self._decompose(weights)
-        z, min_cost = self._right_side(weights, x)
-        rows = np.zeros_like(self.products)
-        np.multiply(root, scale, out=rows[:-1, :-1])
-        rows[:-1, -1], rows[-1, -1] = z, np.sqrt(min_cost)
-        return TriangularSystem(rows)
+    def with_priors(self, weights: Array, x: Array | float) -> DeterminedSystem:
+        """Build the system of data and priors."""
+        right = self._factor**2 * self._unscaled[:-1, -1] - weights**2 * x
+        system = DeterminedSystem(self, weights**2, right, self.cost + float(np.sum((weights * x) ** 2)))
+        vars(system)["_cholesky"] = self._decompose(weights)
+        return system
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
         """Compute the best step with priors, and the cost after it; see `qr.TriangularSystem.solve`."""
-        root, scale = self._decompose(weights)
-        z, min_cost = self._right_side(weights, x)
-        return lapack.dtrtrs(root, z)[0] / scale, min_cost
-
-    def _right_side(self, weights: Array, x: Array | float) -> tuple[Array, float]:
-        """Return z, (p,), and ρ² of the system with priors."""
-        root, scale = self._decompose(weights)
-        z = lapack.dtrtrs(root, (self.products[:-1, -1] - weights**2 * x) / scale, trans=1)[0]
-        return z, max(self.cost + float(np.sum((weights * x) ** 2)) - float(z @ z), 0.0)
+        posterior = self.with_priors(weights, x)
+        return posterior.substitute(), posterior.min_cost
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
         """Compute a square root of the covariance of data and priors together; see `qr.TriangularSystem`.
@@ -117,38 +124,154 @@ class NormalEquations(TriangularSystem):
         """
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):
-            vars(self)["_inverse_root"] = lapack.dtrtri(root)[0] / scale[:, None]
+            vars(self)["_inverse_root"] = _inverse(root)
+            vars(self)["_inverse_root"] *= 1 / scale[:, None]
         return vars(self)["_inverse_root"], np.empty((len(weights), 0))
+
+    def covariance(self, weights: Array) -> Array:
+        """Compute the covariance of data and priors together, shape (p, p)."""
+        upper = lapack.dlauum(self.sqrt_covariance(weights)[0])[0]
+        covariance = upper + upper.T
+        covariance.flat[:: len(covariance) + 1] *= 0.5
+        return covariance
 
     def _decompose(self, weights: Array) -> tuple[Array, Array]:
         """Decompose JᵀJ + W² = D·RᵀR·D; the last result is kept for the covariance of the same solution."""
         last = vars(self).get("_decomposition")
-        if last is not None and np.array_equal(last[0], weights):
-            return last[1:]
-        matrix, scale = self._with_unit_diagonal(weights)
-        # LAPACK reads the transposed matrix, which is the same.
-        root, info = lapack.dpotrf(matrix.T)
-        if info:
-            matrix.flat[:: len(matrix) + 1] += _DIAGONAL_SHIFT
-            root, info = lapack.dpotrf(matrix.T, overwrite_a=1)
-        assert info == 0
-        vars(self)["_decomposition"] = weights, root, scale
-        vars(self).pop("_inverse_root", None)
-        return root, scale
+        if last is None or not np.array_equal(last[0], weights):
+            last = vars(self)["_decomposition"] = weights, *self.cholesky(weights**2)
+            vars(self).pop("_inverse_root", None)
+        return last[1:]
 
-    def _with_unit_diagonal(self, weights: Array) -> tuple[Array, Array]:
-        """Return D⁻¹·(JᵀJ + W²)·D⁻¹, whose diagonal is 1, and the diagonal of D; 1 for a column of zeros."""
-        products = self.products[:-1, :-1]
+    def cholesky(self, diagonal: Array) -> tuple[Array, Array]:
+        """Compute R and the diagonal of D of JᵀJ + diag(diagonal) = D·RᵀR·D."""
+        for shift in (0.0, _DIAGONAL_SHIFT):
+            matrix, scale = self._with_unit_diagonal(diagonal)
+            matrix.flat[:: len(matrix) + 1] += shift
+            # LAPACK reads the transposed matrix, which is the same.
+            root, info = lapack.dpotrf(matrix.T, overwrite_a=1)
+            if not info:
+                return root, scale
+        raise AssertionError("the matrix is not positive definite")
+
+    def _with_unit_diagonal(self, diagonal: Array) -> tuple[Array, Array]:
+        """Return D⁻¹·(JᵀJ + diag(diagonal))·D⁻¹ of diagonal 1, and D; 1 for a column of zeros."""
+        products, diagonal = self._unscaled[:-1, :-1], diagonal / self._factor**2
         # A difference of sums may be negative by rounding.
-        scale = np.sqrt(np.fmax(np.diag(products) + weights**2, 0.0))
+        scale = np.sqrt(np.fmax(np.diag(products) + diagonal, 0.0))
         scale[scale == 0] = 1.0
-        matrix = products / scale
-        matrix /= scale[:, None]
-        matrix.flat[:: len(matrix) + 1] += (weights / scale) ** 2
-        return matrix, scale
+        matrix = products * (1 / scale)
+        matrix *= 1 / scale[:, None]
+        matrix.flat[:: len(matrix) + 1] += diagonal / scale**2
+        return matrix, self._factor * scale
 
     def predicted_variance(self, root: Array) -> float:
         """Compute the variance of all rows that uncertain unknowns cause; the root is upper triangular."""
         upper = lapack.dlauum(root)[0]
-        products = self.products[:-1, :-1]
-        return 2 * float(np.vdot(products, upper)) - float(np.diag(products) @ np.diag(upper))
+        # The products are symmetric. Both arrays are then read in the order of memory.
+        products = self.products[:-1, :-1].T
+        return 2 * float(np.einsum("ij,ij->", products, upper)) - float(np.diag(products) @ np.diag(upper))
+
+
+class DeterminedSystem(TriangularSystem):
+    """Triangular system of normal equations to which diagonal rows were appended: priors, and a damping."""
+
+    def __init__(self, equations: NormalEquations, diagonal: Array, right: Array, cost: float):
+        """Store the equations, the squares (p,) of the appended rows, and what both have on the right side.
+
+        That is Jᵀr of shape (p,), and ‖r‖².
+        """
+        vars(self).update(_equations=equations, _diagonal=diagonal, _right=right, _cost=cost)
+
+    @cached_property
+    def _cholesky(self) -> tuple[Array, Array]:
+        """R of unit columns, and the norms D of the columns."""
+        return self._equations.cholesky(self._diagonal)
+
+    @cached_property
+    def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """[R z; 0 ρ], upper triangular, shape (p+1, p+1)."""
+        rows = np.zeros((len(self.z) + 1,) * 2, order="F")
+        rows[:-1, :-1], rows[:-1, -1], rows[-1, -1] = self.r, self.z, np.sqrt(self.min_cost)
+        return rows
+
+    @cached_property
+    def r(self) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """R factor, upper triangular, shape (p, p)."""
+        root, scale = self._cholesky
+        return root * scale
+
+    @cached_property
+    def z(self) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Right-hand side, shape (p,)."""
+        root, scale = self._cholesky
+        return lapack.dtrtrs(root, self._right / scale, trans=1)[0]
+
+    @property
+    def roundoff(self) -> float:
+        """Rounding error of the rows, EPS_MODEL·‖R‖."""
+        return EPS_MODEL * euclidean_norm(self._cholesky[1])
+
+    @property
+    def min_cost(self) -> float:
+        """Cost ρ² that remains after the best step."""
+        return max(self._cost - float(self.z @ self.z), 0.0)
+
+    @property
+    def cost(self) -> float:
+        """Cost at the current x."""
+        return self._cost
+
+    def appended(self, diagonal: Array, right: Array) -> DeterminedSystem:
+        """Append the rows diag(diagonal)·δ = right."""
+        system = DeterminedSystem(
+            self._equations,
+            self._diagonal + diagonal**2,
+            self._right + diagonal * right,
+            self._cost + float(right @ right),
+        )
+        vars(system)["_before"] = self
+        return system
+
+    def best_step(self) -> Array:
+        """Compute the best step, shape (p,)."""
+        before = vars(self).get("_before")
+        step = self._refined_step(before) if before and is_well_conditioned(before._cholesky[0]) else None
+        if step is not None:
+            return step
+        return self.substitute() if is_well_conditioned(self._cholesky[0]) else super().best_step()
+
+    def _refined_step(self, before: DeterminedSystem) -> Array | None:
+        """Compute the best step from the decomposition without the last rows; None if they are too large.
+
+        With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at the solution
+        for A + E. A damping is mostly so small that it takes some steps only.
+        """
+        root, scale = before._cholesky
+        added, right = (self._diagonal - before._diagonal) / scale**2, self._right / scale
+        step, change = lapack.dpotrs(root, right)[0], np.inf
+        for _ in range(_MAX_REFINEMENTS):
+            last, step = step, lapack.dpotrs(root, right - added * step)[0]
+            last_change, change = change, euclidean_norm(step - last)
+            if change <= _REFINED * euclidean_norm(step):
+                return step / scale
+            if change > _MAX_RATIO * last_change:
+                break
+        return None
+
+    def substitute(self) -> Array:
+        """Compute the best step by back substitution, shape (p,)."""
+        root, scale = self._cholesky
+        return lapack.dtrtrs(root, self.z)[0] / scale
+
+
+def _inverse(root: Array) -> Array:
+    """Invert an upper triangular matrix in the order of Fortran. Products of parts are faster than LAPACK."""
+    half = len(root) // 2
+    if half < _SMALL:
+        return lapack.dtrtri(root)[0]
+    out = np.zeros_like(root)
+    out[:half, :half], out[half:, half:] = _inverse(root[:half, :half]), _inverse(root[half:, half:])
+    beside = blas.dtrmm(1.0, out[half:, half:], root[:half, half:], side=1)
+    out[:half, half:] = blas.dtrmm(-1.0, out[:half, :half], beside, overwrite_b=1)
+    return out

@@ -137,7 +137,7 @@ class PriorGroups:
 def effective_parameters(problem: Problem, solution: SolverResult) -> float:
     """Compute the effective number of parameters that the data determine (MacKay 1992)."""
     root = solution.system.sqrt_covariance(problem.weights)[0]
-    return root.shape[1] - float(np.einsum("ij,ij,i->", root, root, problem.weights**2))
+    return root.shape[1] - float(np.einsum("ij,ij->i", root, root) @ problem.weights**2)
 
 
 def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:

@@ -325,34 +325,35 @@ class StructuredRows:
         columns = np.concatenate([dense_columns, first + by_joint])
         return cls(dense, joint_rows, np.array([terms[i] for i in by_joint]), blocks, columns)
 
+    def take(self, index: Array) -> StructuredRows:
+        """Return the rows of some samples, given by a mask or an index."""
+        parts = (self.dense[..., index], self.joint_rows[..., index], self.terms[:, index])
+        return StructuredRows(*parts, self.blocks, self.columns)
+
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
-        c = len(self.dense)
-        out = np.empty((len(self.columns),) * 2)
-        # Views of the products by kind of column: dense, and coefficients.
-        flat, of_terms = self.dense.reshape(c, -1), out[c:, c:]
+        c, m, n = len(self.dense), self.dense.shape[-1], len(self.columns)
+        out, scaled = work_array("products", n, n), work_array("scaled columns", n, m)
+        flat = self.dense.reshape(c, -1)
         out[:c, :c] = flat @ flat.T
         for i, (joint, block) in enumerate(self.blocks):
-            beside = np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint]) @ self.terms[block].T
-            out[:c, c:][:, block], out[c:, :c][block] = beside, beside.T
-            for other_joint, other in self.blocks[: i + 1]:
-                common = np.einsum("km,km->m", self.joint_rows[joint], self.joint_rows[other_joint])
-                if other == block:
-                    weighted = self.terms[block] * np.sqrt(common)
-                    of_terms[block, block] = weighted @ weighted.T
-                    continue
-                part = (self.terms[block] * common) @ self.terms[other].T
-                of_terms[block, other], of_terms[other, block] = part, part.T
-        order = np.argsort(self.columns)
-        return out[np.ix_(order, order)]
+            terms, own = self.terms[block], slice(c + block.start, c + block.stop)
+            # All columns before those of this joint, times the motion of the joint.
+            np.einsum("ckm,km->cm", self.dense, self.joint_rows[joint], out=scaled[:c])
+            common = np.einsum("jkm,km->jm", self.joint_rows, self.joint_rows[joint])
+            for other_joint, other in self.blocks[:i]:
+                np.multiply(self.terms[other], common[other_joint], out=scaled[c:][other])
+            beside = scaled[: own.start] @ terms.T
+            out[: own.start, own], out[own, : own.start] = beside, beside.T
+            weighted = np.multiply(terms, np.sqrt(common[joint]), out=scaled[own])
+            out[own, own] = weighted @ weighted.T
+        return _reordered(out, np.argsort(self.columns))
 
     def covariances(self, covariance: Array) -> Array:
         """Compute the covariance of the rows of each sample that uncertain unknowns cause."""
-        c, dense = len(self.dense), self.dense[:-1]
-        dense_columns, coefficients = self.columns[: c - 1], self.columns[c:]
-        of_dense = covariance[np.ix_(dense_columns, dense_columns)]
-        beside = covariance[np.ix_(dense_columns, coefficients)]
-        of_terms = covariance[np.ix_(coefficients, coefficients)]
+        c, dense = len(self.dense) - 1, self.dense[:-1]
+        covariance = _reordered(covariance, np.delete(self.columns, c))
+        of_dense, beside, of_terms = covariance[:c, :c], covariance[:c, c:], covariance[c:, c:]
         out = np.einsum("ckm,clm->mkl", dense, np.tensordot(of_dense, dense, 1))
         for i, (joint, block) in enumerate(self.blocks):
             terms = self.terms[block]
@@ -364,6 +365,12 @@ class StructuredRows:
             product = np.einsum("km,lm->mkl", half, self.joint_rows[joint])
             out += product + product.swapaxes(1, 2)
         return out
+
+
+def _reordered(matrix: Array, order: Array) -> Array:
+    """Return a symmetric matrix with its rows and columns in another order."""
+    rows = np.take(matrix, order, 0, work_array("reordered rows", *matrix.shape), mode="clip")
+    return np.take(rows, order, 1, mode="clip")
 
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
@@ -429,9 +436,8 @@ def uses_normal_equations(problem: Problem) -> bool:
     They are accurate if all unknowns have priors. There are many transmission coefficients, and one
     configuration per row.
     """
-    n_coefficients = sum(parameter.coefficient_index is not None for parameter in problem.errors.parameters)
     return (
-        n_coefficients > MANY_COLUMNS
+        problem.errors.n_coefficients > MANY_COLUMNS
         and not problem.instrument_parameters
         and bool(problem.weights.all())
         and all(map(_is_structured, problem.data))
@@ -459,6 +465,26 @@ def normal_equations(problem: Problem, x: Array) -> NormalEquations:
 def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
     """Compute the inner products of a chunk; a module-level function can be sent to another process."""
     return linearization.structured_rows(chunk).products()
+
+
+def normal_equations_by_part(problem: Problem, x: Array, labels: Sequence[Array]) -> list[NormalEquations]:
+    """Compute the normal equations of the samples of each label 0, 1, …, given for each measurement, (m,)."""
+    of_chunks = [
+        label[start : start + CHUNK_SIZE] for label in labels for start in range(0, len(label), CHUNK_SIZE)
+    ]
+    count = max(int(label.max(initial=-1)) for label in labels) + 1
+    function = partial(_chunk_products_by_part, problem.linearize(x), count)
+    products = problem.executor.map(function, zip(problem.chunks, of_chunks, strict=True))
+    return [NormalEquations(reduce(np.add, parts)) for parts in zip(*products, strict=True)]
+
+
+def _chunk_products_by_part(
+    linearization: Linearization, count: int, labelled: tuple[Chunk, Array]
+) -> list[Array]:
+    """Compute the inner products of the samples of each label of a chunk."""
+    chunk, label = labelled
+    rows = linearization.structured_rows(chunk)
+    return [rows.take(np.flatnonzero(label == i)).products() for i in range(count)]
 
 
 def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:

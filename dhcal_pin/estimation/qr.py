@@ -161,7 +161,15 @@ class TriangularSystem:
         of shape (p,), or 0 [m and rad].
         """
         posterior = self.with_priors(weights, x)
-        return pseudo_inverse(posterior.r, posterior.z), posterior.min_cost
+        return posterior.best_step(), posterior.min_cost
+
+    def best_step(self) -> Array:
+        """Compute the best step δ, of minimum norm, shape (p,)."""
+        return pseudo_inverse(self.r, self.z)
+
+    def appended(self, diagonal: Array, right: Array) -> TriangularSystem:
+        """Append the rows diag(diagonal)·δ = right."""
+        return TriangularSystem(append_diagonal(self.rows[None], diagonal[None], right[None])[0])
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
         """Compute a square root of the covariance of data and priors together.
@@ -175,11 +183,11 @@ class TriangularSystem:
         if not len(weights):
             return np.empty((0, 0)), np.empty((0, 0))
         full = self.with_priors(weights, 0.0).r
-        if _is_well_conditioned(full):
+        if is_well_conditioned(full):
             return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
         # Unknowns of different units may alone cause the condition.
         scale = np.linalg.norm(full, axis=0)
-        if weights.all() and _is_well_conditioned(full / scale):
+        if weights.all() and is_well_conditioned(full / scale):
             return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
         _, s, vt = singular_value_decomposition(self.r)
         n_observable = int(np.sum(s > RANK_RTOL * s[0]))
@@ -195,6 +203,11 @@ class TriangularSystem:
         data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0] if n_observable else np.empty((0, 0))
         root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
         return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T
+
+    def covariance(self, weights: Array) -> Array:
+        """Compute the covariance of data and priors, on the directions that they determine, (p, p)."""
+        root = self.sqrt_covariance(weights)[0]
+        return root @ root.T
 
     def squared_error(self, step: Array) -> float:
         """Compute the cost after a step."""
@@ -251,12 +264,10 @@ def _merge_with(merged: Array | None, pending: Sequence[Array]) -> Array:
 
 def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> TriangularSystem:
     """Append the rows diag(diagonal)·δ = right to a system."""
-    if not diagonal.any():
-        return system
-    return TriangularSystem(append_diagonal(system.rows[None], diagonal[None], right[None])[0])
+    return system.appended(diagonal, right) if diagonal.any() else system
 
 
-def _is_well_conditioned(r: Array) -> bool:
+def is_well_conditioned(r: Array) -> bool:
     """Check that no singular value of R can be near the rank cut."""
     return bool(r.size) and lapack.dtrcon(r)[0] > WELL_CONDITIONED
 
@@ -267,10 +278,10 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     Singular values below RANK_RTOL times the largest count as zero.
     """
     # Back substitution takes a hundredth of the time of the singular value decomposition.
-    if _is_well_conditioned(r):
+    if is_well_conditioned(r):
         return lapack.dtrtrs(r, z)[0]
     # Unknowns of different units may alone cause the condition. None of them may count as zero.
     scale = np.linalg.norm(r, axis=0)
-    if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and _is_well_conditioned(r / scale):
+    if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and is_well_conditioned(r / scale):
         return lapack.dtrtrs(r / scale, z)[0] / scale
     return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]

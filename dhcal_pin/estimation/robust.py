@@ -41,6 +41,7 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement
 from . import qr
+from .normal_equations import NormalEquations
 from .priors import effective_parameters
 from .problem import (
     CHUNK_SIZE,
@@ -313,16 +314,16 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     covariance, I - H_i, as it pulls the fit towards itself. A rejected sample has more, I + H_i, as the fit
     is uncertain there.
     """
-    system = solution.system
-    if solution.converged:
+    system, model = solution.system, problem.linearize(solution.x)
+    if solution.converged and not isinstance(system, NormalEquations):
         # The system was linearized one step earlier, where other directions may be unobservable. With the
         # wide priors of frames and instruments its covariance would then not fit these rows.
         system = linear_system(problem, solution.x)
-    root = system.sqrt_covariance(problem.weights)[0]
-    model = problem.linearize(solution.x)
     if uses_normal_equations(problem):
-        chunks = problem.map_chunks(partial(_structured_covariance, model, root @ root.T))
+        covariance = system.covariance(problem.weights)
+        chunks = problem.map_chunks(partial(_structured_covariance, model, covariance))
     else:
+        root = system.sqrt_covariance(problem.weights)[0]
         chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
     out = []
     for item, weight in zip(problem.data, weights, strict=True):

@@ -50,7 +50,6 @@ from .qr import (
     TriangularSystem,
     append_rows,
     euclidean_norm,
-    pseudo_inverse,
     sum_of_squares,
 )
 from .solver_rules import has_diverged, step_is_negligible
@@ -104,7 +103,7 @@ def minimize(
 def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
     """Compute the least-squares step that stays within the bounds of a problem."""
     if problem.bounds is None:
-        return pseudo_inverse(system.r, system.z)
+        return system.best_step()
     # lazy import: scipy.optimize takes longer to import than most calibrations take.
     from scipy.optimize import lsq_linear
 
@@ -163,7 +162,7 @@ def gauss_newton(
     while iteration < max_iterations and not converged:
         data = linearize_and_factor(problem, x, small_angle=True)
         system = data.with_priors(problem.weights, x)
-        step = pseudo_inverse(system.r, system.z)
+        step = system.best_step()
         cost = system.min_cost + float(system.z @ system.z)
         change = euclidean_norm(system.residual_change(step))
         converged = step_is_negligible(change, math.sqrt(cost), 0.0, system.roundoff)

@@ -39,6 +39,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Chunk, Problem
+from ..estimation.qr import TriangularSystem
 
 # Distances l over which model errors are looked for, each half the one before [rad].
 LENGTHS = tuple(2.0**-i for i in range(-1, 6))
@@ -74,20 +75,24 @@ class ResidualCorrelation:
 
 
 def find_residual_correlation(
-    problem: Problem, x: Array, root: Array, noise: float, weights: Sequence[Array]
+    problem: Problem, x: Array, system: TriangularSystem, noise: float, weights: Sequence[Array]
 ) -> ResidualCorrelation:
-    """Test whether the residuals of neighbouring configurations are correlated."""
+    """Test whether the residuals of neighbouring configurations are correlated.
+
+    The system at x is that of the rows divided by the noise.
+    """
     linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
-    quadratic = np.zeros((len(LENGTHS), root.shape[1], root.shape[1]))
+    quadratic = np.zeros((len(LENGTHS), 1, 1))
     for item, w in zip(problem.data, weights, strict=True):
         chosen = np.flatnonzero(w > 0.5)
         if item.configurations_per_row != 1 or len(chosen) < 2:
             continue
         part = item.take(chosen[:: -(-len(chosen) // MAX_CONFIGURATIONS)])
-        n_residuals, n_columns = len(part.rows) * part.residual_dim, root.shape[1]
+        n_residuals, n_columns = len(part.rows) * part.residual_dim, len(x)
         effort = MAX_PRODUCTS * max(1.0, MORE_PRODUCTS * n_columns / n_residuals)
         if len(part.rows) * n_residuals * n_columns <= effort:
+            root = system.sqrt_covariance(problem.weights)[0]
             rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
             effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
         else:
@@ -98,7 +103,7 @@ def find_residual_correlation(
         excess += scores.excess
         variance += scores.variance
         if len(effect):
-            quadratic += scores.quadratic
+            quadratic = quadratic + scores.quadratic
     excess += np.trace(quadratic, axis1=1, axis2=2)
     variance += 2 * np.sum(quadratic * np.swapaxes(quadratic, 1, 2), (1, 2))
     is_known = variance > 0

@@ -151,6 +151,13 @@ class Conditions:
         pairs = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: values for name, values in pairs if values is not None}
 
+    def equals(self, other: Conditions) -> bool:
+        """Check whether the same conditions are known, with the same values."""
+        own, others = self._known, other._known
+        return own.keys() == others.keys() and all(
+            values is others[name] or np.array_equal(values, others[name]) for name, values in own.items()
+        )
+
     @property
     def names(self) -> frozenset[str]:
         """Names of the known conditions besides q."""

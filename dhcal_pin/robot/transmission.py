@@ -25,6 +25,7 @@ coefficients, e selected coefficients. Arrays of joint positions are (n, m) in t
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -37,6 +38,9 @@ from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER
 
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
+
+# Terms that each thread evaluated last, with what they depend on.
+_last_terms = threading.local()
 
 
 @dataclass(frozen=True)
@@ -200,7 +204,20 @@ class Transmission:
         return int(np.flatnonzero(self.joint_terms.any(1)).max(initial=-1)) + 1
 
     def terms(self, conditions: Conditions) -> Array:
-        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms."""
+        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms.
+
+        They do not depend on the coefficients. Each thread keeps those that it evaluated last.
+        """
+        last = vars(_last_terms)
+        is_same = last and last["loads"] is self.loads and last["order"] == self.order
+        if not is_same or not last["conditions"].equals(conditions):
+            last.update(
+                loads=self.loads, order=self.order, conditions=conditions, terms=self._terms(conditions)
+            )
+        return last["terms"]
+
+    def _terms(self, conditions: Conditions) -> Array:
+        """Evaluate the terms."""
         q = np.ascontiguousarray(conditions.q.T)
         first = 2 * self.order + 1
         out = np.empty((first + len(JOINT_TERMS) + len(LINK_TERMS), *q.shape))
@@ -208,6 +225,7 @@ class Transmission:
         fill_harmonics(q, out[1:first].reshape(self.order, 2, *q.shape))
         for row, term in zip(out[first:], (*JOINT_TERMS.values(), *LINK_TERMS.values()), strict=True):
             row[:] = term.evaluate(conditions, self.loads)
+        out.flags.writeable = False
         return out
 
     def errors(self, terms: Array) -> Array:

@@ -213,8 +213,20 @@ def _scale_motions(points: Array) -> Array:
 
 def inverse(information: Array) -> Array:
     """Return the inverse of a matrix of information, some directions of which may be undetermined."""
+    unit, scale = _with_unit_diagonal(information)
+    return np.linalg.inv(unit) / scale / scale[:, None]
+
+
+def solve_information(information: Array, right: Array) -> Array:
+    """Return the inverse of a matrix of information times a vector."""
+    unit, scale = _with_unit_diagonal(information)
+    return np.linalg.solve(unit, right / scale) / scale
+
+
+def _with_unit_diagonal(information: Array) -> tuple[Array, Array]:
+    """Scale a matrix of information to unit diagonal, and raise the diagonal for undetermined directions."""
     scale = np.sqrt(np.diag(information))
     scale[scale == 0] = 1.0
     unit = information / scale / scale[:, None]
     unit.flat[:: len(unit) + 1] += MIN_INFORMATION
-    return np.linalg.inv(unit) / scale / scale[:, None]
+    return unit, scale

@@ -34,7 +34,7 @@ from ..estimation.problem import Problem
 from ..measurements.base import Measurement
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
-from .linear_model import Layout, inverse, whitened_rows
+from .linear_model import Layout, inverse, solve_information, whitened_rows
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
@@ -125,7 +125,7 @@ class _Search:
     def __init__(
         self, problem: Problem, x: Array, timeline: Timeline, is_ordered: bool, n_samples: int, n_cells: int
     ):
-        """Prepare the samples in the order of measurement, and linearize the model at x."""
+        """Prepare the samples in the order of measurement, linearize the model at x and fit it."""
         self.n_cells = n_cells
         self.layout = Layout.of(problem)
         self.is_ordered = is_ordered
@@ -143,8 +143,9 @@ class _Search:
         self.groups = self._noise_groups()
         can_lag = is_ordered and sum(map(len, timeline.numbers)) <= MAX_PATH_SAMPLES
         self.paths = JointPaths(timeline) if can_lag else None
-        self.first_rows = self.linearize()
-        self.layout = self.layout.restricted_to(self.first_rows)
+        self.rows = self.linearize()
+        self.layout = self.layout.restricted_to(self.rows)
+        self.first_fit = self.solve(self.rows, [])
 
     def _noise_groups(self) -> Array:
         """Label the rows that have one noise, (N, k); -1 for rows that a kind does not have."""
@@ -201,22 +202,34 @@ class _Search:
         prior = np.concatenate([layout.weights, 1 / sizes])
         value = np.concatenate([self.x, held])
         is_row = self.groups >= 0
+        labels = [self.groups == label for label in range(self.groups.max() + 1)]
+        products = [part.T @ part for part in (columns[chosen] for chosen in labels)]
         noise, weights = np.ones(residual.shape), np.ones(len(rows))
+
+        def information_with(weights: Array) -> Array:
+            """Return the inner products of all rows; few samples have weights below 1."""
+            total = sum(
+                product / noise[chosen][0] ** 2
+                for product, chosen in zip(products, labels, strict=True)
+                if chosen.any()
+            )
+            is_low = weights < 1
+            return total - _information(
+                columns[is_low], np.sqrt(1 - weights[is_low])[:, None] / noise[is_low]
+            )
+
         after = residual
         step = covariance = np.zeros(0)
         freedom = 1.0
         for _ in range(N_PASSES):
-            scaled = np.sqrt(weights)[:, None] / noise
-            flat = (columns * scaled[..., None]).reshape(-1, columns.shape[-1])
-            right = (residual * scaled).ravel()
-            information = flat.T @ flat
+            information = information_with(weights)
             covariance = inverse(information + np.diag(prior**2))
-            step = covariance @ (flat.T @ right - prior**2 * value)
+            right = np.tensordot(residual * weights[:, None] / noise**2, columns, 2)
+            step = covariance @ (right - prior**2 * value)
             after = residual - columns @ step
             freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
-            for label in range(self.groups.max() + 1):
-                chosen = self.groups == label
+            for chosen in labels:
                 scale = 1.4826 * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
                 noise[chosen] = max(scale, MIN_NOISE)
             size = np.sqrt(np.sum((after / noise) ** 2 * is_row, 1) / is_row.sum(1))
@@ -229,24 +242,27 @@ class _Search:
         noise = np.maximum(noise * np.sqrt(variance), MIN_NOISE)
         out = rows / noise[..., None]
         out[..., -1] = after / noise
-        columns = columns / noise[..., None]
         equal, weighted = (
-            inverse(_information(columns, root) + np.diag(prior**2))
-            for root in (np.ones((len(rows), 1)), np.sqrt(weights)[:, None])
+            inverse(information_with(each) + np.diag(prior**2)) for each in (np.ones(len(rows)), weights)
         )
+        columns = columns / noise[..., None]
         score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
         return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
 
-    def iterate(self) -> LinearFit:
-        """Fit unknowns and causes until the steps are negligible."""
-        fit = self.solve(self.linearize(), self.causes)
+    def iterate(self, fit: LinearFit) -> LinearFit:
+        """Fit unknowns and causes until the steps are negligible, from a fit at their current values."""
         for _ in range(MAX_ITERATIONS):
             self._advance(fit)
             change = np.sqrt(np.mean((fit.columns @ fit.step) ** 2 * fit.weights[:, None]))
-            fit = self.solve(self.linearize(), self.causes)
+            fit = self._fit()
             if change < 0.05:
                 break
         return fit
+
+    def _fit(self) -> LinearFit:
+        """Fit unknowns and causes once, and keep the rows at their current values."""
+        self.rows = self.linearize()
+        return self.solve(self.rows, self.causes)
 
     def _advance(self, fit: LinearFit) -> None:
         """Move unknowns and causes by the step of a fit."""
@@ -385,11 +401,12 @@ class _Search:
     # ------------------------------------------------------------------------------------------- search
     def run(self) -> None:
         """Find all causes."""
-        fit = self.solve(self.first_rows, [])
+        fit = self.first_fit
         gross = self.best_cause(fit)
         if gross and gross.log_evidence > MIN_GROSS_EVIDENCE and self._effect(fit, gross) > MIN_GROSS_EFFECT:
             self._add(gross)
-        fit = self.iterate()
+            fit = self._fit()
+        fit = self.iterate(fit)
         while len(self.causes) < MAX_CAUSES:
             found = self.best_cause(fit)
             if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
@@ -397,8 +414,7 @@ class _Search:
             before = self.x, self.changes, [*self.causes], self.edges
             self._add(found)
             settled = self._settle()
-            rows = self.linearize()
-            judged = self._judge(rows, self.solve(rows, self.causes), len(self.causes) - 1)
+            judged = self._judge(self.rows, settled, len(self.causes) - 1)
             if judged.log_evidence >= MIN_LOG_EVIDENCE:
                 fit = settled
                 continue
@@ -426,11 +442,11 @@ class _Search:
 
     def _settle(self) -> LinearFit:
         """Fit, and move the steps to the samples where they fit best."""
-        fit = self.iterate()
+        fit = self.iterate(self._fit())
         for _ in range(MAX_MOVES):
             if not (self._move_steps(fit) or self._change_drifts(fit)):
                 break
-            fit = self.iterate()
+            fit = self.iterate(self._fit())
         return fit
 
     def _change_drifts(self, fit: LinearFit) -> bool:
@@ -442,7 +458,7 @@ class _Search:
             if not isinstance(old, Drift | FreeDrift):
                 continue
             others = [*self.causes[:i], *self.causes[i + 1 :]]
-            rows = self.linearize()
+            rows = self.linearize() if has_changed else self.rows
             simple, span = replace(cause, values=np.zeros(len(cause.block.sizes))), old.end - old.begin
             tried = [
                 replace(simple, shape=Drift(old.begin, old.end, ratio * span)) for ratio in FINE_CONSTANTS
@@ -475,11 +491,7 @@ class _Search:
         held = [np.zeros_like(cause.values) for cause in self.causes]
         self.changes = update(self.changes, self.causes, held, self._base(), self.layout.links)
 
-    def log_noise(self) -> float:
-        """Return the mean logarithm of the noise of the fit at the current unknowns."""
-        return self._log_noise(self.solve(self.linearize(), self.causes))
-
-    def _log_noise(self, fit: LinearFit) -> float:
+    def log_noise(self, fit: LinearFit) -> float:
         """Return the mean logarithm of the noise of a fit."""
         return float(np.mean(np.log(fit.noise[self.groups >= 0])))
 
@@ -682,7 +694,7 @@ def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[
 def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
     """Return the squared residuals with products `out`, for the fit of some columns to products `kept`."""
     matrix = kept[np.ix_(used, used)] + np.diag(prior[used] ** 2)
-    x = np.append(-inverse(matrix) @ kept[used, -1], 1.0)
+    x = np.append(-solve_information(matrix, kept[used, -1]), 1.0)
     chosen = np.append(used, len(kept) - 1)
     return float(x @ out[np.ix_(chosen, chosen)] @ x)
 
@@ -722,11 +734,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         _Search(problem, start, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
         for start in (np.zeros_like(x), x)
     ]
-    noises = [search.log_noise() for search in starts]
+    noises = [search.log_noise(search.first_fit) for search in starts]
     search = starts[int(np.argmin(noises))]
     search.run()
     # A search that ends in a wrong minimum says nothing.
-    if search.log_noise() > min(noises):
+    if search.log_noise(search.solve(search.linearize(), search.causes)) > min(noises):
         return nothing
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
@@ -758,7 +770,7 @@ def _scales(causes: Sequence[Cause]) -> Iterator[Scale]:
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:
     """Return whether a test of a part of the samples calls for a search."""
     screening = _Search(problem, x, timeline, is_ordered, MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS)
-    fit = screening.solve(screening.first_rows, [])
+    fit = screening.first_fit
     if np.mean(fit.weights < OUTLIER_WEIGHT) > MAX_SCREENED_OUTLIERS:
         return True
     found = screening.best_cause(fit)
@@ -770,4 +782,5 @@ def _cell_products(rows: Array, edges: Array) -> Array:
     if np.ptp(np.diff(edges)) == 0:
         cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
         return cells.swapaxes(1, 2) @ cells
-    return np.array([_information(rows[a:b], np.ones((b - a, 1))) for a, b in pairwise(edges)])
+    cells = (rows[a:b].reshape(-1, rows.shape[-1]) for a, b in pairwise(edges))
+    return np.array([cell.T @ cell for cell in cells])

@@ -13,8 +13,10 @@ import dhcal_pin.estimation.folds as folds
 import dhcal_pin.estimation.problem as problem_module
 from dhcal_pin import Chain, calibrate
 from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
+from dhcal_pin.estimation.folds import factor_partition
+from dhcal_pin.estimation.normal_equations import NormalEquations
 from dhcal_pin.estimation.problem import UnfactoredSystem, normal_equations, uses_normal_equations
-from dhcal_pin.estimation.qr import rank
+from dhcal_pin.estimation.qr import append_rows, rank
 from dhcal_pin.measurements import Noise, Pose, Position
 
 SETS = "minimal,base,tool,gain,coupling,compliance,harmonics,curves"
@@ -109,6 +111,33 @@ def test_each_member_agrees_with_the_triangular_system():
         root = reference.sqrt_covariance(w)[0]
         found = normal.predicted_variance(normal.sqrt_covariance(w)[0])
         assert found == pytest.approx(reference.predicted_variance(root), rel=1e-7)
+        difference = (normal.covariance(w) - reference.covariance(w)) / std / std[:, None]
+        assert np.abs(difference).max() < 1e-7
+        # A small damping refines the step without it, a large one needs a decomposition of its own.
+        for damping in (1e-8, 1e-2):
+            rows = damping**0.5 * np.linalg.norm(both[1].r, axis=0), rng.standard_normal(len(w))
+            damped = [append_rows(each, *rows) for each in both]
+            expected = damped[1].best_step()
+            np.testing.assert_allclose(damped[0].best_step() / std, expected / std, atol=1e-5)
+            assert damped[0].min_cost == pytest.approx(damped[1].min_cost, rel=1e-9)
+            assert damped[0].roundoff == pytest.approx(damped[1].roundoff, rel=1e-7)
+            sizes = np.linalg.norm(damped[1].rows, axis=0)
+            found, expected = (each.rows.T @ each.rows / sizes / sizes[:, None] for each in damped)
+            np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("m", [300, 2100])
+def test_folds_are_those_of_problems_with_some_of_the_samples(m):
+    """With one chunk of samples and with two, and samples in no fold."""
+    problem, x = curved_problem(m=m)
+    label = np.random.default_rng(0).integers(0, 3, m)
+    folds = [(label == 0,), (label == 1,)]
+    for fold, systems in zip(folds, factor_partition(problem, x, folds), strict=True):
+        for mask, found in ((fold[0], systems.held_out), (~fold[0], systems.fitted)):
+            expected = normal_equations(problem.with_data([problem.data[0].take(mask)]), x).products
+            assert isinstance(found, NormalEquations)
+            np.testing.assert_allclose(found.products, expected, atol=1e-9 * np.abs(expected).max())
+        assert systems.n_rows == 6 * fold[0].sum()
 
 
 def test_samples_that_determine_few_unknowns():

@@ -53,8 +53,7 @@ def fitted(seed: int, m: int, kind: type[Measurement] = Pose, size: float = 0.0)
 
 def correlation_of(fit: Result) -> ResidualCorrelation:
     """Return the correlation of the residuals of a fit."""
-    root = fit.solution.system.sqrt_covariance(fit.problem.weights)[0]
-    return find_residual_correlation(fit.problem, fit.solution.x, root, 1.0, fit.weights)
+    return find_residual_correlation(fit.problem, fit.solution.x, fit.solution.system, 1.0, fit.weights)
 
 
 def test_score_is_that_of_full_matrices():
@@ -121,8 +120,7 @@ def test_neighbours_with_opposite_residuals_are_significant(monkeypatch):
 def test_samples_without_neighbours_have_no_correlation():
     fit = fitted(0, 12)
     problem = fit.problem.with_data([fit.problem.data[0].take(np.s_[:1])])
-    root = np.zeros((len(fit.x), 1))
-    found = find_residual_correlation(problem, fit.solution.x, root, 1.0, [np.ones(1)])
+    found = find_residual_correlation(problem, fit.solution.x, fit.solution.system, 1.0, [np.ones(1)])
     assert found == ResidualCorrelation(0.0, 0.0)
 
 

@@ -445,3 +445,23 @@ def test_only_coefficients_of_sines_and_cosines_have_an_order():
     found = harmonic_orders(np.arange(n_coefficients(n, n)), n)
     np.testing.assert_array_equal(found[: len(wanted)], wanted)
     assert not found[len(wanted) :].any()
+
+
+def test_terms_are_those_of_the_given_conditions():
+    """They are kept from one call to the next, but not for other positions, temperatures, orders or loads."""
+    chain = ur10()
+    transmission, rng = Transmission.zero(chain.loads), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (5, 6))
+    first = transmission.terms(Conditions(q))
+    assert transmission.terms(Conditions(q.copy())) is first
+    changed = [
+        (transmission, Conditions(q + 1e-9)),
+        (transmission, Conditions(q[:4])),
+        (transmission, Conditions(q, temperature=np.full(5, 30.0))),
+        (replace(transmission, min_order=3), Conditions(q)),
+        (replace(transmission, loads=chain.with_payload(Payload(3.0)).loads), Conditions(q)),
+    ]
+    for other, conditions in changed:
+        found = other.terms(conditions)
+        np.testing.assert_array_equal(found, other._terms(conditions))
+        assert found.shape != first.shape or np.any(found != first)

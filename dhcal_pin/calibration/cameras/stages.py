@@ -105,7 +105,7 @@ def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
 def held_out_prediction_std(fit: Fit, folds: Sequence[Fold]) -> float:
     """Compute the error of images that the uncertainty of fits of the other images causes."""
     columns = np.ones(len(fit.solution.x), bool)
-    systems = factor_partition(fit.problem, fit.solution.x, folds)
+    systems = tuple(factor_partition(fit.problem, fit.solution.x, folds))
     variances = [system.prediction_std(fit.problem.weights, columns) ** 2 for system in systems]
     return float(np.sqrt(np.average(variances, weights=[system.n_rows for system in systems])))
 
