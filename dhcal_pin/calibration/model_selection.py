@@ -95,7 +95,7 @@ from .partition import (
     k_fold,
     region_partitions,
 )
-from .reweighting import Fit, reweight, with_sigma_scales
+from .reweighting import Fit, leverages, reweight, with_sigma_scales
 
 # Whitened residuals of exact data are smaller, as their standard deviations have a lower limit. They are
 # rounding errors, whose correlation says nothing about the model.
@@ -621,7 +621,7 @@ def extend(
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     groups = PriorGroups.none()
-    final = reweight(extended, (stage,), groups, max_iterations, progress, effective_parameters)
+    final = reweight(extended, (stage,), groups, max_iterations, progress, leverages)
     return final, extension
 
 

@@ -4,13 +4,14 @@ The least-squares problem depends on three sets of numbers that are not known be
 
 1. The standard deviations of residual groups whose instrument does not state them. Group g has a scale
 
-       s_g² = Σ_i w_i·‖r_gi‖² / (m_g·(1 - p/m)),
+       s_g² = Σ_i w_i·‖r_gi‖² / (m_g - p_g),
 
    with r_gi the residuals in units of the placeholder standard deviation, w_i robust weights, m_g the
-   weighted rows of the group, m those of all groups and p the number of parameters that the data determine:
-   the rank of the Jacobian for geometric errors alone, and the effective number of parameters (MacKay 1992)
-   for families of joint errors, many of which only their priors determine. This is a variance component
-   estimate (Helmert 1907; Foerstner 1979) that shares the loss of degrees of freedom equally among the rows.
+   weighted rows of the group and p_g the degrees of freedom that they lose. This is a variance component
+   estimate (Helmert 1907; Foerstner 1979). For geometric errors alone the rank of the Jacobian is shared
+   equally among the rows. For families of joint errors, many of which only their priors determine, p_g is the
+   sum of the leverages of the rows, if it is not negligible: a group that takes more parameters than its
+   share would otherwise be fitted more closely in each round.
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
    `estimation.robust`; loss "auto" starts from the samples that a majority agrees with, see
@@ -19,8 +20,8 @@ The least-squares problem depends on three sets of numbers that are not known be
    widths, and searched again at that solution until they stay the same.
 
 Each round estimates all three from the current solution and solves the problem again, starting from it.
-Early rounds solve loosely. The rounds end when none of the numbers changes by more than 1 % and the last
-solution was iterated to full convergence.
+Early rounds solve loosely. Once none of the numbers changes by more than 1 %, the problem is iterated to full
+convergence in each round, until that holds again.
 
 References:
     F. R. Helmert, Die Ausgleichungsrechnung nach der Methode der kleinsten Quadrate, Teubner 1907.
@@ -32,13 +33,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from .._typing import Array, Progress
 from ..estimation import qr, robust
-from ..estimation.priors import PriorGroups, update_prior_scales
+from ..estimation.priors import PriorGroups, effective_parameters, update_prior_scales
 from ..estimation.problem import Problem
 from ..estimation.robust import WeightChange, studentized_residuals
 from ..estimation.solver import SolverResult, minimize
@@ -59,8 +61,9 @@ CHANGE_TOL = 0.01
 # Replaces the weight 0 of a parameter without a prior, to avoid a division by zero.
 MIN_WEIGHT = 1e-300
 
-# Function that returns the number of parameters that the data of a solved problem determine.
-CountDetermined = Callable[[Problem, SolverResult], float]
+# Function that returns the degrees of freedom (g,) that residual groups lose in a solved problem. The third
+# argument computes the covariances of its predictions, the last one has the rows of each group, shape (g,).
+LostFreedom = Callable[[Problem, SolverResult, Callable[[], list[Array]], Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +119,27 @@ class ReweightState:
     is_done: bool = False  # Whether all numbers have settled
 
 
-def observable_directions(problem: Problem, solution: SolverResult) -> float:
-    """Return the number of directions of parameter space that the data determine."""
-    return qr.rank(solution.system.r)
+def shared_rank(
+    problem: Problem, solution: SolverResult, predicted: Callable[[], list[Array]], n_rows: Array
+) -> Array:
+    """Share the number of directions of parameter space that the data determine among all rows."""
+    return qr.rank(solution.system.r) * n_rows / n_rows.sum()
+
+
+def leverages(
+    problem: Problem, solution: SolverResult, predicted: Callable[[], list[Array]], n_rows: Array
+) -> Array:
+    """Sum the leverages of the rows of each group, or share the sum among all rows if it is negligible."""
+    total = effective_parameters(problem, solution)
+    if total < robust.NEGLIGIBLE_LEVERAGE * n_rows.sum():
+        return total * n_rows / n_rows.sum()
+    return np.array(
+        [
+            np.einsum("mkk->", covariances[:, group.rows, group.rows])
+            for item, covariances in zip(problem.data, predicted(), strict=True)
+            for group in item.residual_groups.values()
+        ]
+    )
 
 
 def reweight(
@@ -127,7 +148,7 @@ def reweight(
     groups: PriorGroups,
     max_iterations: int,
     progress: Progress | None,
-    count_determined: CountDetermined = observable_directions,
+    lost_freedom: LostFreedom = shared_rank,
 ) -> Fit:
     """Solve a problem again until noise scales, prior widths and robust weights have settled."""
     expected = fit.problem.weights
@@ -136,7 +157,7 @@ def reweight(
         if progress:
             progress(PHASE, MAX_ROUNDS - rounds_left, MAX_ROUNDS)
         is_last = rounds_left <= 1
-        state = _next_round(state, groups, expected, max_iterations, count_determined, is_last)
+        state = _next_round(state, groups, expected, max_iterations, lost_freedom, is_last)
         if state.is_done:
             break
     return replace(state.fit, stage=state.stages[-1])
@@ -147,13 +168,15 @@ def _next_round(
     groups: PriorGroups,
     expected: Array,
     max_iterations: int,
-    count_determined: CountDetermined,
+    lost_freedom: LostFreedom,
     is_last: bool,
 ) -> ReweightState:
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
     fit, stage = state.fit, state.stages[0]
     problem, solution, weights, change = fit.problem, fit.solution, fit.weights, WeightChange(0.0)
-    scales = estimate_variance_components(problem, solution, fit.data, weights, count_determined)
+    predicted = cache(partial(robust.prediction_covariances, problem, solution))
+    lost = partial(lost_freedom, problem, solution, predicted)
+    scales = estimate_variance_components(problem, solution, fit.data, weights, lost)
     weighted = with_sigma_scales(fit.data, scales)
     if stage == robust.TRIMMED:
         found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
@@ -164,7 +187,7 @@ def _next_round(
         next_search = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
         state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
-        residuals = studentized_residuals(problem, solution, weighted, weights)
+        residuals = studentized_residuals(problem, solution, weighted, weights, predicted)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
         weights = [
             robust.reject_groups(w, t, item) for w, t, item in zip(weights, residuals, fit.data, strict=True)
@@ -181,7 +204,7 @@ def _next_round(
         return replace(state, stages=state.stages[1:], weight_change=WeightChange())
     if has_settled and state.is_final:
         return replace(state, is_done=True)
-    is_final = has_settled or is_last
+    is_final = has_settled or is_last or state.is_final
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
         # The rows are the same: continue the previous iteration with the new priors.
         problem = problem.with_prior_weights(priors)
@@ -200,7 +223,7 @@ def estimate_variance_components(
     solution: SolverResult,
     data: tuple[Measurement, ...],
     weights: Sequence[Array],
-    count_determined: CountDetermined,
+    lost_freedom: Callable[[Array], Array],
 ) -> Array:
     """Estimate one noise scale per residual group from the residuals of a fit.
 
@@ -218,40 +241,41 @@ def estimate_variance_components(
         )
         for item in data
     ]
-    counts = [w.sum() for w in weights]
-    n_determined = count_determined(problem, solution)
-    freedom = 1 - n_determined / sum(len(r) * count for r, count in zip(residuals, counts, strict=True))
-    groups = [
-        _ResidualGroup(
-            group.unit,
-            item.has_stated_sigma,
-            len(r[group.rows]) * count,
-            np.sum(r[group.rows] ** 2 * w),
-        )
-        for item, r, w, count in zip(data, residuals, weights, counts, strict=True)
+    each = [
+        (group.unit, item.has_stated_sigma, len(r[group.rows]) * w.sum(), np.sum(r[group.rows] ** 2 * w))
+        for item, r, w in zip(data, residuals, weights, strict=True)
         for group in item.residual_groups.values()
     ]
+    lost = lost_freedom(np.array([n_rows for _, _, n_rows, _ in each]))
+    groups = [_ResidualGroup(*values, n_lost) for values, n_lost in zip(each, lost.tolist(), strict=True)]
+    n_determined = lost.sum()
     scales = np.ones(len(groups))
-    for i, group in enumerate(groups if freedom > 0 else ()):
+    for i, group in enumerate(groups if n_determined < sum(group.n_rows for group in groups) else ()):
         same_unit = [other for other in groups if other.unit == group.unit]
         pooled = [other for other in same_unit if not other.is_stated]
-        n_rows, squares, is_stated = group.n_rows, group.squares, group.is_stated
-        if n_rows <= n_determined and len(same_unit) > 1:
-            n_rows = sum(other.n_rows for other in pooled)
+        freedom, squares, is_stated = group.freedom, group.squares, group.is_stated
+        if group.n_rows <= n_determined and len(same_unit) > 1:
+            freedom = sum(other.freedom for other in pooled)
             squares = sum(other.squares for other in pooled)
             is_stated = is_stated or len(pooled) == 1
         if not is_stated:
-            scales[i] = max(float(np.sqrt(squares / (n_rows * freedom))), MIN_SIGMA_SCALE)
+            scales[i] = max(float(np.sqrt(squares / freedom)), MIN_SIGMA_SCALE)
     return scales
 
 
 class _ResidualGroup(NamedTuple):
-    """Residual group of one measurement: unit, weighted number of rows and sum of their squares."""
+    """Residual group of one measurement: its weighted number of rows, sum of squares and lost freedom."""
 
     unit: str
     is_stated: bool
     n_rows: float
     squares: float
+    n_lost: float
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the residuals."""
+        return self.n_rows - self.n_lost
 
 
 def with_sigma_scales(data: tuple[Measurement, ...], scales: Array) -> tuple[Measurement, ...]:

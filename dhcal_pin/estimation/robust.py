@@ -266,9 +266,16 @@ def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> Weight
 
 
 def studentized_residuals(
-    problem: Problem, solution: SolverResult, data: Sequence[Measurement], weights: Sequence[Array]
+    problem: Problem,
+    solution: SolverResult,
+    data: Sequence[Measurement],
+    weights: Sequence[Array],
+    predicted: Callable[[], list[Array]] | None = None,
 ) -> list[Array]:
-    """Compute standardized residuals that are corrected for leverage."""
+    """Compute standardized residuals that are corrected for leverage.
+
+    `predicted` returns the result of `prediction_covariances`, where the caller needs it, too.
+    """
     n_rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
     n_unknowns = len(solution.x)
     if problem.temperature > 1:
@@ -289,7 +296,7 @@ def studentized_residuals(
         for item, w in zip(data, weights, strict=True)
     ]
     covariances = (
-        residual_covariances(problem, solution, weights)
+        residual_covariances(predicted() if predicted else prediction_covariances(problem, solution), weights)
         if n_unknowns >= NEGLIGIBLE_LEVERAGE * n_rows
         else [None] * len(data)
     )
@@ -306,13 +313,25 @@ def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:
         yield next(results)
 
 
-def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequence[Array]) -> list[Array]:
+def residual_covariances(predicted: Sequence[Array], weights: Sequence[Array]) -> list[Array]:
     """Compute the covariance of each sample's whitened residual in a fit of good samples.
 
-    With the whitened Jacobian J_i of sample i, its weight w_i, the covariance C of the unknowns and
-    H_i = J_i·C·J_iᵀ, the covariance is I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit
-    covariance, I - H_i, as it pulls the fit towards itself. A rejected sample has more, I + H_i, as the fit
-    is uncertain there.
+    With the weight w_i of sample i and H_i = J_i·C·J_iᵀ from `prediction_covariances`, the covariance is
+    I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit covariance, I - H_i, as it pulls the fit
+    towards itself. A rejected sample has more, I + H_i, as the fit is uncertain there.
+    """
+    out = []
+    for covariances, weight in zip(predicted, weights, strict=True):
+        w = weight[:, None, None]
+        out.append(np.eye(covariances.shape[1]) + (1 - 2 * w) * covariances / w)
+    return out
+
+
+def prediction_covariances(problem: Problem, solution: SolverResult) -> list[Array]:
+    """Compute w_i·H_i, shape (m, k, k), of the samples of each measurement: the uncertainty of the fit there.
+
+    With the whitened Jacobian J_i of sample i, without its weight w_i, and the covariance C of the unknowns,
+    H_i = J_i·C·J_iᵀ. The diagonal of w_i·H_i has the leverages of the rows of the problem.
     """
     system, model = solution.system, problem.linearize(solution.x)
     if solution.converged and not isinstance(system, NormalEquations):
@@ -325,13 +344,10 @@ def residual_covariances(problem: Problem, solution: SolverResult, weights: Sequ
     else:
         root = system.sqrt_covariance(problem.weights)[0]
         chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
-    out = []
-    for item, weight in zip(problem.data, weights, strict=True):
-        parts = [np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)]
-        # The rows of the problem are scaled by √w, so that the parts are w·H.
-        w = weight[:, None, None]
-        out.append(np.eye(item.residual_dim) + (1 - 2 * w) * np.concatenate(parts) / w)
-    return out
+    return [
+        np.concatenate([np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)])
+        for item in problem.data
+    ]
 
 
 def _prediction_covariance(linearization: Linearization, root: Array, chunk: Chunk) -> Array:

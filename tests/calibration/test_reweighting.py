@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from dhcal_pin.calibration import calibrate, reweighting
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.priors import effective_parameters
+from dhcal_pin.estimation.robust import prediction_covariances
 from dhcal_pin.measurements import Noise, PointContact, PointDistance, Pose
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
@@ -68,3 +73,47 @@ def test_stated_standard_deviations_are_kept(sim_6dof, sim_6dof_actual):
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (50, 6)), Noise(2e-2, 5e-5), rng)
     (used,) = calibrate(sim_6dof, data, "dh").problem.data
     np.testing.assert_array_equal(used.sigma, data.sigma)
+
+
+def test_leverages_are_those_of_the_orthogonal_projection(sim_6dof, sim_6dof_actual):
+    """Positions and rotations lose different numbers of degrees of freedom, effective parameters in sum."""
+    rng = np.random.default_rng(1)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-2.5, 2.5, (15, 6)), Noise(1e-4, 1e-4), rng)
+    fit = calibrate(sim_6dof, data, "dh,harmonics")
+    problem, solution = fit.problem, fit.solution
+    rows = problem.linearize(solution.x).rows(problem.chunks[0])[:-1].reshape(len(solution.x), -1).T
+    basis = np.linalg.qr(np.concatenate([rows, np.diag(problem.weights)]))[0][:90]
+    wanted = np.sum(basis.reshape(2, 45, -1) ** 2, (1, 2))
+    predicted = partial(prediction_covariances, problem, solution)
+    found = reweighting.leverages(problem, solution, predicted, np.array([45.0, 45.0]))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    assert found.sum() == pytest.approx(effective_parameters(problem, solution), rel=1e-6)
+    many = reweighting.leverages(problem, solution, predicted, np.array([1e6, 3e6]))
+    np.testing.assert_allclose(many, found.sum() * np.array([0.25, 0.75]), rtol=1e-6)
+
+
+def test_noise_of_each_group_has_no_bias_with_families_of_joint_errors(sim_6dof, sim_6dof_actual):
+    """20 poses and up to 84 parameters; an equal share would bias positions by 12 and rotations by -17 %."""
+    harmonics, ratios = select_parameters(sim_6dof_actual, "harmonics"), []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        truth = harmonics.at(harmonics.priors * rng.standard_normal(len(harmonics.parameters)))
+        data = Pose.simulate(truth, rng.uniform(-2.5, 2.5, (20, 6)), Noise(1e-4, 1e-4), rng)
+        fit = calibrate(sim_6dof, Pose(data.q, data.poses), "dh", extend=["harmonics"])
+        (used,) = fit.problem.data
+        ratios.append(np.log([np.median(used.sigma) / 1e-4, np.median(used.rotation_sigma) / 1e-4]))
+    np.testing.assert_allclose(np.mean(ratios, 0), 0.0, atol=0.1)
+
+
+def test_noise_of_one_group_does_not_vanish_with_many_coefficients(sim_6dof, sim_6dof_actual):
+    """30 poses and hundreds of coefficients; with an equal share rotations were fitted exactly."""
+    families = ("harmonics", "curves", "fine-curves")
+    errors = select_parameters(sim_6dof_actual, ",".join(families))
+    rng = np.random.default_rng(0)
+    truth = errors.at(errors.priors * rng.standard_normal(len(errors.parameters)))
+    data = Pose.simulate(truth, rng.uniform(-2.5, 2.5, (30, 6)), Noise(1e-4, 1e-4), rng)
+    fit = calibrate(sim_6dof, Pose(data.q, data.poses), "dh", extend=families)
+    (used,) = fit.problem.data
+    assert len(fit.x) > 200
+    for sigma in used.sigma, used.rotation_sigma:
+        assert 0.1 < np.median(sigma) / 1e-4 < 10
