@@ -147,7 +147,8 @@ class FittedModel:
     def studentized_residuals(self) -> tuple[Array, ...]:
         """Studentized residual of each fitted sample, one array of shape (m,) per measurement."""
         data = [item.with_weights(1 / w) for item, w in zip(self.problem.data, self.weights, strict=True)]
-        return tuple(robust.studentized_residuals(self.problem, self.solution, data, self.weights))
+        solved = robust.SolvedProblem(self.problem, self.solution)
+        return tuple(robust.studentized_residuals(solved, data, self.weights))
 
     @cached_property
     def is_counted(self) -> tuple[Array, ...]:

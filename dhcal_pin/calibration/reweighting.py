@@ -33,7 +33,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +41,7 @@ from .._typing import Array, Progress
 from ..estimation import qr, robust
 from ..estimation.priors import PriorGroups, effective_parameters, update_prior_scales
 from ..estimation.problem import Problem
-from ..estimation.robust import WeightChange, studentized_residuals
+from ..estimation.robust import SolvedProblem, WeightChange, studentized_residuals
 from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from .good_samples import find_good_samples
@@ -61,9 +60,8 @@ CHANGE_TOL = 0.01
 # Replaces the weight 0 of a parameter without a prior, to avoid a division by zero.
 MIN_WEIGHT = 1e-300
 
-# Function that returns the degrees of freedom (g,) that residual groups lose in a solved problem. The third
-# argument computes the covariances of its predictions, the last one has the rows of each group, shape (g,).
-LostFreedom = Callable[[Problem, SolverResult, Callable[[], list[Array]], Array], Array]
+# Function that returns the degrees of freedom (g,) that residual groups of n_rows (g,) rows lose.
+LostFreedom = Callable[[SolvedProblem, Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,24 +117,20 @@ class ReweightState:
     is_done: bool = False  # Whether all numbers have settled
 
 
-def shared_rank(
-    problem: Problem, solution: SolverResult, predicted: Callable[[], list[Array]], n_rows: Array
-) -> Array:
+def shared_rank(solved: SolvedProblem, n_rows: Array) -> Array:
     """Share the number of directions of parameter space that the data determine among all rows."""
-    return qr.rank(solution.system.r) * n_rows / n_rows.sum()
+    return qr.rank(solved.solution.system.r) * n_rows / n_rows.sum()
 
 
-def leverages(
-    problem: Problem, solution: SolverResult, predicted: Callable[[], list[Array]], n_rows: Array
-) -> Array:
+def leverages(solved: SolvedProblem, n_rows: Array) -> Array:
     """Sum the leverages of the rows of each group, or share the sum among all rows if it is negligible."""
-    total = effective_parameters(problem, solution)
+    total = effective_parameters(solved.problem, solved.solution)
     if total < robust.NEGLIGIBLE_LEVERAGE * n_rows.sum():
         return total * n_rows / n_rows.sum()
     return np.array(
         [
             np.einsum("mkk->", covariances[:, group.rows, group.rows])
-            for item, covariances in zip(problem.data, predicted(), strict=True)
+            for item, covariances in zip(solved.problem.data, solved.prediction_covariances, strict=True)
             for group in item.residual_groups.values()
         ]
     )
@@ -174,9 +168,8 @@ def _next_round(
     """Estimate scales, priors and weights from the current solution, and solve again if they changed."""
     fit, stage = state.fit, state.stages[0]
     problem, solution, weights, change = fit.problem, fit.solution, fit.weights, WeightChange(0.0)
-    predicted = cache(partial(robust.prediction_covariances, problem, solution))
-    lost = partial(lost_freedom, problem, solution, predicted)
-    scales = estimate_variance_components(problem, solution, fit.data, weights, lost)
+    solved = SolvedProblem(problem, solution)
+    scales = estimate_variance_components(solved, fit.data, weights, lost_freedom)
     weighted = with_sigma_scales(fit.data, scales)
     if stage == robust.TRIMMED:
         found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
@@ -187,7 +180,7 @@ def _next_round(
         next_search = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
         state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
-        residuals = studentized_residuals(problem, solution, weighted, weights, predicted)
+        residuals = studentized_residuals(solved, weighted, weights)
         weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
         weights = [
             robust.reject_groups(w, t, item) for w, t, item in zip(weights, residuals, fit.data, strict=True)
@@ -199,31 +192,34 @@ def _next_round(
         start, priors = np.zeros_like(start) if fit.start is None else fit.start, expected
     relative = np.log(scales / state.scales), (priors - problem.weights) / np.fmax(expected, MIN_WEIGHT)
     has_settled = max(change.size, *(np.abs(each).max(initial=0.0) for each in relative)) < CHANGE_TOL
-    state = replace(state, fit=replace(fit, weights=tuple(weights)), weight_change=change)
-    if has_settled and len(state.stages) > 1:
-        return replace(state, stages=state.stages[1:], weight_change=WeightChange())
-    if has_settled and state.is_final:
-        return replace(state, is_done=True)
+    if has_settled and (state.is_final or len(state.stages) > 1):
+        fit = replace(fit, weights=tuple(weights))
+        if len(state.stages) > 1:
+            return replace(state, fit=fit, stages=state.stages[1:], weight_change=WeightChange())
+        return replace(state, fit=fit, weight_change=change, is_done=True)
     is_final = has_settled or is_last or state.is_final
     if has_settled or all(new is old for new, old in zip(weighted, problem.data, strict=True)):
         # The rows are the same: continue the previous iteration with the new priors.
         problem = problem.with_prior_weights(priors)
-        warm_start, previous_iterations = solution, fit.previous_iterations
+        warm_start, previous_iterations, scales = solution, fit.previous_iterations, state.scales
     else:
         problem = problem.with_data(weighted).with_prior_weights(priors)
         warm_start, previous_iterations = None, fit.iterations
-        state = replace(state, scales=scales)
-    solution = minimize(problem, "lm", start, max_iterations, warm_start=warm_start, loose=not is_final)
-    fit = replace(state.fit, problem=problem, solution=solution, previous_iterations=previous_iterations)
-    return replace(state, fit=fit, is_final=is_final)
+    fit = replace(
+        fit,
+        problem=problem,
+        solution=minimize(problem, "lm", start, max_iterations, warm_start=warm_start, loose=not is_final),
+        weights=tuple(weights),
+        previous_iterations=previous_iterations,
+    )
+    return replace(state, fit=fit, scales=scales, weight_change=change, is_final=is_final)
 
 
 def estimate_variance_components(
-    problem: Problem,
-    solution: SolverResult,
+    solved: SolvedProblem,
     data: tuple[Measurement, ...],
     weights: Sequence[Array],
-    lost_freedom: Callable[[Array], Array],
+    lost_freedom: LostFreedom,
 ) -> Array:
     """Estimate one noise scale per residual group from the residuals of a fit.
 
@@ -234,6 +230,7 @@ def estimate_variance_components(
     """
     if all(item.has_stated_sigma for item in data):
         return np.ones(sum(len(item.residual_groups) for item in data))
+    problem, solution = solved.problem, solved.solution
     chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
     residuals = [
         item.residual(
@@ -246,7 +243,7 @@ def estimate_variance_components(
         for item, r, w in zip(data, residuals, weights, strict=True)
         for group in item.residual_groups.values()
     ]
-    lost = lost_freedom(np.array([n_rows for _, _, n_rows, _ in each]))
+    lost = lost_freedom(solved, np.array([n_rows for _, _, n_rows, _ in each]))
     groups = [_ResidualGroup(*values, n_lost) for values, n_lost in zip(each, lost.tolist(), strict=True)]
     n_determined = lost.sum()
     scales = np.ones(len(groups))

@@ -43,6 +43,8 @@ MIN_PRIOR_STD, MAX_PRIOR_STD = 1e-12, 1e6
 
 # Number of determined parameters that the expected standard deviation counts for against smaller errors.
 EXPECTATION_COUNT = 0.5
+# Smallest positive number.
+_SMALLEST = np.finfo(float).tiny
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:
@@ -152,8 +154,7 @@ def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorG
     squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2
     count = np.bincount(group_index, determined)
     extra = np.where(squares <= count, groups.expectation_counts, 0.0)
-    smallest = np.finfo(float).tiny
-    updated = expected * np.sqrt(np.fmax(count + extra, smallest) / np.fmax(squares + extra, smallest))
-    updated = np.clip(updated, groups.min_weights, groups.max_weights)
+    updated = expected * np.sqrt(np.fmax(count + extra, _SMALLEST) / np.fmax(squares + extra, _SMALLEST))
+    updated = np.fmin(np.fmax(updated, groups.min_weights), groups.max_weights)
     weights[members] = updated[group_index]
     return weights

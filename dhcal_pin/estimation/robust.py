@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -265,17 +265,43 @@ def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> Weight
     return WeightChange(max(float(np.abs(step).max(initial=0.0)) for step in steps), steps)
 
 
-def studentized_residuals(
-    problem: Problem,
-    solution: SolverResult,
-    data: Sequence[Measurement],
-    weights: Sequence[Array],
-    predicted: Callable[[], list[Array]] | None = None,
-) -> list[Array]:
-    """Compute standardized residuals that are corrected for leverage.
+@dataclass(frozen=True, eq=False)
+class SolvedProblem:
+    """Problem with its solution, and the uncertainty of its predictions."""
 
-    `predicted` returns the result of `prediction_covariances`, where the caller needs it, too.
-    """
+    problem: Problem
+    solution: SolverResult
+
+    @cached_property
+    def prediction_covariances(self) -> list[Array]:
+        """w_i·H_i, shape (m, k, k), of the samples of each measurement: the uncertainty of the fit there.
+
+        With the whitened Jacobian J_i of sample i, without its weight w_i, and the covariance C of the
+        unknowns, H_i = J_i·C·J_iᵀ. The diagonal of w_i·H_i has the leverages of the rows of the problem.
+        """
+        problem, solution = self.problem, self.solution
+        system, model = solution.system, problem.linearize(solution.x)
+        if solution.converged and not isinstance(system, NormalEquations):
+            # The system was linearized one step earlier, where other directions may be unobservable. With the
+            # wide priors of frames and instruments its covariance would then not fit these rows.
+            system = linear_system(problem, solution.x)
+        if uses_normal_equations(problem):
+            covariance = system.covariance(problem.weights)
+            chunks = problem.map_chunks(partial(_structured_covariance, model, covariance))
+        else:
+            root = system.sqrt_covariance(problem.weights)[0]
+            chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
+        return [
+            np.concatenate([np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)])
+            for item in problem.data
+        ]
+
+
+def studentized_residuals(
+    solved: SolvedProblem, data: Sequence[Measurement], weights: Sequence[Array]
+) -> list[Array]:
+    """Compute standardized residuals that are corrected for leverage."""
+    problem, solution = solved.problem, solved.solution
     n_rows = sum(np.count_nonzero(w > 0.5) * item.residual_dim for item, w in zip(data, weights, strict=True))
     n_unknowns = len(solution.x)
     if problem.temperature > 1:
@@ -296,7 +322,7 @@ def studentized_residuals(
         for item, w in zip(data, weights, strict=True)
     ]
     covariances = (
-        residual_covariances(predicted() if predicted else prediction_covariances(problem, solution), weights)
+        residual_covariances(solved.prediction_covariances, weights)
         if n_unknowns >= NEGLIGIBLE_LEVERAGE * n_rows
         else [None] * len(data)
     )
@@ -313,41 +339,18 @@ def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:
         yield next(results)
 
 
-def residual_covariances(predicted: Sequence[Array], weights: Sequence[Array]) -> list[Array]:
+def residual_covariances(predictions: Sequence[Array], weights: Sequence[Array]) -> list[Array]:
     """Compute the covariance of each sample's whitened residual in a fit of good samples.
 
-    With the weight w_i of sample i and H_i = J_i·C·J_iᵀ from `prediction_covariances`, the covariance is
+    With the weight w_i of sample i and H_i = J_i·C·J_iᵀ of the predictions, the covariance is
     I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit covariance, I - H_i, as it pulls the fit
     towards itself. A rejected sample has more, I + H_i, as the fit is uncertain there.
     """
     out = []
-    for covariances, weight in zip(predicted, weights, strict=True):
+    for covariances, weight in zip(predictions, weights, strict=True):
         w = weight[:, None, None]
         out.append(np.eye(covariances.shape[1]) + (1 - 2 * w) * covariances / w)
     return out
-
-
-def prediction_covariances(problem: Problem, solution: SolverResult) -> list[Array]:
-    """Compute w_i·H_i, shape (m, k, k), of the samples of each measurement: the uncertainty of the fit there.
-
-    With the whitened Jacobian J_i of sample i, without its weight w_i, and the covariance C of the unknowns,
-    H_i = J_i·C·J_iᵀ. The diagonal of w_i·H_i has the leverages of the rows of the problem.
-    """
-    system, model = solution.system, problem.linearize(solution.x)
-    if solution.converged and not isinstance(system, NormalEquations):
-        # The system was linearized one step earlier, where other directions may be unobservable. With the
-        # wide priors of frames and instruments its covariance would then not fit these rows.
-        system = linear_system(problem, solution.x)
-    if uses_normal_equations(problem):
-        covariance = system.covariance(problem.weights)
-        chunks = problem.map_chunks(partial(_structured_covariance, model, covariance))
-    else:
-        root = system.sqrt_covariance(problem.weights)[0]
-        chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
-    return [
-        np.concatenate([np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)])
-        for item in problem.data
-    ]
 
 
 def _prediction_covariance(linearization: Linearization, root: Array, chunk: Chunk) -> Array:

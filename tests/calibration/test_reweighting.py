@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 from dhcal_pin.calibration import calibrate, reweighting
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.priors import effective_parameters
-from dhcal_pin.estimation.robust import prediction_covariances
+from dhcal_pin.estimation.robust import SolvedProblem
 from dhcal_pin.measurements import Noise, PointContact, PointDistance, Pose
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
@@ -84,11 +82,11 @@ def test_leverages_are_those_of_the_orthogonal_projection(sim_6dof, sim_6dof_act
     rows = problem.linearize(solution.x).rows(problem.chunks[0])[:-1].reshape(len(solution.x), -1).T
     basis = np.linalg.qr(np.concatenate([rows, np.diag(problem.weights)]))[0][:90]
     wanted = np.sum(basis.reshape(2, 45, -1) ** 2, (1, 2))
-    predicted = partial(prediction_covariances, problem, solution)
-    found = reweighting.leverages(problem, solution, predicted, np.array([45.0, 45.0]))
+    solved = SolvedProblem(problem, solution)
+    found = reweighting.leverages(solved, np.array([45.0, 45.0]))
     np.testing.assert_allclose(found, wanted, rtol=1e-6)
     assert found.sum() == pytest.approx(effective_parameters(problem, solution), rel=1e-6)
-    many = reweighting.leverages(problem, solution, predicted, np.array([1e6, 3e6]))
+    many = reweighting.leverages(solved, np.array([1e6, 3e6]))
     np.testing.assert_allclose(many, found.sum() * np.array([0.25, 0.75]), rtol=1e-6)
 
 

@@ -16,9 +16,9 @@ from dhcal_pin.estimation.robust import (
     TRIMMED,
     WEIGHT_FUNCTIONS,
     ZERO_WEIGHT,
+    SolvedProblem,
     WeightChange,
     is_chi_square,
-    prediction_covariances,
     reject_groups,
     residual_covariances,
     standardized_residuals,
@@ -145,7 +145,8 @@ def test_residual_covariances_agree_with_many_draws(sim_6dof, sim_6dof_actual):
     fit = calibrate(sim_6dof, Position(q, exact.values, np.full((14, 3), 1e-4)), "dh", priors="none")
     problem = fit.problem.with_data([fit.problem.data[0].with_weights(weights)])
     solution = replace(fit.solution, system=linearize_and_factor(problem, fit.x, small_angle=False))
-    expected = residual_covariances(prediction_covariances(problem, solution), [weights])[0]
+    predictions = SolvedProblem(problem, solution).prediction_covariances
+    expected = residual_covariances(predictions, [weights])[0]
     # Residuals of NumPy's linear least squares on the same rows, over many draws of noise.
     rows = problem.linearize(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(42, -1)
     noise = np.random.default_rng(1).normal(size=(42, 20000))
@@ -198,7 +199,7 @@ def test_leverages_are_those_of_the_orthogonal_projection(sim_6dof, sim_6dof_act
     fit = calibrate(sim_6dof, data, "minimal,base,tool")
     rows = fit.problem.linearize(fit.x).rows(fit.problem.chunks[0])[:-1].transpose(2, 1, 0).reshape(180, -1)
     basis = np.linalg.qr(np.concatenate([rows, np.diag(fit.problem.weights)]))[0][:180].reshape(60, 3, -1)
-    leverages = prediction_covariances(fit.problem, fit.solution)[0]
+    leverages = SolvedProblem(fit.problem, fit.solution).prediction_covariances[0]
     np.testing.assert_allclose(leverages, basis @ basis.transpose(0, 2, 1), atol=1e-4)
     assert fit.outliers[0].size == 0
 
