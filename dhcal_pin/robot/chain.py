@@ -429,14 +429,14 @@ class Chain:
         return self.body_from_urdf @ self.origins
 
     @cached_property
-    def urdf_from_body(self) -> Array:
+    def _urdf_from_body(self) -> Array:
         """Body frame of each joint in its URDF frame, and the identity for the tip, shape (k+1, 4, 4)."""
         return np.concatenate([self.axis_frames[1:], _IDENTITY[None]])
 
     @cached_property
     def link_transforms(self) -> Array:
         """Constant transforms L_0 … L_k between the joint motions, shape (k+1, 4, 4)."""
-        return self.next_from_body @ self.urdf_from_body
+        return self.next_from_body @ self._urdf_from_body
 
     @cached_property
     def _link_and_tool_transforms(self) -> Array:
@@ -765,7 +765,7 @@ class Chain:
         cached = {
             "axis_frames": self.axis_frames,
             "body_from_urdf": self.body_from_urdf,
-            "urdf_from_body": self.urdf_from_body,
+            "_urdf_from_body": self._urdf_from_body,
         }
         vars(chain).update(self.__getstate__(), **cached, **frames)
         if "origins" in frames:

@@ -155,8 +155,12 @@ class Conditions:
         """Check whether the same conditions are known, with the same values."""
         own, others = self._known, other._known
         return own.keys() == others.keys() and all(
-            values is others[name] or np.array_equal(values, others[name]) for name, values in own.items()
+            np.array_equal(values, others[name]) for name, values in own.items()
         )
+
+    def copy(self) -> Conditions:
+        """Return a copy that does not change if an array of this object is written to."""
+        return Conditions(**{name: values.copy() for name, values in self._known.items()})
 
     @property
     def names(self) -> frozenset[str]:

@@ -212,7 +212,10 @@ class Transmission:
         is_same = last and last["loads"] is self.loads and last["order"] == self.order
         if not is_same or not last["conditions"].equals(conditions):
             last.update(
-                loads=self.loads, order=self.order, conditions=conditions, terms=self._terms(conditions)
+                loads=self.loads,
+                order=self.order,
+                conditions=conditions.copy(),
+                terms=self._terms(conditions),
             )
         return last["terms"]
 

@@ -465,3 +465,6 @@ def test_terms_are_those_of_the_given_conditions():
         found = other.terms(conditions)
         np.testing.assert_array_equal(found, other._terms(conditions))
         assert found.shape != first.shape or np.any(found != first)
+    transmission.terms(conditions := Conditions(q))
+    q[:, 4] += 0.1
+    np.testing.assert_array_equal(transmission.terms(conditions), transmission._terms(conditions))

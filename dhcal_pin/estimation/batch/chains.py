@@ -106,7 +106,8 @@ class ChainBatch:
         chain = self.model.chain
         independent = np.moveaxis(q, -1, 0).reshape(q.shape[-1], -1)
         positions = chain.mimic_matrix @ independent + chain.mimic_offset[:, None]
-        links = chain.body_from_urdf @ self.origins @ chain.urdf_from_body
+        urdf_from_body = np.concatenate([chain.axis_frames[1:], np.eye(4)[None]])
+        links = chain.body_from_urdf @ self.origins @ urdf_from_body
         links[:, -1] @= self.tool
         frames = np.empty((len(positions) + 2, 7, 3, *q.shape[:-1]))
         frames[0, :4] = self.base[:, :3].transpose(2, 1, 0)[:, :, None, :, None]
