@@ -171,7 +171,7 @@ def _reflector_error(chain: Chain, poses: int, distance: float, seed: int) -> fl
     seen = np.concatenate(positions)
     seen += NOISE * rng.standard_normal(seen.shape)
     data = MultiTargetPosition(np.tile(q, (len(positions), 1)), seen, names)
-    fit = fit_geometry(chain, data, "minimal,base,tool", session="off")
+    fit = fit_geometry(chain, data, "minimal,base,tool")
     miss = fit.chain.poses(test)[:, :3, 3] - true.poses(test)[:, :3, 3]
     return float(np.sqrt(np.mean(np.sum(miss**2, 1))))
 
