@@ -10,6 +10,8 @@ const ROLES = {
 // Uses of which there is one file: a new one replaces the other.
 const SINGLE = ["robot", "columns", "rig", "servos"];
 const ROBOT = /\.(urdf|dh\.toml|dh\.csv|ya?ml)$/i;
+// Fewer photographs seldom determine an arm.
+const MIN_PHOTOGRAPHS = 12;
 // Pause before the files are checked again after a change [ms].
 const CHECK_DELAY = 300;
 
@@ -48,12 +50,12 @@ function showError(id, text) {
 // Controls of the page by the options of the command line.
 const CONTROLS = {
   "--skip-bad-rows": "“Skip rows that lack a number or a name”", "--tip": "“Tip link”", "--columns": "a column map among the files",
-  "--rig": "a rig file among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
+  "--rig": "a rig file among the files", "--robot": "a robot among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
 };
 
 // A message of the command, in the words of the page.
 function spoken(text) {
-  return text.replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
+  return text.replace(/(--[a-z-]+) FILE( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
     .replace(/--[a-z][a-z-]*/g, option => CONTROLS[option] ?? `${option} of the command line`);
 }
 
@@ -75,12 +77,16 @@ async function roleOf(file) {
 
 function setRole(name, role) {
   if (SINGLE.includes(role)) {
-    for (const [other, entry] of files) if (other !== name && entry.role === role) files.delete(other);
+    for (const [other, entry] of files) if (other !== name && entry.role === role) {
+      files.delete(other);
+      showError("file-error", `${name} takes the place of ${other}, which is removed from the list.`);
+    }
   }
   files.get(name).role = role;
 }
 
-async function addFiles(added) {
+// The use of a file follows from its name and content, or is given.
+async function addFiles(added, role = null) {
   added = [...added];
   const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
   const size = added.reduce((sum, file) => sum + file.size, total);
@@ -93,7 +99,7 @@ async function addFiles(added) {
     return;
   }
   showError("file-error", "");
-  const roles = await Promise.all(added.map(roleOf));
+  const roles = await Promise.all(added.map(file => role ?? roleOf(file)));
   added.forEach((file, i) => {
     files.set(file.name, { file, role: "beside" });
     setRole(file.name, roles[i]);
@@ -172,13 +178,17 @@ function showHoldoutFiles() {
 // --- rig file and board ----------------------------------------------------------------------------
 
 function writeRig() {
-  const place = $("rig-place").value, square = $("rig-square").value || "30";
-  $("rig-text").value = `[camera.camera]
+  const wrong = [...document.querySelectorAll("#rig-fields input")].find(field => !field.checkValidity() || (!field.value && !field.placeholder));
+  showError("rig-error", wrong ? `${wrong.labels[0].textContent}: expected a positive number.` : "");
+  $("rig-status").textContent = "";
+  if (wrong) return;
+  const place = $("rig-place").value, square = $("rig-square").value;
+  $("rig-text").value = `[camera.webcam]
 link = "${place}"
 width = ${$("rig-width").value}
 height = ${$("rig-height").value}
 
-[board.board]
+[board.paper]
 link = "${place === "tip" ? "world" : "tip"}"
 type = "charuco"
 columns = 8
@@ -189,11 +199,18 @@ dictionary = "DICT_5X5_100"
 ${$("rig-ruler").value ? `ruler_mm = ${$("rig-ruler").value}\n` : ""}`;
 }
 
+// The fields no longer describe a text that was edited.
+function rigEdited() {
+  $("rig-fields").disabled = $("rig-text").value.trim() !== "";
+  if (!$("rig-fields").disabled) writeRig();
+}
+
 const rigFile = () => new File([$("rig-text").value], "rig.toml", { type: "text/plain" });
 
 // The size of the photographs is that of the first one.
 async function showPhotographSize(added) {
   const photograph = added.find(({ name }) => files.get(name)?.role === "images");
+  if ($("rig-fields").disabled || named("rig").length) return;
   try {
     const { width, height } = await createImageBitmap(photograph);
     [$("rig-width").value, $("rig-height").value] = [width, height];
@@ -207,17 +224,20 @@ async function printBoard(paper) {
   const body = new FormData();
   body.append("request", JSON.stringify({ rig: "rig.toml", paper }));
   body.append("file", rigFile());
+  const buttons = document.querySelectorAll("[data-paper]");
   $("rig-status").textContent = "";
   showError("rig-error", "");
+  for (const button of buttons) button.disabled = true;
   try {
     await send("board", body, null, message => {
       if (message.error) throw new Error(spoken(message.error));
       downloadItem(message.files[0]).querySelector("a").click();
-      $("rig-status").textContent = "board.pdf is saved. Print it at its true size, then measure its ruler line.";
+      $("rig-status").textContent = "board.pdf is saved. Print it at 100 %, without fitting to the page. Measure its ruler line, enter its length above, and use the rig file.";
     });
   } catch (error) {
     showError("rig-error", failure(error));
   }
+  for (const button of buttons) button.disabled = false;
 }
 
 // --- requests --------------------------------------------------------------------------------------
@@ -254,7 +274,7 @@ function failure(error) {
 // --- check -----------------------------------------------------------------------------------------
 
 function updateButtons() {
-  const hasImages = named("images").length > 0, measured = hasImages ? "a table of the joint values or counts of each photograph" : "measurements";
+  const hasImages = named("images").length > 0, measured = hasImages ? "a table with a column image and the values or counts of each joint, such as shoulder_pan[ticks]" : "measurements";
   const missing = [...(named("robot").length ? [] : ["a robot"]), ...(named("data").length ? [] : [measured]),
     ...(hasImages && !named("rig").length ? ["a rig file with camera and board"] : [])];
   $("cancel").hidden = $("progress").hidden = !running;
@@ -293,8 +313,9 @@ const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 // What was found in the photographs.
 function boardCard({ board, images, used, problems }) {
   const missed = Object.entries(problems).map(([name, problem]) => `${name}: ${problem}`);
-  return element("div", { className: `card ${used ? missed.length ? "warning" : "ok" : "problem"}` }, element("h3", {}, "Photographs"),
-    element("p", {}, `Board ${board} was found in ${used} of ${count(images, "photograph")}.`), list(missed));
+  return element("div", { className: `card ${used ? missed.length || used < MIN_PHOTOGRAPHS ? "warning" : "ok" : "problem"}` }, element("h3", {}, "Photographs"),
+    element("p", {}, `Board ${board} was found in ${used} of ${count(images, "photograph")}.`),
+    used < MIN_PHOTOGRAPHS ? element("p", {}, `Take at least ${MIN_PHOTOGRAPHS}, better twice as many, that differ in all joints.`) : null, list(missed));
 }
 
 function fileCard(file) {
@@ -472,11 +493,17 @@ for (const name of ["dragover", "dragleave", "drop"]) {
   });
 }
 $("tip").onchange = check;
-for (const field of document.querySelectorAll("#rig-maker .field > :is(select, input)")) field.oninput = writeRig;
+for (const field of document.querySelectorAll("#rig-fields :is(select, input)")) field.oninput = writeRig;
 for (const button of document.querySelectorAll("[data-paper]")) button.onclick = () => printBoard(button.dataset.paper);
-$("rig-use").onclick = () => addFiles([rigFile()]);
+$("rig-text").oninput = rigEdited;
+$("rig-use").onclick = async () => {
+  showError("rig-error", "");
+  await addFiles([rigFile()], "rig");
+  $("rig-status").textContent = "rig.toml is among the files.";
+};
 writeRig();
 $("example").onclick = async () => {
+  if (files.size && !confirm("The example takes the place of all files of this page. Continue?")) return;
   try {
     const example = await (await fetch("example")).json();
     files.clear();

@@ -196,9 +196,17 @@ def _few_images(fit: Evidence) -> list[Finding]:
     count = fit.extension.n_configurations if fit.extension else needed
     if count >= needed or (fit.hand_eye and fit.hand_eye.is_noise):
         return []
+    n_taken = len(np.unique(configuration_groups(fit.data)))
+    if 2 * count < n_taken:
+        text = (
+            f"Only {count} of {n_taken} different images fit one set-up of camera and board. Check that the rig "
+            "file states the board that was photographed."
+        )
+        return [Finding("refused", text)]
+    images = "One image is" if count == 1 else f"{count} different images are"
     text = (
-        f"{count} different images are too few for the zeros and signs of this arm. Take at least "
-        f"{needed - count} more, better {advised - count}."
+        f"{images} too few for the zeros and signs of this arm. Take at least {needed - count} more, better "
+        f"{advised - count}."
     )
     if small := small_ranges(fit.chain, fit.data):
         text += f" Turn the joints that moved less than half of their range: {', '.join(small)}."

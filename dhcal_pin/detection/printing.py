@@ -99,7 +99,7 @@ def _ruler(sheet_width: float) -> list[str]:
     scale = _POINTS_PER_METRE
     lines = [" ".join(f"{scale * value:.5f}" for value in bar) + " re" for bar in bars]
     text = (
-        f"Measure this line from end to end and write its length to the rig file: ruler_mm = {1e3 * RULER:g}"
+        f"Print at 100 %: this line is {1e3 * RULER:g} mm long. Measure it, and state its length as ruler_mm."
     )
     place = f"{scale * left:.5f} {scale * (MARGIN + _MARK + 0.002):.5f}"
     return [*lines, "f", f"BT /F1 {_FONT_SIZE} Tf {place} Td ({text}) Tj ET"]

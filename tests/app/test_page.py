@@ -199,10 +199,21 @@ def test_a_rig_file_is_made_and_its_board_is_printed(page, example, tmp_path, mo
     page.click("#rig-use")
     page.wait_for_selector('[aria-label="Remove rig.toml"]')
     assert page.get_attribute("#rig-maker", "open") is None
+    drop(page, ("other.toml", "[camera.a]\n"))
+    page.wait_for_selector('[aria-label="Remove other.toml"]')
+    assert "other.toml takes the place of rig.toml" in page.inner_text("#file-error")
     page.evaluate("document.getElementById('rig-maker').open = true")
     page.fill("#rig-square", "1000")
     page.click("[data-paper=a4]")
     page.wait_for_selector("#rig-error:not([hidden])")
+    page.fill("#rig-square", "")
+    assert page.inner_text("#rig-error") == "Square of the board [mm]: expected a positive number."
+    page.fill("#rig-square", "20")
+    assert page.is_hidden("#rig-error")
+    page.fill("#rig-text", "[board.own]")
+    assert page.is_disabled("#rig-square")
+    page.fill("#rig-text", "")
+    assert "square_mm = 20" in page.input_value("#rig-text")
 
 
 def test_errors_are_shown_as_one_line(page, example):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from camera_setups import ARMS, simulate, wrong_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
-from dhcal_pin.calibration.verdict import judge
+from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES
+from dhcal_pin.calibration.verdict import _few_images, judge
+from dhcal_pin.measurements import Position
 
 MESSAGE = r"do not move as the joint values say: the rotations between images differ by [1-9]\d°"
 
@@ -47,3 +50,24 @@ def test_joint_values_of_other_images_are_refused():
     images = simulate(chain, chain, rng, is_on_wrist=True, n_images=12, sigma=0.3).images
     q, of_row = np.unique(images.q, axis=0, return_inverse=True)
     require_refusal(calibrate(chain, images.replace(q=rng.uniform(-1.5, 1.5, q.shape)[of_row.reshape(-1)])))
+
+
+@pytest.mark.parametrize(
+    ("n_taken", "n_good", "text"),
+    [
+        (20, 1, "Only 1 of 20 different images fit"),
+        (1, 1, "One image is too few"),
+        (6, 5, "5 different images"),
+    ],
+)
+def test_refusal_counts_the_images_that_fit(sim_6dof, n_taken, n_good, text):
+    q = np.random.default_rng(0).uniform(-2, 2, (n_taken, 6))
+    fit = SimpleNamespace(
+        arm_type=ARM_TYPES["low-cost"],
+        extension=SimpleNamespace(n_configurations=n_good),
+        hand_eye=None,
+        chain=sim_6dof,
+        data=(Position(q, np.zeros((n_taken, 3))),),
+    )
+    (finding,) = _few_images(fit)  # pyright: ignore[reportArgumentType]
+    assert finding.reason.startswith(text)
