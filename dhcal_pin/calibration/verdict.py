@@ -199,8 +199,8 @@ def _few_images(fit: Evidence) -> list[Finding]:
     n_taken = len(np.unique(configuration_groups(fit.data)))
     if 2 * count < n_taken:
         text = (
-            f"Only {count} of {n_taken} different images fit one set-up of camera and board. Check that the rig "
-            "file states the board that was photographed."
+            f"Only {count} of {n_taken} different images fit one set-up of camera and board. Check that the "
+            "rig file states the board that was photographed."
         )
         return [Finding("refused", text)]
     images = "One image is" if count == 1 else f"{count} different images are"
