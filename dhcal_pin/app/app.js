@@ -496,6 +496,10 @@ $("tip").onchange = check;
 for (const field of document.querySelectorAll("#rig-fields :is(select, input)")) field.oninput = writeRig;
 for (const button of document.querySelectorAll("[data-paper]")) button.onclick = () => printBoard(button.dataset.paper);
 $("rig-text").oninput = rigEdited;
+$("rig-save").onclick = async () => {
+  const content = btoa(String.fromCodePoint(...new Uint8Array(await rigFile().arrayBuffer())));
+  downloadItem({ name: "rig.toml", label: "", content }).querySelector("a").click();
+};
 $("rig-use").onclick = async () => {
   showError("rig-error", "");
   await addFiles([rigFile()], "rig");

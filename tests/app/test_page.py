@@ -193,6 +193,9 @@ def test_a_rig_file_is_made_and_its_board_is_printed(page, example, tmp_path, mo
     Path("rig.toml").write_text(page.input_value("#rig-text"))
     assert main("board rig.toml --paper letter -o board.pdf".split()) == 0
     assert Path(waiting.value.path()).read_bytes() == Path("board.pdf").read_bytes()
+    with page.expect_download() as waiting:
+        page.click("#rig-save")
+    assert Path(waiting.value.path()).read_bytes() == Path("rig.toml").read_bytes()
     rig = read_rig("rig.toml")
     (camera,), (board,) = rig.cameras.values(), rig.boards.values()
     assert (camera.link, board.link, camera.width, camera.height) == ("world", "tip", 320, 200)
