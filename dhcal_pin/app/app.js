@@ -178,7 +178,7 @@ function showHoldoutFiles() {
 // --- rig file and board ----------------------------------------------------------------------------
 
 function writeRig() {
-  const wrong = [...document.querySelectorAll("#rig-fields input")].find(field => !field.checkValidity() || (!field.value && !field.placeholder));
+  const wrong = [...document.querySelectorAll("#rig-fields input")].find(field => !field.checkValidity());
   showError("rig-error", wrong ? `${wrong.labels[0].textContent}: expected a positive number.` : "");
   $("rig-status").textContent = "";
   if (wrong) return;

@@ -7,6 +7,9 @@ messages for the page, dictionaries that JSON can hold:
 - `{"error": TEXT}`: one line that says what is wrong and what is expected; the last message;
 - `{"result": DOCUMENT, ...}`: the JSON document of the command; the last message. A calibration adds `status`
   (`done` or `refused`), `screen` (what the command shows) and `files`: name, label and content in base64.
+
+A request without the files that a command needs raises `InvalidArgumentError`; the server sends it as an
+error.
 """
 
 from __future__ import annotations
