@@ -33,7 +33,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -245,18 +245,23 @@ def update_weights(
 
     Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of samples
     with much leverage alternate again after that. From the second time on, every round makes a part of the
-    change only, and half of that part after each further time.
+    change only, and half of that part after each further time. Where samples either count or are rejected,
+    a sample near the limit may have no weight that its own residual confirms. From the second time on,
+    rejected samples then stay rejected.
     """
     weights = [sample_weights(t, stage) for t in residuals]
-    steps = tuple(a - b for a, b in zip(weights, previous, strict=True))
-    size = max(float(np.abs(step).max(initial=0.0)) for step in steps)
-    is_stalled = size > OSCILLATION_RATIO * last.size
-    is_reversed = is_stalled and sum(map(np.vdot, steps, last.steps)) < 0
+    change = weight_change(weights, previous)
+    is_stalled = change.size > OSCILLATION_RATIO * last.size
+    is_reversed = is_stalled and sum(map(np.vdot, change.steps, last.steps)) < 0
     n_reversals = last.n_reversals + is_reversed
-    damping = 0.5 ** max(n_reversals - 1, int(is_stalled))
-    if damping < 1:
-        weights = [damping * a + (1 - damping) * b for a, b in zip(weights, previous, strict=True)]
-    return weights, WeightChange(size, steps, n_reversals)
+    if WEIGHT_FUNCTIONS[stage][0] is _uniform:
+        if n_reversals > 1:
+            weights = [np.minimum(a, b) for a, b in zip(weights, previous, strict=True)]
+            change = weight_change(weights, previous)
+    elif damping := max(n_reversals - 1, int(is_stalled)):
+        part = 0.5**damping
+        weights = [part * a + (1 - part) * b for a, b in zip(weights, previous, strict=True)]
+    return weights, replace(change, n_reversals=n_reversals)
 
 
 def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> WeightChange:
