@@ -88,9 +88,16 @@ class GoodSamples:
 
 
 def find_good_samples(
-    problem: Problem, solution: SolverResult, data: Sequence[Measurement], groups: Array
+    problem: Problem,
+    solution: SolverResult,
+    data: Sequence[Measurement],
+    groups: Array,
+    previous: Sequence[Array],
 ) -> GoodSamples:
-    """Find the samples that agree with the fit of a majority of the samples."""
+    """Find the samples that agree with the fit of a majority of the samples.
+
+    The samples that an earlier search found, by their weights, compete with the new ones.
+    """
     counts = [len(item.rows) for item in data]
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
         return GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
@@ -108,7 +115,11 @@ def find_good_samples(
     redundancy = n_rows / independent_rows(rows, groups[drawn])
     if 2 * n_determined > n_rows / redundancy:
         return all_good
-    core = _best_core(rows, search_majorities(rows, groups[drawn], n_determined), redundancy)
+    majorities = search_majorities(rows, groups[drawn], n_determined)
+    was_good = np.concatenate([np.empty(0), *previous])[drawn] > robust.ZERO_WEIGHT
+    if not was_good.all():
+        majorities.append((was_good, majorities[0][1]))
+    core = _best_core(rows, majorities, redundancy)
     if core is None:
         return all_good
     stage = robust.rejection_stage(core.t)

@@ -172,7 +172,7 @@ def _next_round(
     scales = estimate_variance_components(solved, fit.data, weights, lost_freedom)
     weighted = with_sigma_scales(fit.data, scales)
     if stage == robust.TRIMMED:
-        found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data))
+        found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data), fit.weights)
         weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
         # The rounds go on with these weights, then with another search or with those of the nonlinear model.
         # A fit to all parts of joint space does not show that one of them agrees better by itself.

@@ -198,6 +198,14 @@ def test_good_samples_are_fitted_and_searched_away_from_the_bent_solution(
     assert n_false <= 1
 
 
+@pytest.mark.parametrize("seed", some_slow([3, 7], {0}))
+def test_a_further_search_keeps_good_samples_that_are_more_likely(seed):
+    """Equal offsets at all sockets agree with each other, and so do the offset samples of a single socket."""
+    ratio, n_found, n_bad, n_false, *_ = trial("point", 200, 0.4, True, False, seed) or [0] * 5
+    assert 0 < ratio <= 1.10
+    assert (n_found, n_false) == (n_bad, 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("largest", [500, 5000])
 @pytest.mark.parametrize("is_stated", [False, True])

@@ -12,6 +12,8 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.summary import headline
 from dhcal_pin.estimation import LOSSES, linearize_and_factor
 from dhcal_pin.estimation.robust import (
+    FAR_REJECTED,
+    FAR_THRESHOLD,
     KEPT,
     TRIMMED,
     WEIGHT_FUNCTIONS,
@@ -261,6 +263,18 @@ def test_weights_that_alternate_settle(slope):
             break
     assert last.size < 1e-3
     assert weights[0] == pytest.approx([0.5, 1.0], abs=2e-3)
+
+
+def test_a_sample_that_no_weight_agrees_with_stays_rejected():
+    """It is above the limit where it counts, and below it where it is rejected."""
+    weights, last, found = [np.array([1.0, 1.0])], WeightChange(), []
+    for _ in range(8):
+        t = FAR_THRESHOLD + (0.1 if weights[0][0] > 0.5 else -0.1)
+        weights, last = update_weights(weights, [np.array([t, 0.5])], FAR_REJECTED, last)
+        found.append(weights[0][0] > 0.5)
+        assert weights[0][1] == 1
+    assert found == [False, True, *[False] * 6]
+    assert last.size == 0
 
 
 def test_pearsons_test_of_squares():
