@@ -66,6 +66,9 @@ MAX_SAMPLES = 200
 MAX_COORDINATES = 200
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
+# Log-likelihood by which the good samples of an earlier search must be more likely than new ones. The rows are
+# linearized at their own solution, so that the likelihood of others is not exact.
+MIN_ADVANTAGE = 10.0
 # Number of majorities that the search for a hidden one extends, probability that chance makes one, and
 # largest number of samples.
 N_HIDDEN, MAX_CHANCE, MAX_FEW = 40, 0.01, 100
@@ -96,7 +99,7 @@ def find_good_samples(
 ) -> GoodSamples:
     """Find the samples that agree with the fit of a majority of the samples.
 
-    The samples that an earlier search found, by their weights, compete with the new ones.
+    Samples that an earlier search found, by their weights, stay the good ones if they are far more likely.
     """
     counts = [len(item.rows) for item in data]
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
@@ -115,11 +118,8 @@ def find_good_samples(
     redundancy = n_rows / independent_rows(rows, groups[drawn])
     if 2 * n_determined > n_rows / redundancy:
         return all_good
-    majorities = search_majorities(rows, groups[drawn], n_determined)
     was_good = np.concatenate([np.empty(0), *previous])[drawn] > robust.ZERO_WEIGHT
-    if not was_good.all():
-        majorities.append((was_good, majorities[0][1]))
-    core = _best_core(rows, majorities, redundancy)
+    core = _best_core(rows, search_majorities(rows, groups[drawn], n_determined), was_good, redundancy)
     if core is None:
         return all_good
     stage = robust.rejection_stage(core.t)
@@ -265,8 +265,10 @@ class _Core:
     log_likelihood: float  # Negative logarithm of the likelihood, see the module docstring
 
 
-def _best_core(rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], redundancy: float) -> _Core | None:
-    """Extend the samples of several fits and choose the most likely ones."""
+def _best_core(
+    rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], was_good: Array, redundancy: float
+) -> _Core | None:
+    """Extend the samples of several fits and choose the most likely ones, or those that were good before."""
     everything = np.ones(rows.n_samples, bool)
     scales = rows.noise_scales(rows.residual_squares(rows.solve(everything[None] * 1.0, fits[0][1][None])))[0]
     cores: list[_Core] = []
@@ -275,6 +277,10 @@ def _best_core(rows: LinearizedRows, fits: Sequence[tuple[Array, Array]], redund
         if not any((core.t[is_good] <= STRICT_THRESHOLD).all() for core in cores):
             cores.append(_extend(rows, is_good, noise, redundancy))
     best = min(cores, key=lambda core: core.log_likelihood)
+    if not was_good.all():
+        earlier = _extend(rows, was_good, fits[0][1], redundancy)
+        if earlier.log_likelihood < best.log_likelihood - MIN_ADVANTAGE:
+            best = earlier
     has_outlier = (best.t > robust.OUTLIER_THRESHOLD).any()
     is_likely = best.log_likelihood < _log_likelihood(rows, everything, scales, redundancy)
     return best if has_outlier and is_likely else None
