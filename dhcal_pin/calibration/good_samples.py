@@ -66,7 +66,7 @@ MAX_SAMPLES = 200
 MAX_COORDINATES = 200
 # Standardized residual above which a sample does not extend the good ones: one good sample in a thousand.
 STRICT_THRESHOLD = 3.0
-# Log-likelihood by which the good samples of an earlier search must be more likely than new ones. The rows are
+# Log-likelihood by which good samples of an earlier search must be more likely than new ones. The rows are
 # linearized at their own solution, so that the likelihood of others is not exact.
 MIN_ADVANTAGE = 10.0
 # Number of majorities that the search for a hidden one extends, probability that chance makes one, and
