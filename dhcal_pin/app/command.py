@@ -1,4 +1,4 @@
-"""Commands of `dhcal` in a process of their own, and what they tell.
+"""Commands of `dhcal` in a process of their own, and what they report.
 
 A crash or a lack of memory ends that process only, and it can be stopped at any time. Each function yields
 messages for the page, dictionaries that JSON can hold:

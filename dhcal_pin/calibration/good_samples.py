@@ -26,8 +26,8 @@ joint space is then too good there and wrong elsewhere. In both cases samples ar
 very far off.
 
 The search is skipped if there are many data and the residuals of the fit to all samples look like noise. With
-many rows per unknown, independent outliers hardly bend the fit: unknowns divided by rows is the fraction of
-their squares that spreads over all samples. Outliers that agree with each other can bend the fit.
+many rows per unknown, independent outliers hardly change the fit: unknowns divided by rows is the fraction of
+their squares that spreads over all samples. Outliers that agree with each other can change it much.
 The residuals of good and bad samples then differ by multiples of a common shift. In both cases the squares do
 not follow the χ² distribution of noise: a few are far too large, or too many or too few of them are in some
 tenth of the distribution.

@@ -91,8 +91,8 @@ class Result(Evidence, ResultPlots):
     def pose_std(self) -> float:
         """Largest standard deviation of the position of a camera or a board in its link [m].
 
-        It is that along the worst direction; 0 if all of these positions are known, or if they cannot be told
-        apart from an unknown base or tool.
+        It is that along the worst direction; 0 if all of these positions are known, or if they are not
+        distinguishable from an unknown base or tool.
         """
         if self.errors.only_frames():
             return 0.0

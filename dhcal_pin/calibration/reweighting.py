@@ -15,7 +15,7 @@ The least-squares problem depends on three sets of numbers that are not known be
 2. The widths of the default priors, from the evidence procedure (MacKay 1992), see `estimation.priors`.
 3. The weight of each sample under a robust loss, from iteratively reweighted least squares, see
    `estimation.robust`; loss "auto" starts from the samples that a majority agrees with, see
-   `good_samples`. A solution that bad samples bent may be far from the one of the good samples, and its
+   `good_samples`. A solution that bad samples shifted may be far from the one of the good samples, and its
    prior widths are too large. The good samples are therefore solved from the nominal robot with the expected
    widths, and searched again at that solution until they stay the same.
 

@@ -154,7 +154,7 @@ def _read_members(archive: zipfile.ZipFile, path: PathLike) -> dict[str, bytes]:
     """Read all members of a zip file, whose names must be safe and whose size is limited."""
     infos = archive.infolist()
     for info in infos:
-        # `ZipInfo` replaces separators of this system; the original name tells.
+        # `ZipInfo` replaces separators of this system; the original name shows them.
         name = info.orig_filename
         parts = name.split("/")
         if (

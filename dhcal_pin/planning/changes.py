@@ -60,7 +60,7 @@ def with_repeats(
     Args:
         plan: Plan of n poses.
         chain: Nominal robot.
-        n_repeated: Number of poses that are repeated: those that together tell most about the unknowns.
+        n_repeated: Number of poses that are repeated: those that together determine the unknowns best.
         space: Floor and obstacles of the moves.
         margin: Margins to the joint limits [m, rad].
 

@@ -138,7 +138,7 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
-    """Return the measurements, at most `_MAX_ITEMS`, that tell hypotheses about joints apart."""
+    """Return the measurements, at most `_MAX_ITEMS`, that distinguish hypotheses about joints."""
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
     items = [item for item in items if item.rig is None]
     return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]

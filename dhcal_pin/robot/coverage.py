@@ -84,7 +84,7 @@ class JointCoverage:
         return count
 
     def is_lattice(self, order: int) -> bool:
-        """Return whether the joint took so few different values that harmonics cannot be told apart."""
+        """Return whether the joint took so few different values that harmonics are not distinguishable."""
         count = self.n_different_values(order)
         if count < 2 or _MIN_REPETITIONS * count > len(self.values):
             return False

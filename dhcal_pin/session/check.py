@@ -125,7 +125,7 @@ class Recheck:
     Attributes:
         verdict: "ok", "changed" or "cannot say".
         reasons: Sentences on it.
-        changes: What changed; several if the measurements cannot tell them apart. Empty unless `changed`.
+        changes: What changed; several if the measurements do not distinguish them. Empty unless `changed`.
         hypotheses: All hypotheses, the most likely one first.
         log_ratio: Logarithm of the ratio of the likelihoods with and without a change, less its limit.
         samples: Number of samples.
@@ -513,8 +513,8 @@ def _answer(
         verdict = "cannot say"
         rivals = ", ".join(f"{each.name} ({100 * each.share:.0f} %)" for each in hypotheses[:3])
         reasons = [
-            f"Something changed, and these samples cannot tell what: {rivals}. Measure more poses, as `dhcal "
-            "plan --recheck` chooses them."
+            f"Something changed. These samples do not show which of these it is: {rivals}. Measure more "
+            "poses, as `dhcal plan --recheck` chooses them."
         ]
     else:
         verdict, changes = "changed", tuple(group)

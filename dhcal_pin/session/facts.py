@@ -203,8 +203,8 @@ class Scale:
         if self.axis:
             return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
         return (
-            "Check the scale of the instrument: measurements alone cannot tell it from the size of the "
-            f"robot. If the instrument is wrong, add --mend scale:{self.factor:.6g}."
+            "Check the scale of the instrument: measurements alone do not distinguish it from the size of "
+            f"the robot. If the instrument is wrong, add --mend scale:{self.factor:.6g}."
         )
 
 

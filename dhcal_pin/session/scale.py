@@ -1,8 +1,8 @@
 """Scale of all measured lengths, which the size of the robot imitates.
 
-Positions and poses do not tell a scale of the instrument from the size of the robot. A wrong scale changes
-all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections x of the
-arm are therefore
+Positions and poses do not distinguish a scale of the instrument from the size of the robot. A wrong scale
+changes all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections x
+of the arm are therefore
 
     x = k·s + M·e + n,
 

@@ -729,7 +729,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):
         return nothing
-    # The solution may be bent by a large event, and the nominal robot may be far from the measurements.
+    # A large event may have shifted the solution, and the nominal robot may be far from the measurements.
     starts = [
         _Search(problem, start, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
         for start in (np.zeros_like(x), x)

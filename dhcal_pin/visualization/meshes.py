@@ -103,7 +103,7 @@ def rows(pose: Array) -> list[float]:
 # --- the URDF's visual geometry --------------------------------------------------------------------
 @dataclass(frozen=True)
 class _Source:
-    """A URDF and its meshes, which the stamps of their files tell from others."""
+    """A URDF and its meshes, identified by the time stamps of their files."""
 
     text: str
     stamps: tuple[tuple[str, float, int], ...]  # Path, time of the last change, size

@@ -197,7 +197,7 @@ class HandEyeDiagnosis:
 
     @property
     def likely(self) -> str:
-        """Likely cause, causes that cannot be told apart from it, and what to do; with a space before."""
+        """Likely cause, causes that are not distinguishable from it, and what to do; with a space before."""
         if not self.causes:
             return f" No cause that was tried explains it: check the images, the board and the {self.stated}."
         parts = []
@@ -209,7 +209,7 @@ class HandEyeDiagnosis:
         first = self.causes[0]
         if self.alternatives:
             others = " or ".join(f"{trial.text} ({_mm(trial.error.distance)})" for trial in self.alternatives)
-            parts.append(f" Cannot be told apart from: {others}.")
+            parts.append(f" Not distinguishable from: {others}.")
         parts.append(f" {first.remedy}")
         return "".join(parts)
 

@@ -39,8 +39,8 @@ from .stages import held_out_error
 # Families that images show: displacements follow from the direction of approach and from gravity. Periodic
 # errors of the joints are imitated by errors of the links where images were taken.
 FAMILIES = (COMPLIANCE, BACKLASH)
-# Smallest displacement σ of the rows in standard deviations of the corners that is told from their noise, and
-# number of classes, each of twice the σ of the one before.
+# Smallest displacement σ of the rows that the noise of the corners does not hide, in standard deviations of
+# the corners, and number of classes, each of twice the σ of the one before.
 MIN_DISPLACEMENT, N_CLASSES = 0.5, 10
 
 

@@ -33,7 +33,7 @@ from .search import linearize_rows, search_majorities
 
 # Approximate number of samples of each measurement that the search uses, and the smallest number of them from
 # each group, such as an image. Samples of one group are often wrong together, so that a few samples of many
-# groups tell more than all samples of a few.
+# groups determine more than all samples of a few.
 MAX_SAMPLES, MIN_PER_GROUP = 200, 4
 # Number of random subsets that the instruments are initialized from, and their smallest number of
 # configurations.

@@ -53,5 +53,5 @@ def list_images(labels: Sequence[str]) -> str:
 
 
 def _shorten(name: str) -> str:
-    """Return a name, or the end of a long one, which tells files apart."""
+    """Return a name, or the end of a long one, which distinguishes files."""
     return name if len(name) <= MAX_QUOTED_CHARS else f"…{name[1 - MAX_QUOTED_CHARS :]}"
