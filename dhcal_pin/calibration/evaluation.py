@@ -28,7 +28,7 @@ from ..estimation.initialization import fit_frames
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import minimize
 from ..measurements.arguments import as_measurements, require_chain
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, errors_of, instrument_values
 from ..measurements.groups import ERROR_GROUPS, error_group, in_order
 from ..robot.chain import Chain
 
@@ -170,7 +170,7 @@ def fit_nominal(
             item.instrument_parameters,
             item.instrument_jacobian(
                 chain.forward_kinematics(item.conditions()),
-                np.array([values[parameter.name] for parameter in item.instrument_parameters]),
+                instrument_values(item, values),
             ),
             strict=True,
         )
@@ -192,13 +192,7 @@ def compute_errors(
         for item in data
     ]
     values = fit_instrument_parameters(chain, data, known)
-    return [
-        item.errors(
-            chain.forward_kinematics(item.conditions()),
-            np.array([values[parameter.name] for parameter in item.instrument_parameters]),
-        )
-        for item in data
-    ]
+    return [errors_of(item, chain, values) for item in data]
 
 
 def position_errors(

@@ -38,7 +38,7 @@ from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
 from ..identifiability import observability
-from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.base import InstrumentParameter, Measurement, residual_of
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
@@ -263,8 +263,7 @@ class FittedModel:
         """Unit, whether sigmas are stated, and weighted number of rows of each residual group."""
         counts = []
         for item, weights in zip(self.data, self.weights, strict=True):
-            frames = self.chain.forward_kinematics(item.conditions())
-            residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
+            residual = residual_of(item, self.chain, self.problem.instruments(self.x))
             counts += [
                 (group.unit, item.has_stated_sigma, len(residual[group.rows]) * weights.sum())
                 for group in item.residual_groups.values()
@@ -443,10 +442,7 @@ class FittedModel:
         for item, errors in zip(
             self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
         ):
-            whitened = item.residual(
-                self.chain.forward_kinematics(item.conditions()),
-                np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
-            )
+            whitened = residual_of(item, self.chain, self.instruments)
             for name, group in item.residual_groups.items():
                 share = 1.0
                 if item.has_stated_sigma:
@@ -486,7 +482,7 @@ class FittedModel:
     @property
     def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:
         """Parameters of the robot, then of the instruments, in the order of x."""
-        return (*self.errors.parameters, *self.problem.instrument_parameters)
+        return self.problem.parameters
 
     @property
     def instruments(self) -> dict[str, float]:

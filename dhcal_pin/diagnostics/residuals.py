@@ -22,7 +22,7 @@ from ..calibration.evaluation import compute_errors, fit_instrument_parameters
 from ..calibration.result import Result
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import offset
-from ..measurements.base import Measurement, whitened_jacobian
+from ..measurements.base import Measurement, instrument_values, whitened_jacobian
 from ..measurements.groups import error_group
 from ..robot.chain import Chain
 
@@ -134,7 +134,7 @@ def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) ->
     model = errors.derivative(np.zeros(len(errors.parameters)))
     ar, aa = [], []
     for item in data:
-        u = np.array([known[parameter.name] for parameter in item.instrument_parameters])
+        u = instrument_values(item, known)
         frames = chain.forward_kinematics(item.conditions())
         residual = item.residual(frames, u)
         a = whitened_jacobian(item, model, frames, u, residual)

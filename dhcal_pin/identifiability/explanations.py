@@ -225,7 +225,7 @@ class Explainer:
     def _unit(self, i: int) -> str:
         """Return the unit of an unknown."""
         problem = self.probe.problem
-        return (*problem.errors.parameters, *problem.instrument_parameters)[i].unit
+        return problem.parameters[i].unit
 
     def _robot_part(self, group: UnobservableGroup) -> tuple[list[ErrorParameter], Propagation | None]:
         """Return the geometric errors of a group, and their propagation if the group has no other members."""
@@ -467,7 +467,7 @@ def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
     r = linearize_and_factor(problem, x, small_angle=False).r
     layers = probe.null_space_layers(r)
     plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
-    names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
+    names = [p.name for p in problem.parameters]
     explainer = Explainer(probe, dict(layers), names, plain_errors)
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
@@ -520,7 +520,7 @@ def explain_weakly_observable(
     if not len(std_ratios):
         return []
     problem, n_robot = probe.problem, len(probe.problem.errors.parameters)
-    names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
+    names = [p.name for p in problem.parameters]
     plain_errors = PlainErrors.from_model(problem.errors, probe.x[:n_robot])
     # R factor of as many poses over the full range of the joints.
     full_range = probe.full_range / np.sqrt(probe.n_repetitions)

@@ -40,6 +40,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import TriangularSystem
+from ..measurements.base import residual_of
 
 # Distances l over which model errors are looked for, each half the one before [rad].
 LENGTHS = tuple(2.0**-i for i in range(-1, 6))
@@ -81,7 +82,7 @@ def find_residual_correlation(
 
     The system at x is that of the rows divided by the noise.
     """
-    linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
+    linearization, chain = problem.linearize(x), problem.chain(x)
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), 1, 1))
     for item, w in zip(problem.data, weights, strict=True):
@@ -96,8 +97,7 @@ def find_residual_correlation(
             rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
             effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
         else:
-            values = problem.instrument_values_of(part, x)
-            residual = part.residual(chain.forward_kinematics(part.conditions()), values) / noise
+            residual = residual_of(part, chain, linearization.instruments) / noise
             effect, is_exact = np.empty((0, *residual.shape)), False
         scores = _score_terms(_points(part.q, problem.errors.chain.is_prismatic), residual, effect)
         excess += scores.excess

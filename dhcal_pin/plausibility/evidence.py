@@ -110,7 +110,7 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACT
         width,
         factor * noise.length_scale,
         factor * noise.angle_scale,
-        errors.at(solution.x[: len(errors.parameters)]),
+        problem.chain(solution.x),
         dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
     )
 
@@ -144,12 +144,9 @@ class _Noise:
 
 def _estimate_noise(problem: Problem, x: Array) -> _Noise:
     """Estimate scales of lengths and angles, and the weights of outliers, from the residuals at x."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
     # Mean square of each sample (m,) by item and name of the residual group.
     squares: list[dict[str, Array]] = []
-    for item in problem.data:
-        u = problem.instrument_values_of(item, x)
-        r = item.residual(chain.forward_kinematics(item.conditions()), u)
+    for item, r in zip(problem.data, problem.residuals(x, problem.data), strict=True):
         squares.append({name: np.mean(r[g.rows] ** 2, 0) for name, g in item.residual_groups.items()})
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     share = min(1.0, 0.5 * (1 + len(x) / n_rows))
