@@ -49,6 +49,16 @@ def translation(xyz: ArrayLike) -> Array:
     return transform(np.eye(3), xyz)
 
 
+def transform_points(pose: Array, points: Array) -> Array:
+    """Transform points (..., 3) by one pose (4, 4)."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def rms_radius(points: Array) -> float:
+    """Compute the RMS distance of points (m, 3) from their mean."""
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))
+
+
 def inverse(pose: ArrayLike) -> Array:
     """Invert rigid transformations by transposing the rotation."""
     pose = np.asarray(pose, float)

@@ -113,11 +113,11 @@ def _eliminate(system: TriangularSystem, x: Array, robot: Array, others: Array) 
 
 def _displacements(problem: Problem, x: Array, robot: Array, dependence: Array) -> Array:
     """Compute the tool displacement per robot error, (3·N, i), at N configurations over the joint range."""
-    from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
+    from ..robot.sampling import random_configurations  # lazy import: slow, and few calibrations need it
 
     errors, n_parameters = problem.errors, len(problem.errors.parameters)
     chain, bodies, twists = errors.derivative(x[:n_parameters])
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    q = random_configurations(chain, N_CONFIGURATIONS)
     jacobian = np.zeros((3 * N_CONFIGURATIONS, len(x)))
     jacobian[:, :n_parameters] = (
         chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3].reshape(n_parameters, -1).T

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..subsampling import evenly_spaced_indices
 from .intrinsics import intrinsics_candidates, undetermined_focal_length
@@ -187,7 +188,7 @@ class _LensProblem:
         """Return derivatives by lens and pose, and errors, of the views, (2m, f + 7) each [px]."""
         local = np.concatenate(
             [
-                points @ pose[:3, :3].T + pose[:3, 3]
+                se3.transform_points(pose, points)
                 for (points, _), (pose, _) in zip(self.views, poses, strict=True)
             ]
         )

@@ -290,8 +290,7 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
             )
     everywhere = draw_joint_space(a)
     q_all, q_region = everywhere[:N_COMPARED], _common_region(first, second)
-    points = a.poses(q_all)[:, :3, 3]
-    lever = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1)))) or 1.0
+    lever = se3.rms_radius(a.poses(q_all)[:, :3, 3]) or 1.0
     pair = (first.uncertainty, second.uncertainty)
     roots = [u for u in pair if u is not None]
     is_turned = all(_determines_orientation(u, q_all, lever) for u in roots)

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..robot.chain import BASE_FRAME, Chain
-from ..robot.sampling import joint_range
+from ..robot.sampling import joint_range, random_configurations
 
 # Number of configurations over the joint range, and of robots with random errors.
 _N_CONFIGURATIONS, _N_ROBOTS = 32, 24
@@ -86,6 +87,4 @@ def _displacements(a: Chain, b: Chain, q: Array) -> Array:
 
 def workspace_radius(chain: Chain) -> float:
     """Compute the RMS distance of the tool from its mean position over the joint range."""
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (_N_CONFIGURATIONS, chain.n_joints))
-    points = chain.poses(q)[:, :3, 3]
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))
+    return se3.rms_radius(chain.poses(random_configurations(chain, _N_CONFIGURATIONS))[:, :3, 3])

@@ -337,7 +337,7 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
     fit, magnification = context.fit, scene_magnification(context)
     base = se3.inverse(fit.chain.base)
     nominal, calibrated = (
-        points @ base[:3, :3].T + base[:3, 3]
+        se3.transform_points(base, points)
         for points in (_arm_points(chain, context) for chain in (fit.nominal_refitted, fit.chain))
     )
     arms = {"before": nominal, "after": nominal + magnification * (calibrated - nominal)}

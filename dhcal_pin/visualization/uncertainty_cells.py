@@ -14,7 +14,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.uncertainty import Predictor
-from ..robot.sampling import joint_range
+from ..robot.sampling import random_configurations
 
 # Configurations that are drawn; a cell of a robot with six joints contains about ten of them.
 N_CONFIGURATIONS = 6000
@@ -38,10 +38,8 @@ class UncertaintyCells:
 def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
     """Predict the uncertainty of the tool position by cells."""
     chain = predictor.chain
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
-    prediction = predictor.relative.predict(q)
-    base = se3.inverse(chain.base)
-    points = prediction.poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
+    prediction = predictor.relative.predict(random_configurations(chain, N_CONFIGURATIONS))
+    points = se3.transform_points(se3.inverse(chain.base), prediction.poses[:, :3, 3])
     variances = prediction.position_std**2
     is_finite = np.isfinite(variances)
     points, variances = points[is_finite], variances[is_finite]
