@@ -19,7 +19,7 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
-from ..formatting import format_quantity
+from ..formatting import format_quantity, join_names
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
@@ -175,7 +175,7 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
     if len(unmoved) == len(names):
         text = "No joint ever moved: all measurements are of one configuration."
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
-    text = f"{'Joints' if len(unmoved) > 1 else 'Joint'} {_join(unmoved)} never moved"
+    text = f"{'Joints' if len(unmoved) > 1 else 'Joint'} {join_names(unmoved)} never moved"
     if (len(names) > 2 and 2 * len(unmoved) > len(names)) or sum(moved) < 2:
         text += ", so the measurements do not show the errors of the robot."
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
@@ -523,8 +523,3 @@ def _n_robot_parameters(fit: Evidence) -> int:
     """Return the number of parameters of the robot itself that are estimated, without base and tool."""
     frames = (BASE_FRAME, fit.errors.chain.tool_frame_index)
     return sum(parameter.error_frame not in frames for parameter in fit.errors.parameters)
-
-
-def _join(names: list[str]) -> str:
-    """Join names with commas and a final "and"."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
