@@ -25,6 +25,7 @@ from typing import Any
 from .._typing import PathLike
 from ..exceptions import FileFormatError
 from ..messages import quote
+from .tabular import unreadable
 
 # End of the names of bundles.
 ENDING = ".dhcal.zip"
@@ -111,9 +112,7 @@ def read_bundle(path: PathLike) -> Bundle:
     except FileFormatError:
         raise
     except OSError as error:
-        raise FileFormatError(
-            f"{path}: cannot read it: {error.strerror}; give the path of a bundle"
-        ) from error
+        raise unreadable(path, error, "a bundle") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
         raise FileFormatError(f"{path}: not a bundle or damaged: {error}; expected a zip file") from error
     text = members.pop(MANIFEST, b"")
