@@ -57,14 +57,7 @@ class PointMeasurement(Measurement):
         sigma: ArrayLike | None,
         instrument_parameters: tuple[InstrumentParameter, ...] = (),
     ) -> None:
-        """Set the common attributes.
-
-        Args:
-            q: Checked joint positions, (m, n) [rad or m].
-            values: Checked measured values, (m, k) [m].
-            sigma: Standard deviations, one number or (m, k) [m]; None if they have to be estimated.
-            instrument_parameters: Instrument parameters, in the order of u.
-        """
+        """Set the common attributes, whose values are checked."""
         where = f"{type(self).__name__}: sigma"
         self._initialize(
             q=q,

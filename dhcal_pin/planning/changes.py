@@ -55,18 +55,7 @@ def with_repeats(
     space: WorkspaceConstraints | None = None,
     margin: Noise | None = None,
 ) -> Plan:
-    """Return a plan with some of its poses at the begin, in the middle and at the end.
-
-    Args:
-        plan: Plan of n poses.
-        chain: Nominal robot.
-        n_repeated: Number of poses that are repeated: those that together tell most about the unknowns.
-        space: Floor and obstacles of the moves.
-        margin: Margins to the joint limits [m, rad].
-
-    Returns:
-        Plan of n + 2·n_repeated poses.
-    """
+    """Return a plan with its most informative poses at the begin, in the middle and at the end."""
     rows, none = plan.information.rows(plan.q), np.zeros(0, int)
     candidates = CandidateSet.from_rows(rows, scale_joint_units(chain, plan.q), 0.0)
     chosen = select_greedily(

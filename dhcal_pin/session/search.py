@@ -708,16 +708,9 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
-    """Find what happened during a session.
+    """Find what happened during a session, from an approximate solution x (p,) with base and tool.
 
-    Args:
-        problem: Problem with initialized base and tool.
-        x: Approximate solution, (p,).
-        holdout: Held-out measurements, which only count for the timeline.
-        is_ordered: Whether the samples are in the order of measurement; else only files may differ.
-
-    Returns:
-        Causes and changes of the robot.
+    Held-out measurements only count for the timeline. Without an order only files may differ.
     """
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(RobotChanges(), timeline, chain, is_ordered)
