@@ -47,7 +47,7 @@ from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
@@ -433,8 +433,8 @@ def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) 
 
 def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
     """Return the lowest and highest x, shape (2, p), from bounds of values by name or pattern."""
-    frames = (BASE_FRAME, problem.errors.chain.tool_frame_index)
-    robot = [p for p in problem.errors.parameters if p.error_frame not in frames]
+    errors = problem.errors
+    robot = [p for p, is_of_arm in zip(errors.parameters, errors.is_of_arm, strict=True) if is_of_arm]
     limits = np.tile([[-np.inf], [np.inf]], len(problem.weights))
     for pattern, (low, high) in bounds.items():
         bounded = [p for p in robot if fnmatch.fnmatchcase(p.name, pattern)]

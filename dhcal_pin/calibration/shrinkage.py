@@ -48,7 +48,6 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
 from ..estimation.solver import SolverResult
-from ..robot.chain import BASE_FRAME
 
 # Largest accepted probability that the calibrated robot is worse than the nominal one.
 MAX_HARM_PROBABILITY = 0.002
@@ -72,8 +71,7 @@ def compute_shrinkage_factor(
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
     if n_rows > len(x) or n_rows > rank(solution.system.r) or not groups:
         return 1.0
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    robot = np.array([i for i, p in enumerate(errors.parameters) if p.error_frame not in frames], int)
+    robot = np.flatnonzero(errors.is_of_arm)
     if not x[robot].any():
         return 1.0
     others = np.setdiff1d(np.arange(len(x)), robot)

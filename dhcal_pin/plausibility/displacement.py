@@ -18,7 +18,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 from ..robot.sampling import joint_range, random_configurations
 
 # Number of configurations over the joint range, and of robots with random errors.
@@ -49,8 +49,7 @@ def measure_correction(errors: ErrorModel, calibrated: Chain) -> CorrectionSize:
     nominal = errors.chain.with_base_and_tool(np.eye(4), calibrated.tool)
     q = rng.uniform(*joint_range(nominal), (_N_CONFIGURATIONS, nominal.n_joints))
     moved = _displacements(nominal, calibrated.with_base_and_tool(nominal.base, nominal.tool), q)
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    std = np.array([0.0 if p.error_frame in frames else p.prior for p in errors.parameters])
+    std = np.where(errors.is_of_arm, errors.priors, 0.0)
     model = replace(errors, chain=nominal)
     draws = [
         _displacements(nominal, model.at(std * rng.standard_normal(len(std))), q) for _ in range(_N_ROBOTS)

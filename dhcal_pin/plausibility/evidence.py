@@ -30,7 +30,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .._typing import Array
-from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
@@ -39,7 +38,7 @@ from ..estimation.solver import minimize
 from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement
 from ..measurements.pose import PoseMeasurement
 from ..measurements.position import PointMeasurement
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 
 # Errors that the robot may have; base and tool are free, so that instrument and target may be anywhere.
 MANUFACTURED = "minimal,base,tool"
@@ -79,12 +78,12 @@ class Evidence:
     errors: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
 
 
-def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Evidence:
+def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
     errors = initialize_frames(select_parameters(chain, sets), equal, {}, _N_FRAME_ITERATIONS)
     equal = tuple(item.initialized(errors.chain) for item in equal)
-    is_robot = _is_robot(errors)
+    is_robot = errors.is_of_arm
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
     problem = make_problem(
         errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
@@ -113,12 +112,6 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACT
         problem.chain(solution.x),
         dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
     )
-
-
-def _is_robot(errors: ErrorModel) -> Array:
-    """Return which parameters belong to the robot itself, not to base and tool, (p,)."""
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    return np.array([parameter.error_frame not in frames for parameter in errors.parameters])
 
 
 def _with_equal_sigmas(item: Measurement) -> Measurement:
