@@ -20,7 +20,7 @@ from .._typing import Array
 from ..calibration.evaluation import compute_errors, error_norms
 from ..calibration.presentation.workspace import WorkspacePrediction
 from ..estimation import qr
-from ..formatting import Quantity, capitalized
+from ..formatting import Quantity, capitalized, round_up
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..robot.chain import Chain
@@ -377,7 +377,7 @@ def scene_magnification(context: ReportContext) -> float:
     )
     displacement = float(np.linalg.norm(calibrated - nominal, axis=1).max())
     wanted = DRAWN_DISPLACEMENT * float(np.ptp(nominal, axis=0).max()) / max(displacement, 1e-12)
-    return min(max(_round_up_125(max(wanted, 1e-3) / 2), 1.0), scene.MAX_MAGNIFICATION)
+    return min(max(round_up(max(wanted, 1e-3) / 2), 1.0), scene.MAX_MAGNIFICATION)
 
 
 def _arm_points(chain: Chain, context: ReportContext) -> Array:
@@ -390,12 +390,6 @@ def _arm_points(chain: Chain, context: ReportContext) -> Array:
         q = np.concatenate(used)[nearest : nearest + 1]
     frames = chain.forward_kinematics(q)
     return np.array([*(body[3, :, 0] for body in frames.bodies), frames.tool[3, :, 0]])
-
-
-def _round_up_125(value: float) -> float:
-    """Return the smallest of 1, 2 and 5 times a power of ten that is at least `value`."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(k * power for k in (1, 2, 5, 10) if k * power >= value * (1 - 1e-9))
 
 
 def observability_figures(context: ReportContext) -> list[FigureGroup]:

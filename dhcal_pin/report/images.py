@@ -12,7 +12,7 @@ from .._typing import Array
 from ..calibration.cameras import ImageError, Stage
 from ..calibration.evaluation import compute_errors
 from ..cameras.rig import Camera
-from ..formatting import Table, format_fixed
+from ..formatting import Table, format_fixed, round_down
 from ..visualization import image_plots
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel, Section
@@ -197,7 +197,7 @@ def _reprojection_panel(
 ) -> Panel:
     """Return the figure of corners of a camera with their errors."""
     large = max(float(np.percentile(np.linalg.norm(errors, axis=1), _LARGE_PERCENTILE)), 1e-9)
-    magnification = _round_down(_DRAWN_PART * camera.width / large)
+    magnification = round_down(_DRAWN_PART * camera.width / large)
     text = (
         f"{len(pixels)} corners in an image plane of {camera.width} x {camera.height} px, RMS error "
         f"{_rms(errors):.3g} px, drawn {magnification:g} times larger."
@@ -207,9 +207,3 @@ def _reprojection_panel(
     )
     height = (width - _BESIDE) * camera.height / camera.width + _BELOW
     return Panel(key, f"{title}, errors × {magnification:g}", text, plot, (width, height))
-
-
-def _round_down(value: float) -> float:
-    """Return the largest number 1, 2 or 5 times a power of ten below a value."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

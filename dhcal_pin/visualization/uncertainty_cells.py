@@ -14,14 +14,13 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.uncertainty import Predictor
+from ..formatting import round_down
 from ..robot.sampling import random_configurations
 
 # Configurations that are drawn; a cell of a robot with six joints contains about ten of them.
 N_CONFIGURATIONS = 6000
 # Cells along the largest extent of the workspace, at least.
 MIN_CELLS = 10
-# Lengths that a cell may have, times a power of ten.
-_ROUND = np.array([1.0, 2.0, 5.0, 10.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +44,7 @@ def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
     points, variances = points[is_finite], variances[is_finite]
     if not len(points):
         return UncertaintyCells(1.0, np.empty((0, 3), int), np.empty(0))
-    size = _round_length(float(np.ptp(points, axis=0).max()) / MIN_CELLS)
+    size = round_down(max(float(np.ptp(points, axis=0).max()) / MIN_CELLS, 1e-3))
     cells, index = np.unique(np.floor(points / size).astype(int), axis=0, return_inverse=True)
     index = index.reshape(-1)
     return UncertaintyCells(size, cells, np.sqrt(np.bincount(index, variances) / np.bincount(index)))
-
-
-def _round_length(length: float) -> float:
-    """Round a length down to 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(length, 1e-3)))
-    return float(power * _ROUND[np.searchsorted(_ROUND, max(length, 1e-3) / power * (1 + 1e-9)) - 1])
