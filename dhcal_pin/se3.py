@@ -54,6 +54,11 @@ def transform_points(pose: Array, points: Array) -> Array:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
+def position_and_rotvec(pose: Array) -> Array:
+    """Return the position and the rotation vector of a pose (4, 4), (6,)."""
+    return np.concatenate([pose[:3, 3], log3(pose[:3, :3])])
+
+
 def rms_radius(points: Array) -> float:
     """Compute the RMS distance of points (m, 3) from their mean."""
     return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))

@@ -141,7 +141,7 @@ class FittedModel:
 
     def _without_rejected(self, data: Sequence[Measurement]) -> list[Measurement]:
         """Remove the samples of zero weight from measurements that correspond to `data`."""
-        return _take(data, [w > robust.ZERO_WEIGHT for w in self.weights])
+        return take_samples(data, [w > robust.ZERO_WEIGHT for w in self.weights])
 
     @cached_property
     def studentized_residuals(self) -> tuple[Array, ...]:
@@ -182,12 +182,12 @@ class FittedModel:
     @property
     def counted(self) -> list[Measurement]:
         """Fitted measurements without outliers."""
-        return _take(self.data, self.is_counted)
+        return take_samples(self.data, self.is_counted)
 
     @property
     def counted_holdout(self) -> list[Measurement]:
         """Held-out measurements without outliers."""
-        return _take(self.holdout, self.is_holdout_counted)
+        return take_samples(self.holdout, self.is_holdout_counted)
 
     @property
     def n_outliers(self) -> int:
@@ -510,7 +510,7 @@ class FittedModel:
         return next((rig for rig in rigs if rig is not None), None)
 
 
-def _take(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
+def take_samples(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
     """Take some samples of each measurement; measurements without any are left out."""
     return [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
 

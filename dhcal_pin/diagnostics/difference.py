@@ -110,7 +110,7 @@ class Distances:
 
     position: Array
     orientation: Array | None
-    expected: float | None = None
+    expected: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return RMS, 95th percentile and maximum for a JSON document."""
@@ -334,10 +334,15 @@ def _displacements(a: Chain, b: Chain, q: Array, lever: float) -> Array:
     return np.hstack([of_b[:, :3, 3] - of_a[:, :3, 3], lever * np.array(turns)])
 
 
+def _frame_columns(chain: Chain, q: Array, lever: float, n_components: int) -> Array:
+    """Return the effects of base and tool on displacements, (m·components, 12)."""
+    return frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+
+
 def _aligned(a: Chain, b: Chain, q: Array, lever: float, n_components: int) -> Chain:
     """Return b with the base and tool with which its tool is nearest to that of a."""
     for _ in range(MAX_ITERATIONS):
-        effects = frame_effects(b, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+        effects = _frame_columns(b, q, lever, n_components)
         d = _displacements(a, b, q, lever)[:, :n_components].ravel()
         step = -np.linalg.lstsq(effects, d, rcond=EFFECT_RTOL)[0]
         b = replace(b, base=se3.exp6(step[:6]) @ b.base, tool=b.tool @ se3.exp6(step[6:]))
@@ -356,8 +361,7 @@ def _effects(chain: Chain, uncertainty: Uncertainty, q: Array, lever: float) -> 
 
 def _without_frames(chain: Chain, q: Array, lever: float, n_components: int, columns: Array) -> Array:
     """Remove what base and tool explain of displacements (m, 6, c), (m·components, c)."""
-    g = frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
-    u, s, _ = np.linalg.svd(g, full_matrices=False)
+    u, s, _ = np.linalg.svd(_frame_columns(chain, q, lever, n_components), full_matrices=False)
     u = u[:, s > EFFECT_RTOL * s[0]]
     flat = columns[:, :n_components].reshape(-1, columns.shape[2])
     return flat - u @ (u.T @ flat)

@@ -135,6 +135,12 @@ class PointMeasurement(Measurement):
         }
 
 
+def _noisy_positions(chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Array:
+    """Return positions of the chain's tool point (m, 3) with normal noise on each axis."""
+    points = chain.forward_kinematics(conditions).tool[3].T
+    return points + noise.position * rng.standard_normal(points.shape)
+
+
 class Position(PointMeasurement):
     """Positions of the tool point in the measuring frame, by a laser tracker, a CMM or trilateration.
 
@@ -176,11 +182,7 @@ class Position(PointMeasurement):
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> Position:
         """Return positions of the chain's tool point with normal noise on each axis."""
-        q = conditions.q
-        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
-            (len(q), 3)
-        )
-        return cls(q, positions, noise.position or None)
+        return cls(conditions.q, _noisy_positions(chain, conditions, noise, rng), noise.position or None)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -251,11 +253,8 @@ class PositionComponents(PointMeasurement):
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> PositionComponents:
         """Return the coordinates x and z of the chain's tool point with normal noise."""
-        q = conditions.q
-        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
-            (len(q), 3)
-        )
-        return cls(q, positions[:, [0, 2]], (0, 2), noise.position or None)
+        positions = _noisy_positions(chain, conditions, noise, rng)
+        return cls(conditions.q, positions[:, [0, 2]], (0, 2), noise.position or None)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
