@@ -63,7 +63,7 @@ class ErrorStatistics:
     unit: str
 
     @classmethod
-    def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array] = ()) -> ErrorStatistics:
+    def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array]) -> ErrorStatistics:
         """Compute the statistics of error norms."""
         square = norms**2
         rms = float(np.sqrt(np.mean(square)))

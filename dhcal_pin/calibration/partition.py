@@ -276,7 +276,7 @@ def blocked_folds(
 
 
 def region_partitions(
-    data: Measurement | Sequence[Measurement], groups: Array | None = None
+    data: Measurement | Sequence[Measurement], groups: Array
 ) -> tuple[tuple[Fold, ...], ...]:
     """Divide the measured joint space into four regions, once per pair of principal directions.
 

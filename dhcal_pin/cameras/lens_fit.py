@@ -121,9 +121,7 @@ def fit_lens(
     return LensFit(values, _find_poses(views, lens, values, known), cost, widths)
 
 
-def fit_unknown_lens(
-    views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool = False
-) -> LensFit:
+def fit_unknown_lens(views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool) -> LensFit:
     """Fit the lens of a camera whose focal lengths are not known."""
     candidates = intrinsics_candidates(views, camera)
     size = max(camera.width, camera.height)

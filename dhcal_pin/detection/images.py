@@ -64,7 +64,7 @@ def detect_boards(
     camera: Camera,
     paths: Sequence[str],
     on_progress: Callable[[int], None],
-    jobs: int | None = None,
+    jobs: int | None,
 ) -> list[BoardDetection]:
     """Find the corners of all boards of a rig in the images of one camera."""
     boards = [board for board in rig.boards.values() if board.type != "points"]
@@ -115,7 +115,7 @@ def corner_columns(
     rig: Rig,
     camera: Camera,
     detections: Sequence[BoardDetection],
-    joints: Mapping[str, Mapping[str, str]] | None = None,
+    joints: Mapping[str, Mapping[str, str]] | None,
 ) -> dict[str, list[Any]]:
     """Arrange corners as the columns of a measurement file, one row per corner."""
     rows = [

@@ -64,7 +64,7 @@ class SignDecision:
 
     joint_names: tuple[str, ...]  #: Names of all joints.
     is_prismatic: tuple[bool, ...]  #: Whether each of them is prismatic.
-    turned: tuple[str, ...] = ()  #: Joints that turn the other way.
+    turned: tuple[str, ...]  #: Joints that turn the other way.
     open: tuple[OpenSigns, ...] = ()  #: Open questions, the most likely one first.
     is_compared: bool = True  #: Whether the measurements are enough to compare signs.
 

@@ -80,7 +80,7 @@ class GravityLoads:
     link_vectors: Array
     reference_temperature: float
     tip: str
-    payload: Payload | None = None
+    payload: Payload | None
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @property

@@ -117,7 +117,7 @@ def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
     return item if rig is item.rig else item.with_rig(rig)
 
 
-def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
+def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> Fit:
     """Fit the model of some causes; noise and the sizes of the arm's errors are estimated."""
     fit = _first_fit(hand_eye, causes, start)
     errors = fit.problem.errors

@@ -257,7 +257,7 @@ class HandEyeFit:
     fit: Fit  # Fit of the poses with the nominal arm; only base and tool of the robot may be unknown
     position_std: float  # Largest standard deviation of the position of a camera or a board [m]
     holdout: tuple[Measurement, ...]  # Held-out images, for the order of all images
-    unrelated: str = ""  # What shows that the images are not those of the joint values or of the robot
+    unrelated: str  # What shows that the images are not those of the joint values or of the robot
 
     @cached_property
     def diagnosis(self) -> HandEyeDiagnosis | None:
@@ -282,7 +282,7 @@ def largest_position_std(names: Sequence[str], covariance: Array) -> float:
 
 
 def diagnose_hand_eye(
-    fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
+    fit: Fit, position_std: float, holdout: Sequence[Measurement]
 ) -> HandEyeDiagnosis | None:
     """Find the likely cause of the error that a hand-eye calibration leaves."""
     inliers = _search(fit, fit.without_rejected().data, holdout)

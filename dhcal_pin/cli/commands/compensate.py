@@ -214,7 +214,7 @@ def _program(result: Compensation, nominal: Chain) -> Program:
     )
 
 
-def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str = "rad") -> str:
+def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str) -> str:
     """Format corrected targets."""
     import numpy as np  # lazy import, as the following: they are slow to load
 

@@ -73,7 +73,7 @@ class _VendorTable:
 
 
 def read_mapped_table(
-    source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str = ""
+    source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str
 ) -> DataTable:
     """Read a file of another maker as a table with the project's own columns.
 

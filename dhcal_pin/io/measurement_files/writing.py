@@ -63,8 +63,8 @@ def configurations_text(
     q: Array,
     chain: Chain,
     comments: Sequence[str],
-    angle_unit: str = "rad",
-    decimals: int | None = None,
+    angle_unit: str,
+    decimals: int | None,
     iso_points: Sequence[str] = (),
 ) -> str:
     """Return the CSV text of joint positions, with the points of a test according to ISO 9283 if given."""
