@@ -61,7 +61,12 @@ def position_and_rotvec(pose: Array) -> Array:
 
 def rms_radius(points: Array) -> float:
     """Compute the RMS distance of points (m, 3) from their mean."""
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))
+    return rms_length(points - points.mean(0))
+
+
+def rms_length(vectors: Array) -> float:
+    """Compute the RMS length of vectors (m, d)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, 1))))
 
 
 def inverse(pose: ArrayLike) -> Array:

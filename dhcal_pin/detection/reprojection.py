@@ -68,4 +68,4 @@ def reproject_corners(camera: Camera, board: Board, image: DetectedImage) -> Rep
     local = se3.transform_points(pose, board.points)
     pixels = camera.lens.project(local.T, camera.values)[0].T
     errors = image.pixels - pixels[image.corner]
-    return Reprojection(pixels, float(np.sqrt(np.mean(np.sum(errors**2, 1)))))
+    return Reprojection(pixels, se3.rms_length(errors))

@@ -28,7 +28,7 @@ from ..session import histories
 from ..visualization import scene
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel
-from .samples import ROLES, Samples, is_prismatic_joint
+from .samples import ROLES, Samples
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
@@ -220,7 +220,7 @@ def _joint_error_group(samples: Samples) -> FigureGroup:
             samples.q[is_shown, i],
             errors[is_shown],
             joint=joint,
-            is_prismatic=is_prismatic_joint(samples.chain, i),
+            is_prismatic=bool(samples.chain.is_prismatic[i]),
             quantity=quantity,
             unit=ERROR_GROUPS[group].unit,
         )

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..calibration.cameras import ImageError, Stage
 from ..calibration.evaluation import compute_errors
@@ -42,12 +43,7 @@ class _Image:
     @property
     def rms(self) -> float:
         """RMS distance in the image after the calibration [px]."""
-        return _rms(self.after)
-
-
-def _rms(errors: Array) -> float:
-    """Return the RMS length of errors (c, d)."""
-    return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
+        return se3.rms_length(self.after)
 
 
 def image_section(context: ReportContext) -> Section | None:
@@ -109,7 +105,7 @@ def image_table(context: ReportContext) -> Table:
             image.camera.name,
             image.role,
             str(len(image.pixels)),
-            f"{_rms(image.before):.3g}",
+            f"{se3.rms_length(image.before):.3g}",
             f"{image.rms:.3g}",
             format_fixed(1e3 * float(np.sqrt(np.mean(image.distance**2))), 3),
         ]
@@ -155,7 +151,7 @@ def _images(context: ReportContext) -> list[_Image]:
 def image_figures(context: ReportContext) -> list[FigureGroup]:
     """Draw the errors of corners over the images of each camera, of each image, and of the worst images."""
     images = _images(context)
-    before, after = (np.array([_rms(e) for e in side]) for side in
+    before, after = (np.array([se3.rms_length(e) for e in side]) for side in
                      ([i.before for i in images], [i.after for i in images]))  # fmt: skip
     text = (
         f"RMS error of the corners of {len(images)} images: median {np.median(before):.3g} px before, "
@@ -200,7 +196,7 @@ def _reprojection_panel(
     magnification = round_down(_DRAWN_PART * camera.width / large)
     text = (
         f"{len(pixels)} corners in an image plane of {camera.width} x {camera.height} px, RMS error "
-        f"{_rms(errors):.3g} px, drawn {magnification:g} times larger."
+        f"{se3.rms_length(errors):.3g} px, drawn {magnification:g} times larger."
     )
     plot = partial(
         image_plots.plot_reprojection, pixels, errors, (camera.width, camera.height), magnification

@@ -378,7 +378,7 @@ class _State:
         assert error is not None
         jitter = residual_jitter(fit)
         sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
-        scatter = jitter.noise * float(np.sqrt(np.mean(np.sum(sigma**2, 1))))
+        scatter = jitter.noise * se3.rms_length(sigma)
         growth = min(float(np.hypot(1.0, held_out_prediction_std(fit, folds))), MAX_LEFT_OUT_RATIO)
         return cls(causes, fit, error, scatter, growth * scatter, jitter.is_significant)
 
@@ -605,7 +605,7 @@ def _corner_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
         if len(observed) < 3:
             continue
         moved = _without_rigid_motion(found[observed], board.points[observed])
-        rms = float(np.sqrt(np.mean(np.sum(moved**2, 1))))
+        rms = se3.rms_length(moved)
         if rms > largest[1]:
             largest = board.name, rms, float(np.sqrt(np.mean(moved[:, 2] ** 2)))
     name, rms, normal = largest
