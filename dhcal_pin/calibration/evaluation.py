@@ -147,9 +147,7 @@ def fit_instrument_parameters(
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
         return given
-    start = start or {}
-    x = np.array([start.get(p.name, p.nominal) - p.nominal for p in parameters if p.name not in given])
-    return problem.instruments(minimize(problem, x=x).x)
+    return problem.instruments(minimize(problem, x=problem.instrument_start(start or {})).x)
 
 
 def fit_nominal(

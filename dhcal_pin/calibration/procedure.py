@@ -294,7 +294,7 @@ def _first_fit(
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    start = np.concatenate([_start(errors, first), _instrument_start(problem, distortion)])
+    start = np.concatenate([_start(errors, first), problem.instrument_start(distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
 
 
@@ -324,11 +324,6 @@ def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> Non
 def _start(errors: ErrorModel, first: Mapping[str, float]) -> Array:
     """Return the start (p,) of the errors of the robot: the nominal robot, or first values by name."""
     return np.array([first.get(p.name, 0.0) for p in errors.parameters])
-
-
-def _instrument_start(problem: Problem, first: Mapping[str, float]) -> Array:
-    """Return the start (s,) of the instruments: first values by name, such as the distortion of the rig."""
-    return np.array([first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters])
 
 
 def _calibrate_samples(

@@ -104,6 +104,10 @@ class Problem:
         """Compute the instrument parameters of one measurement."""
         return instrument_values(item, self.instruments(x))
 
+    def instrument_start(self, first: Mapping[str, float]) -> Array:
+        """Return the start (s,) of the instruments: first values by name, such as a distortion."""
+        return np.array([first.get(p.name, p.nominal) - p.nominal for p in self.instrument_parameters])
+
     def residuals(self, x: Array, data: Sequence[Measurement]) -> list[Array]:
         """Compute the whitened residuals (k, m) of each of other measurements with the same unknowns."""
         chain, values = self.chain(x), self.instruments(x)
