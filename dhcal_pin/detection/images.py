@@ -64,7 +64,7 @@ def detect_boards(
     camera: Camera,
     paths: Sequence[str],
     on_progress: Callable[[int], None],
-    jobs: int | None,
+    jobs: int | None = None,
 ) -> list[BoardDetection]:
     """Find the corners of all boards of a rig in the images of one camera."""
     boards = [board for board in rig.boards.values() if board.type != "points"]
