@@ -61,12 +61,33 @@ def format_fixed(value: float, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 
+def round_up(value: float) -> float:
+    """Return the smallest number 1, 2 or 5 times a power of ten that is not below a value."""
+    return next(each for each in _round_numbers(value) if each >= value * (1 - 1e-9))
+
+
+def round_down(value: float) -> float:
+    """Return the largest number 1, 2 or 5 times a power of ten that is not above a value."""
+    return max(each for each in _round_numbers(value) if each <= value * (1 + 1e-9))
+
+
+def _round_numbers(value: float) -> list[float]:
+    """Return the numbers 1, 2 or 5 times a power of ten around a value."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return [k * power for k in (1, 2, 5, 10)]
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Join names with commas and a final "and"."""
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
 def capitalized(text: str) -> str:
     """Return a text with its first letter in upper case."""
     return text[:1].upper() + text[1:]
 
 
-def format_quantity(value: float, unit: str, std: float = math.nan, small: bool = False) -> str:
+def format_quantity(value: float, unit: str, std: float, small: bool = False) -> str:
     """Format a value with its unit, rounded according to its standard deviation."""
     if not math.isfinite(value):
         return "–"

@@ -80,18 +80,7 @@ def require_code_ending(path: PathLike) -> None:
 
 
 def model_code(chain: Chain, path: PathLike) -> str:
-    """Write the model of a robot as source code.
-
-    Args:
-        chain: Kinematic chain.
-        path: Name of the file. Its ending selects the language; all names in C begin with its stem.
-
-    Returns:
-        Text of the file.
-
-    Raises:
-        InvalidArgumentError: The ending is unknown.
-    """
+    """Write the model of a robot as source code in the language of the ending of a file name."""
     require_code_ending(path)
     stem, ending = os.path.splitext(os.path.basename(os.fspath(path)))
     language = LANGUAGES[ending.lower()]

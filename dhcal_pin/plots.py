@@ -264,6 +264,14 @@ def sample_color(role: str, has_holdout: bool) -> str:
     return "sample" if role == "fitted" and has_holdout else "after"
 
 
+def medians_by_part(x: Array, values: Array) -> tuple[Array, Array]:
+    """Return centres and medians of the equal parts of the range of x that have enough values."""
+    edges = np.linspace(x.min(), x.max(), _MEDIAN_PARTS + 1)
+    part = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _MEDIAN_PARTS - 1)
+    full = [k for k in range(_MEDIAN_PARTS) if np.sum(part == k) >= _MIN_PART_SAMPLES]
+    return 0.5 * (edges[:-1] + edges[1:])[full], np.array([np.median(values[part == k]) for k in full])
+
+
 def plot_errors_over_joint(
     values: Array,
     errors: Array,
@@ -281,12 +289,8 @@ def plot_errors_over_joint(
     chosen = evenly_spaced_indices(len(values), MAX_DOTS)
     size = DOT_SIZES[len(chosen) < _MAX_LARGE_DOTS]
     plot_dots(ax, scale * values[chosen], factor * errors[chosen], COLORS["sample"], size, label="sample")
-    edges = np.linspace(values.min(), values.max(), _MEDIAN_PARTS + 1)
-    part = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, _MEDIAN_PARTS - 1)
-    full = [k for k in range(_MEDIAN_PARTS) if np.sum(part == k) >= _MIN_PART_SAMPLES]
-    if len(full) > 1:
-        centres = 0.5 * (edges[:-1] + edges[1:])[full]
-        medians = np.array([np.median(errors[part == k]) for k in full])
+    centres, medians = medians_by_part(values, errors)
+    if len(centres) > 1:
         ax.plot(scale * centres, factor * medians, color=COLORS["text"], label="median", gid="samples")
     ax.set(xlabel=f"{joint}, {angle}", ylabel=f"{quantity}, {unit_name}")
     ax.set_ylim(bottom=0.0)

@@ -49,6 +49,26 @@ def translation(xyz: ArrayLike) -> Array:
     return transform(np.eye(3), xyz)
 
 
+def transform_points(pose: Array, points: Array) -> Array:
+    """Transform points (..., 3) by one pose (4, 4)."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def position_and_rotvec(pose: Array) -> Array:
+    """Return the position and the rotation vector of a pose (4, 4), (6,)."""
+    return np.concatenate([pose[:3, 3], log3(pose[:3, :3])])
+
+
+def rms_radius(points: Array) -> float:
+    """Compute the RMS distance of points (m, 3) from their mean."""
+    return rms_length(points - points.mean(0))
+
+
+def rms_length(vectors: Array) -> float:
+    """Compute the RMS length of vectors (m, d)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, 1))))
+
+
 def inverse(pose: ArrayLike) -> Array:
     """Invert rigid transformations by transposing the rotation."""
     pose = np.asarray(pose, float)

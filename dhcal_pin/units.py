@@ -42,6 +42,11 @@ UNITS: Mapping[str, Mapping[str, float]] = {
 MAX_SI_VALUE = 1e6
 
 
+def column_header(name: str, unit: str) -> str:
+    """Return the header cell of a column."""
+    return f"{name}[{unit}]" if unit else name
+
+
 def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
     """Parse standard deviations of position and orientation."""
     out: dict[str, float] = {}

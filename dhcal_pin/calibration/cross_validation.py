@@ -41,7 +41,7 @@ from .evaluation import (
     fit_nominal,
     take_errors,
 )
-from .fitted import FittedModel
+from .fitted import FittedModel, take_samples
 from .partition import (
     blocked_folds,
     configuration_groups,
@@ -188,10 +188,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
     nominal = replace(fit.errors, chain=fit.nominal_refitted)
     before: list[dict[str, Array]] = []
     for fold in folds:
-        fitted, held_out = (
-            [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
-            for masks in ([~mask for mask in fold], fold)
-        )
+        fitted, held_out = (take_samples(data, masks) for masks in ([~mask for mask in fold], fold))
         chain, instruments = fit_nominal(nominal, fitted, fit.problem.known, fit.nominal_instruments)
         before += compute_errors(chain, held_out, instruments)
     after: list[dict[str, Array]] = []
@@ -232,7 +229,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
 def leave_regions_out(
     fit: FittedModel,
     recalibrate: Callable[[list[Measurement]], FittedModel],
-    progress: Progress | None = None,
+    progress: Progress | None,
 ) -> Comparison | None:
     """Judge a calibration by further ones, each without the samples of a region of joint space.
 
@@ -249,11 +246,9 @@ def leave_regions_out(
     for number, fold in enumerate(folds, 1):
         if progress:
             progress("left-out regions", number, len(folds))
-        part = recalibrate(
-            [item.take(~mask) for item, mask in zip(fit.data, fold, strict=True) if not mask.all()]
-        )
+        part = recalibrate(take_samples(fit.data, [~mask for mask in fold]))
         is_judged = [mask & counted for mask, counted in zip(fold, fit.is_counted, strict=True)]
-        held_out = [item.take(mask) for item, mask in zip(fit.data, is_judged, strict=True) if mask.any()]
+        held_out = take_samples(fit.data, is_judged)
         before += compute_errors(part.nominal_refitted, held_out, part.nominal_instruments)
         after += compute_errors(part.chain, held_out, part.instruments)
         if fit.bare:

@@ -78,7 +78,7 @@ def make_estimates(
     """Make the estimates of all identified parameters, then those of the fixed ones."""
     frames = {BASE_FRAME: chain.base, chain.tool_frame_index: chain.tool}
     # Position and rotation vector of base and tool, shape (6,).
-    components = {frame: np.append(pose[:3, 3], se3.log3(pose[:3, :3])) for frame, pose in frames.items()}
+    components = {frame: se3.position_and_rotvec(pose) for frame, pose in frames.items()}
     rows = [(p, row, False) for p, row in zip(parameters, figures.tolist(), strict=True)]
     rows += [(p, [0.0] * 5, True) for p in fixed]
     estimates = []

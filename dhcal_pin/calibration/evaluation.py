@@ -28,7 +28,7 @@ from ..estimation.initialization import fit_frames
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import minimize
 from ..measurements.arguments import as_measurements, require_chain
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, errors_of, instrument_values
 from ..measurements.groups import ERROR_GROUPS, error_group, in_order
 from ..robot.chain import Chain
 
@@ -63,7 +63,7 @@ class ErrorStatistics:
     unit: str
 
     @classmethod
-    def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array] = ()) -> ErrorStatistics:
+    def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array]) -> ErrorStatistics:
         """Compute the statistics of error norms."""
         square = norms**2
         rms = float(np.sqrt(np.mean(square)))
@@ -147,9 +147,7 @@ def fit_instrument_parameters(
     problem = Problem(ErrorModel(chain, ()), tuple(data), weights, given)
     if not len(weights):
         return given
-    start = start or {}
-    x = np.array([start.get(p.name, p.nominal) - p.nominal for p in parameters if p.name not in given])
-    return problem.instruments(minimize(problem, x=x).x)
+    return problem.instruments(minimize(problem, x=problem.instrument_start(start or {})).x)
 
 
 def fit_nominal(
@@ -170,7 +168,7 @@ def fit_nominal(
             item.instrument_parameters,
             item.instrument_jacobian(
                 chain.forward_kinematics(item.conditions()),
-                np.array([values[parameter.name] for parameter in item.instrument_parameters]),
+                instrument_values(item, values),
             ),
             strict=True,
         )
@@ -192,13 +190,7 @@ def compute_errors(
         for item in data
     ]
     values = fit_instrument_parameters(chain, data, known)
-    return [
-        item.errors(
-            chain.forward_kinematics(item.conditions()),
-            np.array([values[parameter.name] for parameter in item.instrument_parameters]),
-        )
-        for item in data
-    ]
+    return [errors_of(item, chain, values) for item in data]
 
 
 def position_errors(

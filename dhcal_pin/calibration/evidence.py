@@ -12,7 +12,7 @@ from .._typing import Array
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import Diagnosis, diagnose_mixups
@@ -260,8 +260,7 @@ def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[s
     """Return the mean squared residual of each kind of measurement and residual group."""
     parts: dict[tuple[str, str], list[Array]] = {}
     for item in data:
-        values = fit.problem.instrument_values_of(item, fit.x)
-        residual = item.residual(fit.chain.forward_kinematics(item.conditions()), values)
+        residual = residual_of(item, fit.chain, fit.problem.instruments(fit.x))
         for name, group in item.residual_groups.items():
             parts.setdefault((item.kind, name), []).append(residual[group.rows].ravel())
     squares = {key: float(np.mean(np.concatenate(each) ** 2)) for key, each in parts.items()}

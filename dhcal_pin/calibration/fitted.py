@@ -38,7 +38,7 @@ from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
 from ..identifiability import observability
-from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.base import InstrumentParameter, Measurement, residual_of
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from .cameras.sets import has_joint_values
@@ -141,7 +141,7 @@ class FittedModel:
 
     def _without_rejected(self, data: Sequence[Measurement]) -> list[Measurement]:
         """Remove the samples of zero weight from measurements that correspond to `data`."""
-        return _take(data, [w > robust.ZERO_WEIGHT for w in self.weights])
+        return take_samples(data, [w > robust.ZERO_WEIGHT for w in self.weights])
 
     @cached_property
     def studentized_residuals(self) -> tuple[Array, ...]:
@@ -182,12 +182,12 @@ class FittedModel:
     @property
     def counted(self) -> list[Measurement]:
         """Fitted measurements without outliers."""
-        return _take(self.data, self.is_counted)
+        return take_samples(self.data, self.is_counted)
 
     @property
     def counted_holdout(self) -> list[Measurement]:
         """Held-out measurements without outliers."""
-        return _take(self.holdout, self.is_holdout_counted)
+        return take_samples(self.holdout, self.is_holdout_counted)
 
     @property
     def n_outliers(self) -> int:
@@ -263,8 +263,7 @@ class FittedModel:
         """Unit, whether sigmas are stated, and weighted number of rows of each residual group."""
         counts = []
         for item, weights in zip(self.data, self.weights, strict=True):
-            frames = self.chain.forward_kinematics(item.conditions())
-            residual = item.residual(frames, self.problem.instrument_values_of(item, self.x))
+            residual = residual_of(item, self.chain, self.problem.instruments(self.x))
             counts += [
                 (group.unit, item.has_stated_sigma, len(residual[group.rows]) * weights.sum())
                 for group in item.residual_groups.values()
@@ -443,10 +442,7 @@ class FittedModel:
         for item, errors in zip(
             self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
         ):
-            whitened = item.residual(
-                self.chain.forward_kinematics(item.conditions()),
-                np.array([self.instruments[parameter.name] for parameter in item.instrument_parameters]),
-            )
+            whitened = residual_of(item, self.chain, self.instruments)
             for name, group in item.residual_groups.items():
                 share = 1.0
                 if item.has_stated_sigma:
@@ -486,7 +482,7 @@ class FittedModel:
     @property
     def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:
         """Parameters of the robot, then of the instruments, in the order of x."""
-        return (*self.errors.parameters, *self.problem.instrument_parameters)
+        return self.problem.parameters
 
     @property
     def instruments(self) -> dict[str, float]:
@@ -514,7 +510,7 @@ class FittedModel:
         return next((rig for rig in rigs if rig is not None), None)
 
 
-def _take(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
+def take_samples(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
     """Take some samples of each measurement; measurements without any are left out."""
     return [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
 

@@ -102,15 +102,15 @@ def find_good_samples(
     Samples that an earlier search found, by their weights, stay the good ones if they are far more likely.
     """
     counts = [len(item.rows) for item in data]
+    all_good = GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
-        return GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
+        return all_good
     drawn = _draw_samples(sum(counts))
     starts = np.cumsum([0, *counts])
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
     root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
-    all_good = GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good

@@ -375,7 +375,7 @@ def _factor_folds(
 
 def _unknown_names(problem: Problem) -> list[str]:
     """Return the names of the unknowns of a problem, robot and instruments."""
-    return [one.name for one in (*problem.errors.parameters, *problem.instrument_parameters)]
+    return [one.name for one in problem.parameters]
 
 
 def prior_weights(problem: Problem, family: Array, widths: Mapping[str, float]) -> Array:
@@ -670,11 +670,8 @@ def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tu
 
     Samples of low previous weight do not count for the scale of the residuals.
     """
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
     weights = []
-    for item, w in zip(problem.data, previous, strict=True):
-        values = problem.instrument_values_of(item, x)
-        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
+    for residual, w in zip(problem.residuals(x, problem.data), previous, strict=True):
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
         weights.append(np.where(is_outlier, robust.ZERO_WEIGHT, 1.0))
     return tuple(weights)
@@ -686,13 +683,9 @@ def _rejection_stage(fit: Fit) -> str:
     Residuals that only the geometry leaves may look like outliers. They then have all sizes with the
     families, too.
     """
-    problem = fit.problem
-    chain = problem.errors.at(fit.solution.x[: len(problem.errors.parameters)])
+    data = [item.with_weights(1 / w) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     t = [np.empty(0)]
-    for item, w in zip(problem.data, fit.weights, strict=True):
-        item = item.with_weights(1 / w)
-        values = problem.instrument_values_of(item, fit.solution.x)
-        residual = item.residual(chain.forward_kinematics(item.conditions()), values)
+    for residual, w in zip(fit.problem.residuals(fit.solution.x, data), fit.weights, strict=True):
         t.append(robust.standardized_residuals(residual, None, w > 0.5))
     return robust.rejection_stage(np.concatenate(t))
 

@@ -276,7 +276,7 @@ def blocked_folds(
 
 
 def region_partitions(
-    data: Measurement | Sequence[Measurement], groups: Array | None = None
+    data: Measurement | Sequence[Measurement], groups: Array
 ) -> tuple[tuple[Fold, ...], ...]:
     """Divide the measured joint space into four regions, once per pair of principal directions.
 
@@ -327,7 +327,7 @@ def contact_groups(problem: Problem, x: Array) -> Array:
     Points that are joined by a known distance count as the same thing. A sample that touches nothing has a
     label of its own.
     """
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chain = problem.chain(x)
     node = {parameter.name: i for i, parameter in enumerate(merge_instrument_parameters(problem.data))}
     # Nodes of the graph: instrument parameters, then samples; a contact links a sample to its parameters.
     start, samples, parameters = len(node), [], []

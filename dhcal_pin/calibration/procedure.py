@@ -47,7 +47,7 @@ from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.evidence import HAND_BUILT
 from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
@@ -294,7 +294,7 @@ def _first_fit(
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
     if bounds:
         problem = replace(problem, bounds=_bounds(problem, bounds))
-    start = np.concatenate([_start(errors, first), _instrument_start(problem, distortion)])
+    start = np.concatenate([_start(errors, first), problem.instrument_start(distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
 
 
@@ -324,11 +324,6 @@ def _require_conditions(sets: Sequence[str], data: Sequence[Measurement]) -> Non
 def _start(errors: ErrorModel, first: Mapping[str, float]) -> Array:
     """Return the start (p,) of the errors of the robot: the nominal robot, or first values by name."""
     return np.array([first.get(p.name, 0.0) for p in errors.parameters])
-
-
-def _instrument_start(problem: Problem, first: Mapping[str, float]) -> Array:
-    """Return the start (s,) of the instruments: first values by name, such as the distortion of the rig."""
-    return np.array([first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters])
 
 
 def _calibrate_samples(
@@ -433,8 +428,8 @@ def _validated_known(data: tuple[Measurement, ...], known: Mapping[str, float]) 
 
 def _bounds(problem: Problem, bounds: Mapping[str, tuple[float, float]]) -> Array:
     """Return the lowest and highest x, shape (2, p), from bounds of values by name or pattern."""
-    frames = (BASE_FRAME, problem.errors.chain.tool_frame_index)
-    robot = [p for p in problem.errors.parameters if p.error_frame not in frames]
+    errors = problem.errors
+    robot = [p for p, is_of_arm in zip(errors.parameters, errors.is_of_arm, strict=True) if is_of_arm]
     limits = np.tile([[-np.inf], [np.inf]], len(problem.weights))
     for pattern, (low, high) in bounds.items():
         bounded = [p for p in robot if fnmatch.fnmatchcase(p.name, pattern)]

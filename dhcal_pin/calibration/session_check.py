@@ -80,12 +80,7 @@ def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
 
 def residuals_of(fit: Fit) -> Sequence[Array]:
     """Return the residuals of a fit, (k, m) each, without the weights of the samples."""
-    problem, x = fit.problem, fit.solution.x
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    return [
-        item.residual(chain.forward_kinematics(item.conditions()), problem.instrument_values_of(item, x))
-        for item in fit.data
-    ]
+    return fit.problem.residuals(fit.solution.x, fit.data)
 
 
 def without_changes(session: Session) -> Session:

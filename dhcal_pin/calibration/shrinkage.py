@@ -48,7 +48,6 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
 from ..estimation.solver import SolverResult
-from ..robot.chain import BASE_FRAME
 
 # Largest accepted probability that the calibrated robot is worse than the nominal one.
 MAX_HARM_PROBABILITY = 0.002
@@ -72,8 +71,7 @@ def compute_shrinkage_factor(
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
     if n_rows > len(x) or n_rows > rank(solution.system.r) or not groups:
         return 1.0
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    robot = np.array([i for i, p in enumerate(errors.parameters) if p.error_frame not in frames], int)
+    robot = np.flatnonzero(errors.is_of_arm)
     if not x[robot].any():
         return 1.0
     others = np.setdiff1d(np.arange(len(x)), robot)
@@ -113,11 +111,11 @@ def _eliminate(system: TriangularSystem, x: Array, robot: Array, others: Array) 
 
 def _displacements(problem: Problem, x: Array, robot: Array, dependence: Array) -> Array:
     """Compute the tool displacement per robot error, (3·N, i), at N configurations over the joint range."""
-    from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
+    from ..robot.sampling import random_configurations  # lazy import: slow, and few calibrations need it
 
     errors, n_parameters = problem.errors, len(problem.errors.parameters)
     chain, bodies, twists = errors.derivative(x[:n_parameters])
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    q = random_configurations(chain, N_CONFIGURATIONS)
     jacobian = np.zeros((3 * N_CONFIGURATIONS, len(x)))
     jacobian[:, :n_parameters] = (
         chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists)[:, :3].reshape(n_parameters, -1).T

@@ -29,7 +29,7 @@ from ..identifiability import explanations
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files import Part
 from ..measurements.arguments import require_chain
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, instrument_values, residual_of
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from .procedure import Method, calibrate
@@ -208,9 +208,7 @@ def _sigma_scales(fit: Result, head: Measurement) -> dict[str, float] | None:
     if head.has_stated_sigma:
         return None
     (used,) = fit.problem.data
-    frames = fit.chain.forward_kinematics(head.conditions())
-    u = fit.problem.instrument_values_of(head, fit.x)
-    plain, scaled = (item.residual(frames, u) for item in (head, used))
+    plain, scaled = (residual_of(item, fit.chain, fit.problem.instruments(fit.x)) for item in (head, used))
     return {
         name: float(np.linalg.norm(plain[group.rows]) / np.linalg.norm(scaled[group.rows])) or 1.0
         for name, group in head.residual_groups.items()
@@ -221,7 +219,7 @@ def _squared_errors(
     chains: tuple[Chain, ...], known: Mapping[str, float], chunk: Chunk
 ) -> tuple[int, list[dict[str, float]]]:
     """Return the number of samples of a part, and under each chain the sum of squared errors by name."""
-    u, item = chunk.instrument_values(known), chunk.data
+    u, item = instrument_values(chunk.data, known), chunk.data
     return len(item.rows), [
         {name: float(np.sum(error**2)) for name, error in item.errors(chunk.frames(chain), u).items()}
         for chain in chains

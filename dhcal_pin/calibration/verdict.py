@@ -19,7 +19,7 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
-from ..formatting import format_quantity
+from ..formatting import format_quantity, join_names
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
@@ -175,7 +175,7 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
     if len(unmoved) == len(names):
         text = "No joint ever moved: all measurements are of one configuration."
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
-    text = f"{'Joints' if len(unmoved) > 1 else 'Joint'} {_join(unmoved)} never moved"
+    text = f"{'Joints' if len(unmoved) > 1 else 'Joint'} {join_names(unmoved)} never moved"
     if (len(names) > 2 and 2 * len(unmoved) > len(names)) or sum(moved) < 2:
         text += ", so the measurements do not show the errors of the robot."
         return [Finding("refused", f"{text} Measure configurations that differ in all joints.")]
@@ -276,7 +276,7 @@ def _convergence(fit: Evidence) -> list[Finding]:
 
 def _implausible_correction(fit: Evidence) -> list[Finding]:
     """Refuse corrections that are far larger than manufacturing errors."""
-    if not _n_robot_parameters(fit):
+    if not fit.errors.has_arm:
         return []
     size = measure_correction(fit.errors, fit.chain)
     if size.ratio <= MAX_USUAL_DISPLACEMENT:
@@ -360,7 +360,7 @@ def _plausible_cause(fit: Evidence) -> str:
                 f"The measurements fit this robot if its {' and '.join(missing)} {verb} estimated: "
                 "--parameters minimal,base,tool."
             )
-        if _n_robot_parameters(fit) < len(select_parameters(fit.errors.chain, "minimal").parameters):
+        if fit.errors.is_of_arm.sum() < len(select_parameters(fit.errors.chain, "minimal").parameters):
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
@@ -376,7 +376,7 @@ def _plausible_cause(fit: Evidence) -> str:
 def _held_out_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that is worse than the nominal one; keep the nominal one if there is no difference."""
     paired = fit.held_out_errors
-    if paired is None or not (fit.shrinkage_factor and _n_robot_parameters(fit)):
+    if paired is None or not (fit.shrinkage_factor and fit.errors.has_arm):
         return []
     from scipy.special import stdtrit  # lazy import: slow
 
@@ -517,14 +517,3 @@ def _outlying_images(fit: Evidence) -> str:
         return ""
     images = "one image" if len(labels) == 1 else f"{len(labels)} images"
     return f", among them all corners of {images}{list_images(labels)}"
-
-
-def _n_robot_parameters(fit: Evidence) -> int:
-    """Return the number of parameters of the robot itself that are estimated, without base and tool."""
-    frames = (BASE_FRAME, fit.errors.chain.tool_frame_index)
-    return sum(parameter.error_frame not in frames for parameter in fit.errors.parameters)
-
-
-def _join(names: list[str]) -> str:
-    """Join names with commas and a final "and"."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..subsampling import evenly_spaced_indices
 from .intrinsics import intrinsics_candidates, undetermined_focal_length
@@ -120,9 +121,7 @@ def fit_lens(
     return LensFit(values, _find_poses(views, lens, values, known), cost, widths)
 
 
-def fit_unknown_lens(
-    views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool = False
-) -> LensFit:
+def fit_unknown_lens(views: Sequence[View], camera: Camera, std: Array, *, repeats_errors: bool) -> LensFit:
     """Fit the lens of a camera whose focal lengths are not known."""
     candidates = intrinsics_candidates(views, camera)
     size = max(camera.width, camera.height)
@@ -187,7 +186,7 @@ class _LensProblem:
         """Return derivatives by lens and pose, and errors, of the views, (2m, f + 7) each [px]."""
         local = np.concatenate(
             [
-                points @ pose[:3, :3].T + pose[:3, 3]
+                se3.transform_points(pose, points)
                 for (points, _), (pose, _) in zip(self.views, poses, strict=True)
             ]
         )

@@ -318,5 +318,5 @@ def pose_information(pose: Array, points: Array) -> Array:
 
     It is for unit noise of the image coordinates X/Z, Y/Z.
     """
-    rows = _jacobian(points @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 6)
+    rows = _jacobian(se3.transform_points(pose, points)).reshape(-1, 6)
     return rows.T @ rows

@@ -62,7 +62,7 @@ class FleetJobOutcome:
     """Outcome of one job of a manifest."""
 
     status: str  # "failed", or the verdict on the calibration: "ok", "caution" or "refused"
-    message: str = ""  # Reason of the failure, or reasons of the verdict and warnings about the input
+    message: str  # Reason of the failure, or reasons of the verdict and warnings about the input
     # JSON document as of `dhcal calibrate`; empty if the job failed.
     document: Mapping[str, Any] = field(default_factory=dict)
 

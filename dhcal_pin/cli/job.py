@@ -17,14 +17,11 @@ import shlex
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..exceptions import InvalidArgumentError
 from . import job_outputs, options
 from .output_table import Output, OutputFile, chosen_files
-
-if TYPE_CHECKING:
-    from ..calibration import Method
 
 # Value of --holdout for regions of joint space that are left out in turn.
 REGION = "region"
@@ -33,6 +30,12 @@ DOUBTFUL = 4
 # File extension of a bundle, and of a manifest of several jobs.
 BUNDLE_ENDING = ".dhcal.zip"
 MANIFEST_ENDING = ".fleet.toml"
+
+
+def job_option(text: str, metavar: str = "", *, default: Any = None, **more: Any) -> Any:
+    """Declare an option of `Job` by its help, its placeholder, its default and further metadata."""
+    placeholder = {"metavar": metavar} if metavar else {}
+    return field(default=default, metadata={"help": text, **placeholder, **more})
 
 
 @dataclass(frozen=True)
@@ -76,213 +79,132 @@ class Job:
     mend: tuple[str, ...] = field(default=(), metadata=options.MEND)
     parameters: str | None = field(default=None, metadata=options.PARAMETERS)
     arm: str | None = field(default=None, metadata=options.ARM)
-    turned: str = field(
+    turned: str = job_option(
+        "joints that turn the other way than in the URDF, whose axes are reversed in the "
+        "output: auto (decide it from the measurements of a low-cost arm; default), none, or names",
+        "auto|none|JOINT[,JOINT]",
         default="auto",
-        metadata={
-            "metavar": "auto|none|JOINT[,JOINT]",
-            "help": "joints that turn the other way than in the URDF, whose axes are reversed in the "
-            "output: auto (decide it from the measurements of a low-cost arm; default), none, or names",
-        },
     )
-    extend: str = field(
+    extend: str = job_option(
+        "joint error families to add if the measurements support them: auto (try all; default), "
+        "none (geometry only), or some of {error_families}",
+        "auto|none|FAMILY[,FAMILY]",
         default="auto",
-        metadata={
-            "metavar": "auto|none|FAMILY[,FAMILY]",
-            "help": "joint error families to add if the measurements support them: auto (try all; default), "
-            "none (geometry only), or some of {error_families}",
-        },
     )
     fix: str = field(default="", metadata=options.FIX)
     free: str = field(default="", metadata=options.FREE)
-    holdout: str | None = field(
-        default=None,
-        metadata={
-            "metavar": f"FRACTION|FILE|{REGION}",
-            "help": "hold-out data, excluded from the fit to measure the accuracy: a fraction such as 0.3, "
-            f"or a measurement file; {REGION}: fit all data, and repeat the calibration without each region "
-            "of joint space",
-        },
+    holdout: str | None = job_option(
+        "hold-out data, excluded from the fit to measure the accuracy: a fraction such as 0.3, "
+        f"or a measurement file; {REGION}: fit all data, and repeat the calibration without each region "
+        "of joint space",
+        f"FRACTION|FILE|{REGION}",
     )
-    session: str = field(
+    session: str = job_option(
+        "auto: look for what happened during the measurement, such as a base that moved, and "
+        "account for it (default); off: do not",
         default="auto",
-        metadata={
-            "choices": ("auto", "off"),
-            "help": "auto: look for what happened during the measurement, such as a base that moved, and "
-            "account for it (default); off: do not",
-        },
+        choices=("auto", "off"),
     )
-    unordered: bool = field(
-        default=False,
-        metadata={
-            "action": "store_true",
-            "help": "the rows are not in the order of measurement; only files may differ",
-        },
+    unordered: bool = job_option(
+        "the rows are not in the order of measurement; only files may differ", default=False
     )
-    method: Method = field(
+    method: str = job_option(
+        "lm: Levenberg-Marquardt (default); gn: Gauss-Newton iteration of the paper",
         default="lm",
-        metadata={
-            "choices": ("lm", "gn"),
-            "help": "lm: Levenberg-Marquardt (default); gn: Gauss-Newton iteration of the paper",
-        },
+        choices=("lm", "gn"),
     )
-    loss: str = field(
-        default="auto",
-        metadata={
-            "metavar": "LOSS",
-            "help": "weights of the samples in the fit (default: auto): {losses}",
-        },
+    loss: str = job_option(
+        "weights of the samples in the fit (default: auto): {losses}", "LOSS", default="auto"
     )
-    priors: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "default|none|FILE",
-            "help": "prior standard deviations: default (if method is lm), none (if method is gn), or a TOML "
-            "file by parameter name",
-        },
+    priors: str | None = job_option(
+        "prior standard deviations: default (if method is lm), none (if method is gn), or a TOML "
+        "file by parameter name",
+        "default|none|FILE",
     )
-    bounds: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "FILE.toml",
-            "help": "lower and upper bounds by parameter name",
-        },
-    )
+    bounds: str | None = job_option("lower and upper bounds by parameter name", "FILE.toml")
     instrument: str | None = field(default=None, metadata=options.INSTRUMENT)
-    payload: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "KG[@X,Y,Z]",
-            "help": "mass at the tip and its centre in the tip frame, for joint compliance: 5kg or "
-            "5kg@0,0,80mm",
-        },
+    payload: str | None = job_option(
+        "mass at the tip and its centre in the tip frame, for joint compliance: 5kg or 5kg@0,0,80mm",
+        "KG[@X,Y,Z]",
     )
-    max_iterations: int = field(
-        default=100,
-        metadata={
-            "metavar": "N",
-            "type": options.POSITIVE_INTEGER,
-            "help": "maximum number of iterations (default: 100)",
-        },
+    max_iterations: int = job_option(
+        "maximum number of iterations (default: 100)", "N", default=100, type=options.POSITIVE_INTEGER
     )
-    seed: int = field(
+    seed: int = job_option(
+        "random seed of the hold-out selection (default: 0)",
+        "N",
         default=0,
-        metadata={
-            "metavar": "N",
-            "type": options.NON_NEGATIVE_INTEGER,
-            "help": "random seed of the hold-out selection (default: 0)",
-        },
+        type=options.NON_NEGATIVE_INTEGER,
     )
-    in_place: bool = field(
-        default=False, metadata={"help": "allow OUT.urdf to replace ROBOT", "output": None}
+    in_place: bool = job_option("allow OUT.urdf to replace ROBOT", default=False, output=None)
+    world_joint: bool = job_option(
+        "write the base pose into the URDF, as a joint from link `world`", default=False
     )
-    world_joint: bool = field(
-        default=False, metadata={"help": "write the base pose into the URDF, as a joint from link `world`"}
+    tool_frame: str | None = job_option(
+        "write the tool pose into the URDF, as a link of this name fixed to the tip", "NAME"
     )
-    tool_frame: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "NAME",
-            "help": "write the tool pose into the URDF, as a link of this name fixed to the tip",
-        },
+    camera_frame: str | None = job_option(
+        "write the pose of the camera into the URDF, as a link of this name fixed to the link "
+        "that carries it; with several cameras, NAME_CAMERA each",
+        "NAME",
     )
-    camera_frame: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "NAME",
-            "help": "write the pose of the camera into the URDF, as a link of this name fixed to the link "
-            "that carries it; with several cameras, NAME_CAMERA each",
-        },
+    camera_files: str | None = job_option(
+        "write each camera for other programs: PREFIX_CAMERA.camera_info.yaml (ROS), "
+        ".opencv.yaml and .handeye.yaml (transform from its link)",
+        "PREFIX",
+        output=None,
     )
-    camera_files: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "PREFIX",
-            "help": "write each camera for other programs: PREFIX_CAMERA.camera_info.yaml (ROS), "
-            ".opencv.yaml and .handeye.yaml (transform from its link)",
-            "output": None,
-        },
+    force: bool = job_option("write the corrected robot even if the calibration is refused", default=False)
+    map: str | None = job_option(
+        "write the predicted position uncertainty and the hold-out errors over the workspace (.csv or .html)",
+        "MAP",
+        output=Output(job_outputs.map_content, "a map", (".csv", ".html")),
     )
-    force: bool = field(
-        default=False,
-        metadata={"help": "write the corrected robot even if the calibration is refused"},
+    scene: str | None = job_option(
+        "write the 3-D scene of the nominal and the calibrated robot (.html)",
+        "SCENE.html",
+        output=Output(job_outputs.scene_content, "a scene", (".html",), (".htm",)),
     )
-    map: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "MAP",
-            "help": "write the predicted position uncertainty and the hold-out errors over the workspace "
-            "(.csv or .html)",
-            "output": Output(job_outputs.map_content, "a map", (".csv", ".html")),
-        },
+    curves: str | None = job_option(
+        "write joint corrections for controllers that accept a table: joint, value and the angle "
+        "to add to it before it is commanded, in steps of 1 degree (.csv)",
+        "CURVES.csv",
+        output=Output(job_outputs.curves_content, "a table of corrections", (".csv",)),
     )
-    scene: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "SCENE.html",
-            "help": "write the 3-D scene of the nominal and the calibrated robot (.html)",
-            "output": Output(job_outputs.scene_content, "a scene", (".html",), (".htm",)),
-        },
-    )
-    curves: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "CURVES.csv",
-            "help": "write joint corrections for controllers that accept a table: joint, value and the angle "
-            "to add to it before it is commanded, in steps of 1 degree (.csv)",
-            "output": Output(job_outputs.curves_content, "a table of corrections", (".csv",)),
-        },
-    )
-    residuals: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "R.csv",
-            "help": "write the residuals of all measurements with their files and lines (.csv)",
-            "output": Output(
-                job_outputs.residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
-            ),
-        },
+    residuals: str | None = job_option(
+        "write the residuals of all measurements with their files and lines (.csv)",
+        "R.csv",
+        output=Output(
+            job_outputs.residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
+        ),
     )
     json: str | None = field(
         default=None, metadata={**options.JSON, "output": Output(None, is_written_if_refused=True)}
     )
-    report: tuple[str, ...] = field(
+    report: tuple[str, ...] = job_option(
+        "write a report (.html or .md); may be repeated",
+        "R.html",
         default=(),
-        metadata={
-            "metavar": "R.html",
-            "help": "write a report (.html or .md); may be repeated",
-            "output": Output(
-                job_outputs.report_content,
-                "a report",
-                (".html", ".md"),
-                (".htm",),
-                is_written_if_refused=True,
-            ),
-        },
+        output=Output(
+            job_outputs.report_content, "a report", (".html", ".md"), (".htm",), is_written_if_refused=True
+        ),
     )
-    certificate: str | None = field(
-        default=None,
-        metadata={
-            "metavar": "C.html",
-            "help": "write a certificate for quality records, to print or save as PDF (.html)",
-            "output": Output(job_outputs.certificate_content, "a certificate", (".html",), (".htm",)),
-        },
+    certificate: str | None = job_option(
+        "write a certificate for quality records, to print or save as PDF (.html)",
+        "C.html",
+        output=Output(job_outputs.certificate_content, "a certificate", (".html",), (".htm",)),
     )
-    bundle: str | None = field(
-        default=None,
-        metadata={
-            "metavar": f"NAME{BUNDLE_ENDING}",
-            "help": "write one file with all inputs, options and outputs, which --from repeats",
-            "output": Output(None, "a bundle", (BUNDLE_ENDING,), is_written_if_refused=True),
-        },
+    bundle: str | None = job_option(
+        "write one file with all inputs, options and outputs, which --from repeats",
+        f"NAME{BUNDLE_ENDING}",
+        output=Output(None, "a bundle", (BUNDLE_ENDING,), is_written_if_refused=True),
     )
-    meta: tuple[str, ...] = field(
+    meta: tuple[str, ...] = job_option(
+        "fact for the certificate: robot, serial, controller, instrument, temperature, location, "
+        "date, operator or any other; may be repeated",
+        "KEY=VALUE",
         default=(),
-        metadata={
-            "metavar": "KEY=VALUE",
-            "help": "fact for the certificate: robot, serial, controller, instrument, temperature, location, "
-            "date, operator or any other; may be repeated",
-            "output": None,
-        },
+        output=None,
     )
 
     @classmethod

@@ -22,6 +22,7 @@ from ..messages import message_line
 
 if TYPE_CHECKING:
     from ..io.robot_format import RobotFormat
+    from ..robot.chain import Chain
 
 # File name that stands for standard output.
 STDOUT = "-"
@@ -179,6 +180,14 @@ def add_urdf_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tip", **TIP)
     parser.add_argument("--root", **ROOT)
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
+
+
+def read_robot_or_table(path: str, args: argparse.Namespace) -> Chain:
+    """Read one of several robots; the options of a URDF do not concern a DH table."""
+    from ..io.robot import has_dh_table, read_robot  # lazy import: loads Pinocchio
+
+    tip, root = (None, None) if has_dh_table(path) else (args.tip, args.root)
+    return read_robot(path, tip, package_dirs=args.package_dir, root=root)
 
 
 def add_open_option(parser: argparse.ArgumentParser, what: str, default: bool | None = False) -> None:

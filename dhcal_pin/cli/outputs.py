@@ -62,8 +62,8 @@ def written_files() -> list[str]:
 
 def write_outputs(
     contents: Mapping[PathLike, str | bytes | None],
-    json_target: str | None = None,
-    document: object = None,
+    json_target: str | None,
+    document: object,
 ) -> None:
     """Write all outputs of a command, all or none."""
     if path := json_path(json_target):

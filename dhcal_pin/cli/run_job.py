@@ -42,7 +42,7 @@ from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
-from ..parallel import SERIAL, TaskExecutor
+from ..parallel import TaskExecutor
 from ..plausibility.hypotheses import JOINT_CHANGES, mend
 from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
@@ -112,8 +112,8 @@ class CalibrationOutcome:
 
 def run_job(
     job: Job,
-    progress: Progress | None = None,
-    executor: TaskExecutor = SERIAL,
+    progress: Progress | None,
+    executor: TaskExecutor,
     shown: Mapping[str, str] | None = None,
 ) -> CalibrationOutcome:
     """Calibrate one robot and write its outputs, in this process or another; no messages are shown.

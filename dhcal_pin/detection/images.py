@@ -115,7 +115,7 @@ def corner_columns(
     rig: Rig,
     camera: Camera,
     detections: Sequence[BoardDetection],
-    joints: Mapping[str, Mapping[str, str]] | None = None,
+    joints: Mapping[str, Mapping[str, str]] | None,
 ) -> dict[str, list[Any]]:
     """Arrange corners as the columns of a measurement file, one row per corner."""
     rows = [

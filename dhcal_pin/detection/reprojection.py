@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.lens_fit import fit_camera
@@ -64,7 +65,7 @@ def reproject_corners(camera: Camera, board: Board, image: DetectedImage) -> Rep
     if estimate is None or not np.isfinite(estimate[1]):
         return None
     pose = estimate[0]
-    local = board.points @ pose[:3, :3].T + pose[:3, 3]
+    local = se3.transform_points(pose, board.points)
     pixels = camera.lens.project(local.T, camera.values)[0].T
     errors = image.pixels - pixels[image.corner]
-    return Reprojection(pixels, float(np.sqrt(np.mean(np.sum(errors**2, 1)))))
+    return Reprojection(pixels, se3.rms_length(errors))

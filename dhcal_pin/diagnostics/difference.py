@@ -110,7 +110,7 @@ class Distances:
 
     position: Array
     orientation: Array | None
-    expected: float | None = None
+    expected: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return RMS, 95th percentile and maximum for a JSON document."""
@@ -290,8 +290,7 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
             )
     everywhere = draw_joint_space(a)
     q_all, q_region = everywhere[:N_COMPARED], _common_region(first, second)
-    points = a.poses(q_all)[:, :3, 3]
-    lever = float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1)))) or 1.0
+    lever = se3.rms_radius(a.poses(q_all)[:, :3, 3]) or 1.0
     pair = (first.uncertainty, second.uncertainty)
     roots = [u for u in pair if u is not None]
     is_turned = all(_determines_orientation(u, q_all, lever) for u in roots)
@@ -335,10 +334,15 @@ def _displacements(a: Chain, b: Chain, q: Array, lever: float) -> Array:
     return np.hstack([of_b[:, :3, 3] - of_a[:, :3, 3], lever * np.array(turns)])
 
 
+def _frame_columns(chain: Chain, q: Array, lever: float, n_components: int) -> Array:
+    """Return the effects of base and tool on displacements, (m·components, 12)."""
+    return frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+
+
 def _aligned(a: Chain, b: Chain, q: Array, lever: float, n_components: int) -> Chain:
     """Return b with the base and tool with which its tool is nearest to that of a."""
     for _ in range(MAX_ITERATIONS):
-        effects = frame_effects(b, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+        effects = _frame_columns(b, q, lever, n_components)
         d = _displacements(a, b, q, lever)[:, :n_components].ravel()
         step = -np.linalg.lstsq(effects, d, rcond=EFFECT_RTOL)[0]
         b = replace(b, base=se3.exp6(step[:6]) @ b.base, tool=b.tool @ se3.exp6(step[6:]))
@@ -357,8 +361,7 @@ def _effects(chain: Chain, uncertainty: Uncertainty, q: Array, lever: float) -> 
 
 def _without_frames(chain: Chain, q: Array, lever: float, n_components: int, columns: Array) -> Array:
     """Remove what base and tool explain of displacements (m, 6, c), (m·components, c)."""
-    g = frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
-    u, s, _ = np.linalg.svd(g, full_matrices=False)
+    u, s, _ = np.linalg.svd(_frame_columns(chain, q, lever, n_components), full_matrices=False)
     u = u[:, s > EFFECT_RTOL * s[0]]
     flat = columns[:, :n_components].reshape(-1, columns.shape[2])
     return flat - u @ (u.T @ flat)

@@ -36,9 +36,7 @@ def fit_frames(
     return replace(calibrate(chain, data, frames, known=known, loss="linear"), with_auto=None)
 
 
-def frames_differ(
-    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float] | None = None
-) -> bool:
+def frames_differ(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> bool:
     """Check whether fitting base and tool to the measurements would reduce the error many times."""
     n_samples = sum(len(item.rows) for item in data)
     if n_samples < MIN_SAMPLES:

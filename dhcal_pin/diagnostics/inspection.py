@@ -85,11 +85,11 @@ class FileInspection:
 
 def inspect_file(
     source: PathLike | Any,
-    chain: Chain | None = None,
-    columns: PathLike | None = None,
-    rig: MountedRig | None = None,
-    servos: ServoFile | None = None,
-    sheet: str = "",
+    chain: Chain | None,
+    columns: PathLike | None,
+    rig: MountedRig | None,
+    servos: ServoFile | None,
+    sheet: str,
 ) -> FileInspection:
     """Say what a measurement file contains."""
     if chain is None:

@@ -22,7 +22,7 @@ from ..calibration.evaluation import compute_errors, fit_instrument_parameters
 from ..calibration.result import Result
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import offset
-from ..measurements.base import Measurement, whitened_jacobian
+from ..measurements.base import Measurement, instrument_values, whitened_jacobian
 from ..measurements.groups import error_group
 from ..robot.chain import Chain
 
@@ -84,9 +84,6 @@ class JointProfile:
 
     name: str  #: Name of the joint.
     is_prismatic: bool  #: Whether it is prismatic.
-    values: Array  #: Joint positions of the samples, (m,) [rad or m].
-    #: Errors of the samples after the calibration, (m,) [m], or [rad] if only rotations are measured.
-    error_norms: Array
     centres: Array  #: Centres of the b parts of the range that have enough samples, (b,) [rad or m].
     #: Offset of this joint alone that would explain the residuals of a part best, for the nominal robot, (b,)
     #: [rad or m].
@@ -104,12 +101,10 @@ def joint_offset_profiles(fit: Result) -> list[JointProfile]:
     data = [item for item in fit.counted_holdout or fit.counted if item.configurations_per_row == 1]
     if not data or not fit.has_joint_values:
         return []
-    all_errors = compute_errors(fit.chain, data, fit.instruments)
     after = _offset_equations(fit.chain, data, fit)
     before = _offset_equations(fit.nominal_refitted, data, fit)
     q = np.concatenate([item.q for item in data])
     values = q @ fit.chain.mimic_matrix.T + fit.chain.mimic_offset
-    norms = np.concatenate([np.linalg.norm(next(iter(errors.values())), axis=1) for errors in all_errors])
     out = []
     for j, name in enumerate(fit.chain.moving_joints):
         edges = np.linspace(values[:, j].min(), values[:, j].max(), N_BINS + 1)
@@ -122,7 +117,7 @@ def joint_offset_profiles(fit: Result) -> list[JointProfile]:
         is_known = (rows[1::2] < MAX_PROFILE_STD).all(0)
         centres = 0.5 * (edges[:-1] + edges[1:])[parts[is_known]]
         is_prismatic = bool(fit.chain.prismatic[j])
-        out.append(JointProfile(name, is_prismatic, values[:, j], norms, centres, *rows[:, is_known]))
+        out.append(JointProfile(name, is_prismatic, centres, *rows[:, is_known]))
     return out
 
 
@@ -134,7 +129,7 @@ def _offset_equations(chain: Chain, data: Sequence[Measurement], fit: Result) ->
     model = errors.derivative(np.zeros(len(errors.parameters)))
     ar, aa = [], []
     for item in data:
-        u = np.array([known[parameter.name] for parameter in item.instrument_parameters])
+        u = instrument_values(item, known)
         frames = chain.forward_kinematics(item.conditions())
         residual = item.residual(frames, u)
         a = whitened_jacobian(item, model, frames, u, residual)

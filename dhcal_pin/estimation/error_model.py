@@ -197,13 +197,17 @@ class ErrorModel:
     @property
     def has_arm(self) -> bool:
         """Whether the arm itself has unknown parameters, besides base and tool."""
-        outside = (BASE_FRAME, self.chain.tool_frame_index)
-        return any(p.error_frame not in outside for p in self.parameters)
+        return bool(self.is_of_arm.any())
+
+    @cached_property
+    def is_of_arm(self) -> Array:
+        """Which parameters are errors of the arm itself, not of base and tool, (p,)."""
+        frames = (BASE_FRAME, self.chain.tool_frame_index)
+        return np.array([p.error_frame not in frames for p in self.parameters], bool)
 
     def only_frames(self) -> ErrorModel | None:
         """Return the model with the unknowns of base and tool alone."""
-        outside = (BASE_FRAME, self.chain.tool_frame_index)
-        frame_parameters = tuple(p for p in self.parameters if p.error_frame in outside)
+        frame_parameters = tuple(self.parameters[i] for i in np.flatnonzero(~self.is_of_arm))
         return replace(self, parameters=frame_parameters) if frame_parameters else None
 
 

@@ -52,8 +52,7 @@ def separate_frames(uncertainty: Uncertainty, undetermined: Array, q: Array) -> 
     if not (undetermined.size and len(q) and np.isfinite(columns).all()):
         return uncertainty
     q = q[:: -(-len(q) // MAX_FITTED)]
-    points = uncertainty.chain.poses(q)[:, :3, 3]
-    lever = max(float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1)))), MIN_LEVER)
+    lever = max(se3.rms_radius(uncertainty.chain.poses(q)[:, :3, 3]), MIN_LEVER)
     gauge = _gauge_directions(uncertainty, undetermined, lever)
     if not gauge.shape[1]:
         return uncertainty

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .._typing import Array
+from ..measurements.base import instrument_values
 from ..robot.conditions import Conditions, concatenate_conditions
 from .problem import Chunk, Linearization, Problem
 
@@ -96,7 +97,7 @@ def _information(linearization: Linearization, chunk: Chunk) -> Array | None:
     data = chunk.data
     if data.configurations_per_row != 1 or not data.has_length_scale:
         return None
-    frames, u = chunk.frames(linearization.chain), chunk.instrument_values(linearization.instruments)
+    frames, u = chunk.frames(linearization.chain), instrument_values(chunk.data, linearization.instruments)
     observation = data.observation_matrix(frames, u, data.residual(frames, u))
     if observation.body is not None:
         return None

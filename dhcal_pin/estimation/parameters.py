@@ -296,6 +296,11 @@ PARAMETER_SETS: dict[str, ParameterSet] = {
 EXTENSIONS = tuple(FAMILIES)
 
 
+def set_names(sets: str | Iterable[str]) -> list[str]:
+    """Return the names of sets, comma-separated or one by one."""
+    return [name.strip() for name in sets.split(",")] if isinstance(sets, str) else list(sets)
+
+
 def select_parameters(
     chain: Chain, sets: str | Iterable[str], fix: Sequence[str] = (), free: Sequence[str] = ()
 ) -> ErrorModel:
@@ -315,7 +320,7 @@ def select_parameters(
         InvalidArgumentError: If a parameter is both fixed and freed, or no parameter is left.
         UnknownNameError: If a set or parameter is unknown.
     """
-    names = [s.strip() for s in sets.split(",")] if isinstance(sets, str) else list(sets)
+    names = set_names(sets)
     if unknown := [name for name in names if name not in PARAMETER_SETS]:
         raise UnknownNameError(
             f"unknown parameter set {unknown[0]!r}; choose from {', '.join(PARAMETER_SETS)}"

@@ -29,7 +29,6 @@ import numpy as np
 
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
-from ..robot.chain import BASE_FRAME
 from .error_model import ErrorModel
 from .parameters import fold_harmonics
 from .problem import Problem
@@ -77,7 +76,8 @@ def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
     """Find the parameters that have default priors."""
     if isinstance(priors, str):
         return np.full(len(errors.parameters), priors == "default")
-    return np.array([not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters])
+    is_default = (not any(fnmatch.fnmatchcase(p.name, key) for key in priors) for p in errors.parameters)
+    return np.fromiter(is_default, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,7 @@ class PriorGroups:
     @classmethod
     def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
         """Group the parameters of the robot that have default priors; base and tool are left out."""
-        outside = (BASE_FRAME, errors.chain.tool_frame_index)
-        inside = [i for i, p in enumerate(errors.parameters) if default[i] and p.error_frame not in outside]
+        inside = np.flatnonzero(errors.is_of_arm & default).tolist()
         # Angles of the geometry and of the transmission count as different units.
         units = [(errors.parameters[i].unit, errors.parameters[i].coefficient_index is None) for i in inside]
         keys = list(zip(units, expected[inside].tolist(), strict=True))

@@ -33,12 +33,12 @@ from .._kernels import apply_observation_matrix, factor_jacobian
 from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
-from ..measurements.base import InstrumentParameter, Measurement
+from ..measurements.base import InstrumentParameter, Measurement, instrument_values, residual_of
 from ..measurements.groups import POSITION
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from ..robot.conditions import SampleState
-from .error_model import ErrorModel
+from .error_model import ErrorModel, ErrorParameter
 from .normal_equations import NormalEquations
 from .qr import TriangularSystem, combine_r_factors, sum_of_squares
 from .scale_gauge import ScaleGauge, normalize_by_scale
@@ -84,6 +84,15 @@ class Problem:
         """Unknown instrument parameters, each once, length s."""
         return tuple(u for u in merge_instrument_parameters(self.data) if u.name not in self.known)
 
+    @property
+    def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:
+        """Unknowns, length p+s."""
+        return (*self.errors.parameters, *self.instrument_parameters)
+
+    def chain(self, x: Array) -> Chain:
+        """Build the chain with the errors at x."""
+        return self.errors.at(x[: len(self.errors.parameters)])
+
     def instruments(self, x: Array) -> dict[str, float]:
         """Compute the values of all instrument parameters, known and unknown."""
         differences = x[len(self.errors.parameters) :]
@@ -93,8 +102,16 @@ class Problem:
 
     def instrument_values_of(self, item: Measurement, x: Array) -> Array:
         """Compute the instrument parameters of one measurement."""
-        values = self.instruments(x)
-        return np.array([values[parameter.name] for parameter in item.instrument_parameters])
+        return instrument_values(item, self.instruments(x))
+
+    def instrument_start(self, first: Mapping[str, float]) -> Array:
+        """Return the start (s,) of the instruments: first values by name, such as a distortion."""
+        return np.array([first.get(p.name, p.nominal) - p.nominal for p in self.instrument_parameters])
+
+    def residuals(self, x: Array, data: Sequence[Measurement]) -> list[Array]:
+        """Compute the whitened residuals (k, m) of each of other measurements with the same unknowns."""
+        chain, values = self.chain(x), self.instruments(x)
+        return [residual_of(item, chain, values) for item in data]
 
     def linearize(self, x: Array) -> Linearization:
         """Linearize the model."""
@@ -167,7 +184,7 @@ class Problem:
 
     def cost(self, x: Array) -> float:
         """Compute the sum of squared whitened residuals and priors."""
-        chain = self.errors.at(x[: len(self.errors.parameters)])
+        chain = self.chain(x)
         size = self.scale_gauge.size(chain) if self.scale_gauge else 1.0
         costs = self.map_chunks(partial(_chunk_cost, chain, self.instruments(x), size))
         return sum(costs, float(np.sum((self.weights * x) ** 2)))
@@ -198,10 +215,6 @@ class Chunk:
         """Compute the frames of a chain at the samples."""
         k, m = self.joint_state.positions.shape
         return chain.forward_kinematics(self.joint_state, work_array("frames", k + 2, 7, 3, m))
-
-    def instrument_values(self, instruments: Mapping[str, float]) -> Array:
-        """Select the instrument parameters of the measurement."""
-        return np.array([instruments[parameter.name] for parameter in self.data.instrument_parameters])
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +282,7 @@ class Linearization:
     @UnbufferedRows()
     def _fill(self, block: Array, chunk: Chunk, frames: FrameBatch, small_angle: bool) -> ObservationMatrix:
         """Fill a block (c, k, m) with the last c columns of [J | r]; return the observation matrix."""
-        data, u = chunk.data, chunk.instrument_values(self.instruments)
+        data, u = chunk.data, instrument_values(chunk.data, self.instruments)
         if small_angle:
             block[-1], observation = data.small_angle(frames, u)
         else:
@@ -375,7 +388,7 @@ def _reordered(matrix: Array, order: Array) -> Array:
 
 def chunk_residual(chain: Chain, instruments: Mapping[str, float], chunk: Chunk) -> Array:
     """Compute the whitened residuals of a chunk."""
-    return chunk.data.residual(chunk.frames(chain), chunk.instrument_values(instruments))
+    return chunk.data.residual(chunk.frames(chain), instrument_values(chunk.data, instruments))
 
 
 def _chunk_cost(chain: Chain, instruments: Mapping[str, float], size: float, chunk: Chunk) -> float:
@@ -489,8 +502,7 @@ def _chunk_products_by_part(
 
 def whitened_residuals(problem: Problem, x: Array) -> Iterator[Array]:
     """Yield the whitened residuals of each measurement."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
-    chunks = problem.map_chunks(partial(chunk_residual, chain, problem.instruments(x)))
+    chunks = problem.map_chunks(partial(chunk_residual, problem.chain(x), problem.instruments(x)))
     for item in problem.data:
         parts = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
         yield np.concatenate([np.empty((item.residual_dim, 0)), *parts], 1)

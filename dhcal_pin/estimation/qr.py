@@ -96,8 +96,8 @@ def euclidean_norm(a: Array) -> float:
 class TriangularSystem:
     """R factor of the whitened rows [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost.
 
-    `batch.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `min_cost`,
-    `cost`, `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes
+    `batch.TriangularSystemBatch` is the same for b problems. It has the members `r`, `z`, `cost`,
+    `roundoff`, `residual_change` and `predicted_reduction`, too, with a leading axis b. The classes
     are separate because a single system is solved by LAPACK's triangular routines, which NumPy does not offer
     for stacks: a damped step with p = 24 takes seven times as long in a stack of one.
     """

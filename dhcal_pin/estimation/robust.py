@@ -314,7 +314,7 @@ def studentized_residuals(
         n_unknowns = effective_parameters(problem, solution)
     if n_rows <= n_unknowns and n_rows <= qr.rank(solution.system.r):
         return [np.zeros(len(item.rows)) for item in data]
-    chain = problem.errors.at(solution.x[: len(problem.errors.parameters)])
+    chain = problem.chain(solution.x)
     # Residuals of one image are whitened together. Rejected ones must not contribute to the others.
     weighted = [
         item if np.all(w == 1) else item.with_weights(w) for item, w in zip(data, weights, strict=True)

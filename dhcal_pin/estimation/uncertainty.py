@@ -134,7 +134,7 @@ class ModelFit:
 
     chi_square: float | None
     freedom: float
-    gains: Mapping[str, FamilyGain] = field(default_factory=dict)
+    gains: Mapping[str, FamilyGain]
 
 
 @dataclass(frozen=True, eq=False)

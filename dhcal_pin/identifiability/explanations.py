@@ -29,6 +29,7 @@ from ..estimation.error_model import ErrorParameter
 from ..estimation.parameters import fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
+from ..formatting import join_names
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
@@ -66,17 +67,17 @@ _UNIT_WEIGHT_TOL, _ZERO_WEIGHT = 1e-4, 1e-6
 _N_RANDOM_SAMPLES = 30
 
 
-def join_names(names: Sequence[str]) -> str:
-    """Join names with commas and "and"; summarize the last ones if there are too many."""
+def _list_names(names: Sequence[str]) -> str:
+    """Join names; summarize the last ones if there are too many."""
     if len(names) > _MAX_NAMES:
         names = [*names[: _MAX_NAMES - 1], f"{len(names) - _MAX_NAMES + 1} more"]
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return join_names(names)
 
 
 def _numbered(word: str, plural: str, numbers: Sequence[int], chain: Chain) -> str:
     """Name joints or axes by their numbers from 1, and by joint names that do not contain the number."""
     names = [chain.moving_joints[j - 1] for j in numbers]
-    text = f"{word if len(numbers) == 1 else plural} {join_names([str(j) for j in numbers])}"
+    text = f"{word if len(numbers) == 1 else plural} {_list_names([str(j) for j in numbers])}"
     is_clear = all(str(j) in name for j, name in zip(numbers, names, strict=True))
     return text if is_clear else f"{text} ({', '.join(names)})"
 
@@ -170,7 +171,7 @@ class Explainer:
         """List the names of a group; of too many names, those with the largest entries."""
         order = np.argsort(-np.abs(group.vectors[group.members]).max(1), kind="stable")
         selected = sorted(order[: _MAX_NAMES - 1]) + sorted(order[_MAX_NAMES - 1 :])
-        return join_names([names[i] for i in selected])
+        return _list_names([names[i] for i in selected])
 
     def _explain_redundancy(self, group: UnobservableGroup, names: list[str]) -> str:
         """Explain parameters of the robot that no instrument can separate."""
@@ -225,7 +226,7 @@ class Explainer:
     def _unit(self, i: int) -> str:
         """Return the unit of an unknown."""
         problem = self.probe.problem
-        return (*problem.errors.parameters, *problem.instrument_parameters)[i].unit
+        return problem.parameters[i].unit
 
     def _robot_part(self, group: UnobservableGroup) -> tuple[list[ErrorParameter], Propagation | None]:
         """Return the geometric errors of a group, and their propagation if the group has no other members."""
@@ -262,7 +263,7 @@ class Explainer:
         """Explain that poses of cameras and boards take the place of those of base and tool."""
         frames = [frame for frame, moves in (("base", False), ("tool", True)) if moves in entries.values()]
         frame = f"the pose of {' and '.join(f'the {name}' for name in frames)}"
-        poses = f"the pose{'s' if len(entries) > 1 else ''} of {join_names(list(entries))}"
+        poses = f"the pose{'s' if len(entries) > 1 else ''} of {_list_names(list(entries))}"
         n_directions = group.vectors.shape[1]
         number = "one combination" if n_directions == 1 else f"{n_directions} combinations"
         return (
@@ -372,7 +373,7 @@ class Explainer:
         """Explain directions that joints which never moved would make observable."""
         names = [self.plain_errors.chain.joint_names[j] for j in self.probe.unmoved_joints()]
         return (
-            f"{join_names(names)} never moved",
+            f"{_list_names(names)} never moved",
             f"move {'this joint' if len(names) == 1 else 'these joints'}",
         )
 
@@ -392,7 +393,7 @@ class Explainer:
             for j in range(chain.n_joints)
             if self._is_determined_by(self.probe.hypothetical_r_factor([j]), group)
         ]
-        joints = join_names([chain.joint_names[j] for j in decisive]) if decisive else "the joints"
+        joints = _list_names([chain.joint_names[j] for j in decisive]) if decisive else "the joints"
         return "the poses are too similar", f"measure poses over the full range of {joints}"
 
 
@@ -467,7 +468,7 @@ def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
     r = linearize_and_factor(problem, x, small_angle=False).r
     layers = probe.null_space_layers(r)
     plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
-    names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
+    names = [p.name for p in problem.parameters]
     explainer = Explainer(probe, dict(layers), names, plain_errors)
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
@@ -520,7 +521,7 @@ def explain_weakly_observable(
     if not len(std_ratios):
         return []
     problem, n_robot = probe.problem, len(probe.problem.errors.parameters)
-    names = [p.name for p in (*problem.errors.parameters, *problem.instrument_parameters)]
+    names = [p.name for p in problem.parameters]
     plain_errors = PlainErrors.from_model(problem.errors, probe.x[:n_robot])
     # R factor of as many poses over the full range of the joints.
     full_range = probe.full_range / np.sqrt(probe.n_repetitions)
@@ -542,7 +543,7 @@ def explain_weakly_observable(
             "" if len(members) == 1 else " of one combination" if count == 1 else f" of {count} combinations"
         )
         text = (
-            f"{join_names(fold_harmonics(names[i] for i in members))}: standard deviation{what} still "
+            f"{_list_names(fold_harmonics(names[i] for i in members))}: standard deviation{what} still "
             f"{100 * np.sqrt(ratio_squared[0]):.0f} %{' or more' * (count > 1)} of the prior"
         )
         geometric = [plain_errors.parameters[i] for i in members if i < len(plain_errors.parameters)]

@@ -90,7 +90,7 @@ class ObservabilityProbe:
     @property
     def chain(self) -> Chain:
         """Chain at x."""
-        return self.problem.errors.at(self.x[: len(self.problem.errors.parameters)])
+        return self.problem.chain(self.x)
 
     @property
     def n_repetitions(self) -> int:

@@ -14,12 +14,11 @@ of G = J·S are those of the samples. With K the matrix of k_ij with a zero diag
 residuals,
 
     Q    = rᵀ·K·r,    E[Q] = tr(K·V) = -tr(Gᵀ·K·G),    Var[Q] = 2·tr(K·V·K·V),
-    z    = (Q - E[Q])/√Var[Q],
+    z    = (Q - E[Q])/√Var[Q].
 
-and one step from λ = 0 to the maximum of the likelihood is λ = 2·(Q - E[Q])/Var[Q]. A z far below 0 also
-contradicts independent noise: a fit with many unknowns takes up more of errors that neighbours share than of
-noise, and leaves less than nothing of them. For many samples V = I is used: this lowers z, so that only a z
-far above 0 counts.
+A z far below 0 also contradicts independent noise: a fit with many unknowns takes up more of errors that
+neighbours share than of noise, and leaves less than nothing of them. For many samples V = I is used: this
+lowers z, so that only a z far above 0 counts.
 
 Shapes: m samples, k residuals per sample, r columns of S, n joints.
 
@@ -40,6 +39,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import TriangularSystem
+from ..measurements.base import residual_of
 
 # Distances l over which model errors are looked for, each half the one before [rad].
 LENGTHS = tuple(2.0**-i for i in range(-1, 6))
@@ -66,7 +66,6 @@ class ResidualCorrelation:
     """Correlation of the residuals of a fit between configurations."""
 
     z: float  # Score of the length at which it is farthest from 0, standard normal for independent residuals
-    share: float  # Share λ of the variance of the residuals that neighbours share, 0 to 1
 
     @property
     def is_significant(self) -> bool:
@@ -81,7 +80,7 @@ def find_residual_correlation(
 
     The system at x is that of the rows divided by the noise.
     """
-    linearization, chain = problem.linearize(x), problem.errors.at(x[: len(problem.errors.parameters)])
+    linearization, chain = problem.linearize(x), problem.chain(x)
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), 1, 1))
     for item, w in zip(problem.data, weights, strict=True):
@@ -96,8 +95,7 @@ def find_residual_correlation(
             rows = linearization.rows(Chunk(part, problem.errors.chain)) / noise
             effect, residual = np.tensordot(root, rows[:-1], (0, 0)), rows[-1]
         else:
-            values = problem.instrument_values_of(part, x)
-            residual = part.residual(chain.forward_kinematics(part.conditions()), values) / noise
+            residual = residual_of(part, chain, linearization.instruments) / noise
             effect, is_exact = np.empty((0, *residual.shape)), False
         scores = _score_terms(_points(part.q, problem.errors.chain.is_prismatic), residual, effect)
         excess += scores.excess
@@ -107,14 +105,10 @@ def find_residual_correlation(
     excess += np.trace(quadratic, axis1=1, axis2=2)
     variance += 2 * np.sum(quadratic * np.swapaxes(quadratic, 1, 2), (1, 2))
     is_known = variance > 0
-    if not is_known.any():
-        return ResidualCorrelation(0.0, 0.0)
     z = np.where(is_known, excess / np.sqrt(np.where(is_known, variance, 1.0)), 0.0)
     if not is_exact:
         z = np.maximum(z, 0.0)
-    best = int(np.argmax(np.abs(z)))
-    share = 2 * excess[best] / variance[best] if is_known[best] else 0.0
-    return ResidualCorrelation(float(z[best]), float(np.clip(share, 0.0, 1.0)))
+    return ResidualCorrelation(float(z[np.argmax(np.abs(z))]))
 
 
 class _ScoreTerms(NamedTuple):

@@ -25,6 +25,7 @@ from typing import Any
 from .._typing import PathLike
 from ..exceptions import FileFormatError
 from ..messages import quote
+from .tabular import unreadable
 
 # End of the names of bundles.
 ENDING = ".dhcal.zip"
@@ -93,17 +94,7 @@ def bundle_bytes(bundle: Bundle) -> bytes:
 
 
 def read_bundle(path: PathLike) -> Bundle:
-    """Read a bundle and check that nothing in it was changed.
-
-    Args:
-        path: File that `dhcal calibrate --bundle` wrote.
-
-    Returns:
-        Its content.
-
-    Raises:
-        FileFormatError: The file is no bundle, is damaged or was changed, or has members with unsafe names.
-    """
+    """Read a bundle and check that nothing in it was changed."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = _read_members(archive, path)
@@ -111,9 +102,7 @@ def read_bundle(path: PathLike) -> Bundle:
     except FileFormatError:
         raise
     except OSError as error:
-        raise FileFormatError(
-            f"{path}: cannot read it: {error.strerror}; give the path of a bundle"
-        ) from error
+        raise unreadable(path, error, "a bundle") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:
         raise FileFormatError(f"{path}: not a bundle or damaged: {error}; expected a zip file") from error
     text = members.pop(MANIFEST, b"")

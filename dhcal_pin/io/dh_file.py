@@ -269,8 +269,7 @@ def _csv_text(convention: str, poses: Mapping[str, Array], keys: list[str], rows
     units = {"d": "m", "a": "m", "lower": "rad|m", "upper": "rad|m"}
     lines = [f"# convention: {convention}"]
     for key, pose in poses.items():
-        numbers = [*pose[:3, 3].tolist(), *se3.log3(pose[:3, :3]).tolist()]
-        lines.append(f"# {key}: {' '.join(map(repr, numbers))}")
+        lines.append(f"# {key}: {' '.join(map(repr, se3.position_and_rotvec(pose).tolist()))}")
     lines.append(",".join(["joint", "type", *(f"{key}[{units.get(key, 'rad')}]" for key in keys)]))
     for name, joint_type, values in rows:
         cells = (repr(value) if math.isfinite(value) else "" for value in values.values())

@@ -174,15 +174,9 @@ READERS = (
 
 
 def require_agreement(written: Chain, nominal: Chain, path: PathLike) -> None:
-    """Require that all programs compute the tip of a written robot as the chain does.
+    """Require that the programs that read a robot compute the same tip of the written one as the chain.
 
-    Args:
-        written: Chain read from the bytes of the file, with identity base and tool and ideal joints.
-        nominal: The same for the file that was edited.
-        path: Path of the file for messages.
-
-    Raises:
-        DhcalError: A program that reads the nominal robot computes another tip.
+    Both chains have identity base and tool and ideal joints.
     """
     for reader in READERS:
         if type(written.urdf) not in reader.reads or not find_spec(reader.module):

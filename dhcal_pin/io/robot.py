@@ -218,21 +218,10 @@ def convert_robot(
     template: PathLike | None = None,
     template_tip: str | None = None,
 ) -> ConvertedRobot:
-    """Convert a robot file to another format, chosen by the ending of the target.
+    """Convert a robot file to another format, chosen by the ending of the target; return its text, and notes.
 
     A URDF or an MJCF can be copied. With a template the target is that file with the kinematics of the
-    source, see `template`.
-
-    Args:
-        source: Robot file.
-        target: Path of the file to write, whose ending selects the format.
-        tip: Tip link of the source.
-        convention: Convention of a DH table to write.
-        template: URDF or MJCF of the same robot to fill in.
-        template_tip: Tip of the template; of the name of the tip of the source if None.
-
-    Returns:
-        Text of the target, and notes.
+    source, see `template`; its tip has the name of the tip of the source if `template_tip` is None.
     """
     robot_format = find_format(target)
     if robot_format is None or robot_format.convert is None:

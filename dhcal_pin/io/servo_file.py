@@ -89,9 +89,9 @@ class Servo:
     joint: str  #: Name of its joint in the URDF.
     zero: float  #: Count at the zero of the joint.
     counts_per_turn: float  #: Counts of a full turn of the joint.
-    resolution: int = RESOLUTION  #: Number of counts that the motor can report, from 0 on.
-    sign: int = 1  #: 1, or -1 if counts rise while the joint value falls.
-    id: int | None = None  #: Number on the bus.
+    resolution: int  #: Number of counts that the motor can report, from 0 on.
+    sign: int  #: 1, or -1 if counts rise while the joint value falls.
+    id: int | None  #: Number on the bus.
     homing_offset: int = 0  #: Offset in LeRobot's file [counts].
 
     @property

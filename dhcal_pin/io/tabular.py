@@ -44,8 +44,13 @@ def read_bytes(path: PathLike, max_bytes: int = -1) -> bytes:
         with open(path, "rb") as file:
             return file.read(max_bytes)
     except (OSError, ValueError) as error:  # a path with a zero byte raises ValueError
-        reason = getattr(error, "strerror", None) or error
-        raise FileFormatError(f"{path}: cannot read it: {reason}; give the path of a file") from error
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: PathLike, error: Exception, expected: str = "a file") -> FileFormatError:
+    """Make the error about a file that cannot be read."""
+    reason = getattr(error, "strerror", None) or error
+    return FileFormatError(f"{path}: cannot read it: {reason}; give the path of {expected}")
 
 
 def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:

@@ -54,16 +54,7 @@ _ROUNDING = 1e-14
 
 
 def with_kinematics(template: Chain, robot: Chain, path: PathLike) -> Chain:
-    """Return a template with joint origins that give its tip the poses of the tip of a robot.
-
-    Args:
-        template: Chain of the file to fill in.
-        robot: Chain of the calibrated robot.
-        path: Path of the template for messages.
-
-    Raises:
-        InvalidArgumentError: The files do not describe the same robot between root and tip.
-    """
+    """Return a template with joint origins that give its tip the poses of the tip of a robot."""
     source = os.fspath(path)
     if template.moving_joints != robot.moving_joints or not np.array_equal(
         template.prismatic, robot.prismatic

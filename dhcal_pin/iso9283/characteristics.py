@@ -55,7 +55,7 @@ class PointCycles:
     commanded: Array  #: Commanded position, (3,) [m].
     attained: Array  #: Attained positions, (m, 3) [m].
     #: Rotation vectors from the commanded to the attained orientations, (m, 3) [rad]; None without.
-    rotations: Array | None = None
+    rotations: Array | None
 
     def characteristics(self) -> dict[str, float]:
         """Return AP and RP by their names with units, such as `AP_p_m`."""

@@ -59,16 +59,16 @@ class IsoCube:
     side: float  #: Side [m].
     centre: Array  #: Centre in the measuring frame, (3,) [m].
     q: Array  #: Joint positions at P1 to P5, (5, n) [rad or m].
-    notes: tuple[str, ...] = ()  #: What is not checked and why.
+    notes: tuple[str, ...]  #: What is not checked and why.
 
 
 def find_iso_cube(
     chain: Chain,
-    sides: Iterable[float] = SIDES,
-    space: WorkspaceConstraints | None = None,
-    margin: Noise | None = None,
-    candidates: int = N_CENTRES,
-    seed: int = 0,
+    sides: Iterable[float],
+    space: WorkspaceConstraints,
+    margin: Noise,
+    candidates: int,
+    seed: int,
 ) -> IsoCube:
     """Find a cube of the first side that fits into the workspace, and the joint positions at its points.
 
@@ -86,7 +86,7 @@ def find_iso_cube(
     Raises:
         InvalidArgumentError: No cube fits.
     """
-    space, margin, rng = space or WorkspaceConstraints(), margin or Noise(), np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     sampler = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
     low, high = limits_with_margin(chain, margin.rotation, margin.position)
     limited, starts, sides = replace(chain, lower=low, upper=high), sampler.draw(candidates, rng), list(sides)

@@ -493,6 +493,21 @@ def _field_names(kind: type[Measurement]) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind))
 
 
+def instrument_values(item: Measurement, values: Mapping[str, float]) -> Array:
+    """Return the instrument parameters of a measurement from values by name."""
+    return np.array([values[parameter.name] for parameter in item.instrument_parameters])
+
+
+def residual_of(item: Measurement, chain: Chain, values: Mapping[str, float]) -> Array:
+    """Compute the whitened residuals (k, m) for a chain and instrument parameters by name."""
+    return item.residual(chain.forward_kinematics(item.conditions()), instrument_values(item, values))
+
+
+def errors_of(item: Measurement, chain: Chain, values: Mapping[str, float]) -> dict[str, Array]:
+    """Compute the errors by group for a chain and instrument parameters by name."""
+    return item.errors(chain.forward_kinematics(item.conditions()), instrument_values(item, values))
+
+
 def whitened_jacobian(
     item: Measurement, model: tuple[Chain, Array, Array], frames: FrameBatch, u: Array, residual: Array
 ) -> Array:

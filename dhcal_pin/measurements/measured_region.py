@@ -123,6 +123,6 @@ def _thinned(q: Array) -> Array:
 
 def draw_joint_space(chain: Chain) -> Array:
     """Draw configurations evenly from the joint space within the limits."""
-    from ..robot.sampling import joint_range  # lazy import: slow, and few calibrations need it
+    from ..robot.sampling import random_configurations  # lazy import: slow, and few calibrations need it
 
-    return np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
+    return random_configurations(chain, N_CONFIGURATIONS)

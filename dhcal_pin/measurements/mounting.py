@@ -42,7 +42,7 @@ class MountedRig:
     boards: tuple[Board, ...]
     camera_mounts: tuple[Mount, ...]
     board_mounts: tuple[Mount, ...]
-    source: str = ""
+    source: str
 
     @property
     def has_links_to_exchange(self) -> bool:

@@ -63,17 +63,7 @@ class PoseMeasurement(Measurement):
     def __init__(
         self, q: Array, poses: ArrayLike, sigma: ArrayLike | None, rotation_sigma: ArrayLike | None
     ) -> None:
-        """Check and set the common attributes.
-
-        Args:
-            q: Checked joint positions, (m, n) [rad or m].
-            poses: Measured homogeneous matrices, (m, 4, 4).
-            sigma: Standard deviations of the position, one number or (m, 3) [m], or None.
-            rotation_sigma: Standard deviations of the rotation vector, one number or (m, 3) [rad], or None.
-
-        Raises:
-            InvalidArgumentError: Only one of the two standard deviations is given.
-        """
+        """Check and set the common attributes."""
         kind, m, is_stated = type(self).__name__, len(q), sigma is not None
         if is_stated != (rotation_sigma is not None):
             raise InvalidArgumentError(

@@ -57,14 +57,7 @@ class PointMeasurement(Measurement):
         sigma: ArrayLike | None,
         instrument_parameters: tuple[InstrumentParameter, ...] = (),
     ) -> None:
-        """Set the common attributes.
-
-        Args:
-            q: Checked joint positions, (m, n) [rad or m].
-            values: Checked measured values, (m, k) [m].
-            sigma: Standard deviations, one number or (m, k) [m]; None if they have to be estimated.
-            instrument_parameters: Instrument parameters, in the order of u.
-        """
+        """Set the common attributes, whose values are checked."""
         where = f"{type(self).__name__}: sigma"
         self._initialize(
             q=q,
@@ -142,6 +135,12 @@ class PointMeasurement(Measurement):
         }
 
 
+def _noisy_positions(chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Array:
+    """Return positions of the chain's tool point (m, 3) with normal noise on each axis."""
+    points = chain.forward_kinematics(conditions).tool[3].T
+    return points + noise.position * rng.standard_normal(points.shape)
+
+
 class Position(PointMeasurement):
     """Positions of the tool point in the measuring frame, by a laser tracker, a CMM or trilateration.
 
@@ -183,11 +182,7 @@ class Position(PointMeasurement):
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> Position:
         """Return positions of the chain's tool point with normal noise on each axis."""
-        q = conditions.q
-        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
-            (len(q), 3)
-        )
-        return cls(q, positions, noise.position or None)
+        return cls(conditions.q, _noisy_positions(chain, conditions, noise, rng), noise.position or None)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -258,11 +253,8 @@ class PositionComponents(PointMeasurement):
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> PositionComponents:
         """Return the coordinates x and z of the chain's tool point with normal noise."""
-        q = conditions.q
-        positions = chain.forward_kinematics(conditions).tool[3].T + noise.position * rng.standard_normal(
-            (len(q), 3)
-        )
-        return cls(q, positions[:, [0, 2]], (0, 2), noise.position or None)
+        positions = _noisy_positions(chain, conditions, noise, rng)
+        return cls(conditions.q, positions[:, [0, 2]], (0, 2), noise.position or None)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)

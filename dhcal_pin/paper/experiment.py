@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..calibration.evaluation import Accuracy, Comparison, accuracy, compute_errors
 from ..calibration.procedure import calibrate
@@ -53,7 +54,7 @@ def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Ac
 
 def _rms(differences: Array) -> float:
     """Return the root mean square of the norms of vectors, shape (m, 3)."""
-    return float(np.sqrt(np.mean(np.sum(differences**2, 1))))
+    return se3.rms_length(differences)
 
 
 @dataclass(frozen=True, eq=False)

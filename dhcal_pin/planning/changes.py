@@ -22,7 +22,7 @@ from ..robot.collision import CollisionChecker
 from ..robot.sampling import WorkspaceConstraints, limits_with_margin, scale_joint_units
 from .criteria import DOptimality
 from .exchange import CandidateSet, select_greedily
-from .planner import MARGIN_ANGLE, MARGIN_LENGTH, Plan
+from .planner import Plan
 from .tour import find_way, is_move_free
 
 # Sizes of changes that a check must reveal [m, rad].
@@ -52,21 +52,10 @@ def with_repeats(
     plan: Plan,
     chain: Chain,
     n_repeated: int,
-    space: WorkspaceConstraints | None = None,
-    margin: Noise | None = None,
+    space: WorkspaceConstraints,
+    margin: Noise,
 ) -> Plan:
-    """Return a plan with some of its poses at the begin, in the middle and at the end.
-
-    Args:
-        plan: Plan of n poses.
-        chain: Nominal robot.
-        n_repeated: Number of poses that are repeated: those that together determine the unknowns best.
-        space: Floor and obstacles of the moves.
-        margin: Margins to the joint limits [m, rad].
-
-    Returns:
-        Plan of n + 2·n_repeated poses.
-    """
+    """Return a plan with its most informative poses at the begin, in the middle and at the end."""
     rows, none = plan.information.rows(plan.q), np.zeros(0, int)
     candidates = CandidateSet.from_rows(rows, scale_joint_units(chain, plan.q), 0.0)
     chosen = select_greedily(
@@ -80,7 +69,6 @@ def with_repeats(
     chosen, rest = np.sort(chosen), np.setdiff1d(np.arange(len(plan.q)), chosen)
     halves = np.array_split(rest, N_VISITS - 1)
     order = np.concatenate([part for half in halves for part in (chosen, half)] + [chosen])
-    margin, space = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE), space or WorkspaceConstraints()
     limits = limits_with_margin(chain, margin.rotation, margin.position)
     checker = CollisionChecker.from_chain(chain, space.environment)
     ways, is_free, rng = [plan.q[:0]], [True], np.random.default_rng(0)

@@ -158,9 +158,8 @@ class BiasVarianceCriterion:
     def _fit_covariance_and_bias(self, sqrt_covariance: Array) -> tuple[Array, Array]:
         """Compute the square root (p, p) of the covariance C_f of the fit, and the bias B (p, f).
 
-        Both follow from the joint covariance C of all unknowns: C_f is the conditional covariance of the
-            fitted ones for
-        known omitted ones, and -B is the regression matrix of the fitted on the omitted ones.
+        Both follow from the joint covariance of all unknowns: C_f is the conditional covariance of the fitted
+        ones for known omitted ones, and -B is the regression matrix of the fitted on the omitted ones.
         """
         fitted, omitted = sqrt_covariance[self.fitted], sqrt_covariance[~self.fitted]
         q, r = np.linalg.qr(omitted.T)

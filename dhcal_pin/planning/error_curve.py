@@ -9,6 +9,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation import qr
 from ..robot.sampling import scale_joint_units
+from ..subsampling import evenly_spaced_indices
 from . import exchange
 from .refinement import DesignGoal, Selection, refine
 
@@ -113,7 +114,7 @@ def random_errors(
     ][:n_poses]
     poses = np.array(feasible, int)
     rows = candidates.rows_of(poses)[..., goal.full_information.fitted]
-    selected_sizes = sizes[np.unique(np.linspace(0, len(sizes) - 1, N_RANDOM_SIZES).round().astype(int))]
+    selected_sizes = sizes[evenly_spaced_indices(len(sizes), N_RANDOM_SIZES)]
 
     def median_error(size: int) -> float:
         plans = [rng.permutation(len(rows))[:size] for _ in range(N_RANDOM_PLANS)]

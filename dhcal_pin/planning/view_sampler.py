@@ -138,7 +138,7 @@ class ViewSampler(ConfigurationSampler):
             if not visible.any() or pair not in self._blocking:
                 continue
             eye, board = self._in_first_link(tools[0], *pair)
-            points = rig.boards[pair[1]].points[visible[0]] @ board[:3, :3].T + board[:3, 3]
+            points = se3.transform_points(board, rig.boards[pair[1]].points[visible[0]])
             ignored = frozenset().union(*self._blocking[pair].values())
             near_board = eye[:3, 3] + (1 - _BOARD_SHARE) * (points - eye[:3, 3])
             if not self.collision.is_view_free(q, eye[:3, 3], near_board, ignored):

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
-from ..robot.chain import BASE_FRAME, Chain
-from ..robot.sampling import joint_range
+from ..robot.chain import Chain
+from ..robot.sampling import joint_range, random_configurations
 
 # Number of configurations over the joint range, and of robots with random errors.
 _N_CONFIGURATIONS, _N_ROBOTS = 32, 24
@@ -48,8 +49,7 @@ def measure_correction(errors: ErrorModel, calibrated: Chain) -> CorrectionSize:
     nominal = errors.chain.with_base_and_tool(np.eye(4), calibrated.tool)
     q = rng.uniform(*joint_range(nominal), (_N_CONFIGURATIONS, nominal.n_joints))
     moved = _displacements(nominal, calibrated.with_base_and_tool(nominal.base, nominal.tool), q)
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    std = np.array([0.0 if p.error_frame in frames else p.prior for p in errors.parameters])
+    std = np.where(errors.is_of_arm, errors.priors, 0.0)
     model = replace(errors, chain=nominal)
     draws = [
         _displacements(nominal, model.at(std * rng.standard_normal(len(std))), q) for _ in range(_N_ROBOTS)
@@ -86,6 +86,4 @@ def _displacements(a: Chain, b: Chain, q: Array) -> Array:
 
 def workspace_radius(chain: Chain) -> float:
     """Compute the RMS distance of the tool from its mean position over the joint range."""
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (_N_CONFIGURATIONS, chain.n_joints))
-    points = chain.poses(q)[:, :3, 3]
-    return float(np.sqrt(np.mean(np.sum((points - points.mean(0)) ** 2, 1))))
+    return se3.rms_radius(chain.poses(random_configurations(chain, _N_CONFIGURATIONS))[:, :3, 3])

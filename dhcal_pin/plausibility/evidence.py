@@ -30,7 +30,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .._typing import Array
-from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
@@ -39,7 +38,7 @@ from ..estimation.solver import minimize
 from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement
 from ..measurements.pose import PoseMeasurement
 from ..measurements.position import PointMeasurement
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 
 # Errors that the robot may have; base and tool are free, so that instrument and target may be anywhere.
 MANUFACTURED = "minimal,base,tool"
@@ -79,12 +78,12 @@ class Evidence:
     errors: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
 
 
-def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Evidence:
+def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
     errors = initialize_frames(select_parameters(chain, sets), equal, {}, _N_FRAME_ITERATIONS)
     equal = tuple(item.initialized(errors.chain) for item in equal)
-    is_robot = _is_robot(errors)
+    is_robot = errors.is_of_arm
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
     problem = make_problem(
         errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
@@ -110,15 +109,9 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACT
         width,
         factor * noise.length_scale,
         factor * noise.angle_scale,
-        errors.at(solution.x[: len(errors.parameters)]),
+        problem.chain(solution.x),
         dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
     )
-
-
-def _is_robot(errors: ErrorModel) -> Array:
-    """Return which parameters belong to the robot itself, not to base and tool, (p,)."""
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    return np.array([parameter.error_frame not in frames for parameter in errors.parameters])
 
 
 def _with_equal_sigmas(item: Measurement) -> Measurement:
@@ -144,12 +137,9 @@ class _Noise:
 
 def _estimate_noise(problem: Problem, x: Array) -> _Noise:
     """Estimate scales of lengths and angles, and the weights of outliers, from the residuals at x."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
     # Mean square of each sample (m,) by item and name of the residual group.
     squares: list[dict[str, Array]] = []
-    for item in problem.data:
-        u = problem.instrument_values_of(item, x)
-        r = item.residual(chain.forward_kinematics(item.conditions()), u)
+    for item, r in zip(problem.data, problem.residuals(x, problem.data), strict=True):
         squares.append({name: np.mean(r[g.rows] ** 2, 0) for name, g in item.residual_groups.items()})
     n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
     share = min(1.0, 0.5 * (1 + len(x) / n_rows))

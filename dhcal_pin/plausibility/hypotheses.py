@@ -183,7 +183,7 @@ class AxisChange:
     """Other axes of measured positions, rotations unchanged: axis i is sign_i times axis source_i as read."""
 
     sources: tuple[int, int, int]  # Column that holds each axis
-    signs: tuple[int, int, int] = (1, 1, 1)  # 1 or -1 for each axis
+    signs: tuple[int, int, int]  # 1 or -1 for each axis
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements with changed positions."""
@@ -213,7 +213,7 @@ class QuaternionOrder:
         # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
         step = 1 if self.order == "xyzw" else -1
         return _with_rotations(
-            item, lambda rotations: _quaternion_to_matrix(np.roll(_matrix_to_quaternion(rotations), step, 1))
+            item, lambda old: se3.quaternion_to_matrix(np.roll(_matrix_to_quaternion(old), step, 1))
         )
 
 
@@ -322,13 +322,6 @@ def _matrix_to_quaternion(rotations: Array) -> Array:
     angles = np.linalg.norm(vectors, axis=1, keepdims=True)
     # sin(a/2)/a, with its limit 1/2 at 0.
     return np.concatenate([np.cos(0.5 * angles), vectors * 0.5 * np.sinc(0.5 * angles / np.pi)], 1)
-
-
-def _quaternion_to_matrix(quaternions: Array) -> Array:
-    """Convert unit quaternions w, x, y, z of either sign, (m, 4), to rotations (m, 3, 3)."""
-    w, v = quaternions[:, :1, None], quaternions[:, 1:]
-    skew = se3.skew(v)
-    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
 
 
 @dataclass(frozen=True)

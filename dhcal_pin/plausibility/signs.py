@@ -24,7 +24,7 @@ from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
 from ..robot.chain import Chain
-from ..robot.sampling import joint_range
+from ..robot.sampling import random_configurations
 from ..robot.urdf_edit import with_turned_joints
 from .evidence import HAND_BUILT, Evidence, fit_evidence
 from .hypotheses import Hypothesis, JointChange
@@ -64,7 +64,7 @@ class SignDecision:
 
     joint_names: tuple[str, ...]  #: Names of all joints.
     is_prismatic: tuple[bool, ...]  #: Whether each of them is prismatic.
-    turned: tuple[str, ...] = ()  #: Joints that turn the other way.
+    turned: tuple[str, ...]  #: Joints that turn the other way.
     open: tuple[OpenSigns, ...] = ()  #: Open questions, the most likely one first.
     is_compared: bool = True  #: Whether the measurements are enough to compare signs.
 
@@ -247,8 +247,7 @@ def _open_signs(
     chain: Chain, chosen: tuple[int, ...], other: tuple[int, ...], fits: dict[tuple[int, ...], Evidence]
 ) -> OpenSigns:
     """Find the configuration at which the arms of two hypotheses differ most."""
-    lower, upper = joint_range(chain)
-    q = np.random.default_rng(0).uniform(lower, upper, (_N_CONFIGURATIONS, chain.n_joints))
+    q = random_configurations(chain, _N_CONFIGURATIONS)
     positions = []
     for turned in (chosen, other):
         arm = fits[turned].chain

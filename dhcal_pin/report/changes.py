@@ -61,7 +61,7 @@ def _maps(difference: Difference) -> list[FigureGroup]:
     a, b = difference.first, difference.second
     points, others = (chain.poses(difference.q)[:, :3, 3] for chain in (a, b))
     distances, base = np.linalg.norm(points - others, axis=1), se3.inverse(a.base)
-    points = points @ base[:3, :3].T + base[:3, 3]
+    points = se3.transform_points(base, points)
     levels, panels = plots.std_levels(distances), []
     for plane, view in (("xy", "from above"), ("xz", "from the side")):
         plot = partial(plots.plot_position_std_map, points, distances, plane=plane, levels=levels)

@@ -20,7 +20,7 @@ from .._typing import Array
 from ..calibration.evaluation import compute_errors, error_norms
 from ..calibration.presentation.workspace import WorkspacePrediction
 from ..estimation import qr
-from ..formatting import Quantity, capitalized
+from ..formatting import Quantity, capitalized, round_up
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..robot.chain import Chain
@@ -28,7 +28,7 @@ from ..session import histories
 from ..visualization import scene
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel
-from .samples import ROLES, Samples, is_prismatic_joint
+from .samples import ROLES, Samples
 
 # A joint whose errors are larger than this multiple of the joints' median gets a scale of its own. Errors
 # before the calibration are left out if they are larger than this multiple of those after it.
@@ -220,7 +220,7 @@ def _joint_error_group(samples: Samples) -> FigureGroup:
             samples.q[is_shown, i],
             errors[is_shown],
             joint=joint,
-            is_prismatic=is_prismatic_joint(samples.chain, i),
+            is_prismatic=bool(samples.chain.is_prismatic[i]),
             quantity=quantity,
             unit=ERROR_GROUPS[group].unit,
         )
@@ -337,7 +337,7 @@ def scene_figures(context: ReportContext) -> list[FigureGroup]:
     fit, magnification = context.fit, scene_magnification(context)
     base = se3.inverse(fit.chain.base)
     nominal, calibrated = (
-        points @ base[:3, :3].T + base[:3, 3]
+        se3.transform_points(base, points)
         for points in (_arm_points(chain, context) for chain in (fit.nominal_refitted, fit.chain))
     )
     arms = {"before": nominal, "after": nominal + magnification * (calibrated - nominal)}
@@ -377,7 +377,7 @@ def scene_magnification(context: ReportContext) -> float:
     )
     displacement = float(np.linalg.norm(calibrated - nominal, axis=1).max())
     wanted = DRAWN_DISPLACEMENT * float(np.ptp(nominal, axis=0).max()) / max(displacement, 1e-12)
-    return min(max(_round_up_125(max(wanted, 1e-3) / 2), 1.0), scene.MAX_MAGNIFICATION)
+    return min(max(round_up(max(wanted, 1e-3) / 2), 1.0), scene.MAX_MAGNIFICATION)
 
 
 def _arm_points(chain: Chain, context: ReportContext) -> Array:
@@ -390,12 +390,6 @@ def _arm_points(chain: Chain, context: ReportContext) -> Array:
         q = np.concatenate(used)[nearest : nearest + 1]
     frames = chain.forward_kinematics(q)
     return np.array([*(body[3, :, 0] for body in frames.bodies), frames.tool[3, :, 0]])
-
-
-def _round_up_125(value: float) -> float:
-    """Return the smallest of 1, 2 and 5 times a power of ten that is at least `value`."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(k * power for k in (1, 2, 5, 10) if k * power >= value * (1 - 1e-9))
 
 
 def observability_figures(context: ReportContext) -> list[FigureGroup]:

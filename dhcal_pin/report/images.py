@@ -8,11 +8,12 @@ from functools import partial
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..calibration.cameras import ImageError, Stage
 from ..calibration.evaluation import compute_errors
 from ..cameras.rig import Camera
-from ..formatting import Table, format_fixed
+from ..formatting import Table, format_fixed, round_down
 from ..visualization import image_plots
 from .context import ReportContext
 from .document import FigureGroup, LegendEntry, Panel, Section
@@ -42,12 +43,7 @@ class _Image:
     @property
     def rms(self) -> float:
         """RMS distance in the image after the calibration [px]."""
-        return _rms(self.after)
-
-
-def _rms(errors: Array) -> float:
-    """Return the RMS length of errors (c, d)."""
-    return float(np.sqrt(np.mean(np.sum(errors**2, 1))))
+        return se3.rms_length(self.after)
 
 
 def image_section(context: ReportContext) -> Section | None:
@@ -109,7 +105,7 @@ def image_table(context: ReportContext) -> Table:
             image.camera.name,
             image.role,
             str(len(image.pixels)),
-            f"{_rms(image.before):.3g}",
+            f"{se3.rms_length(image.before):.3g}",
             f"{image.rms:.3g}",
             format_fixed(1e3 * float(np.sqrt(np.mean(image.distance**2))), 3),
         ]
@@ -155,7 +151,7 @@ def _images(context: ReportContext) -> list[_Image]:
 def image_figures(context: ReportContext) -> list[FigureGroup]:
     """Draw the errors of corners over the images of each camera, of each image, and of the worst images."""
     images = _images(context)
-    before, after = (np.array([_rms(e) for e in side]) for side in
+    before, after = (np.array([se3.rms_length(e) for e in side]) for side in
                      ([i.before for i in images], [i.after for i in images]))  # fmt: skip
     text = (
         f"RMS error of the corners of {len(images)} images: median {np.median(before):.3g} px before, "
@@ -197,19 +193,13 @@ def _reprojection_panel(
 ) -> Panel:
     """Return the figure of corners of a camera with their errors."""
     large = max(float(np.percentile(np.linalg.norm(errors, axis=1), _LARGE_PERCENTILE)), 1e-9)
-    magnification = _round_down(_DRAWN_PART * camera.width / large)
+    magnification = round_down(_DRAWN_PART * camera.width / large)
     text = (
         f"{len(pixels)} corners in an image plane of {camera.width} x {camera.height} px, RMS error "
-        f"{_rms(errors):.3g} px, drawn {magnification:g} times larger."
+        f"{se3.rms_length(errors):.3g} px, drawn {magnification:g} times larger."
     )
     plot = partial(
         image_plots.plot_reprojection, pixels, errors, (camera.width, camera.height), magnification
     )
     height = (width - _BESIDE) * camera.height / camera.width + _BELOW
     return Panel(key, f"{title}, errors × {magnification:g}", text, plot, (width, height))
-
-
-def _round_down(value: float) -> float:
-    """Return the largest number 1, 2 or 5 times a power of ten below a value."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

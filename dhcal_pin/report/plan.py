@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -32,8 +32,8 @@ class PlanReport:
     text: str  #: Content of this file.
     moves: Sequence[str]  #: Sentences on the moves between the poses.
     scene: str  #: Page of a 3-D scene with the poses.
-    inputs: Mapping[str, str] = field(default_factory=dict)  #: SHA-256 of each input file by path.
-    pixel_sigma: float = float("nan")  #: Standard deviation of the corners of planned images [px].
+    inputs: Mapping[str, str]  #: SHA-256 of each input file by path.
+    pixel_sigma: float  #: Standard deviation of the corners of planned images [px].
 
 
 def plan_page(report: PlanReport) -> str:

@@ -144,14 +144,9 @@ def samples_section(samples: Samples, title: str = "Samples") -> Section:
     return Section("samples", title, sentences, tables=[Table(header, rows)] if rows else [])
 
 
-def is_prismatic_joint(chain: Chain, joint: int) -> bool:
-    """Return whether an independent joint of a chain is prismatic."""
-    return bool(chain.prismatic[np.flatnonzero(chain.mimic_matrix[:, joint])[0]])
-
-
 def joint_unit(chain: Chain, joint: int) -> str:
     """Return the SI unit of an independent joint of a chain."""
-    return "m" if is_prismatic_joint(chain, joint) else "rad"
+    return "m" if chain.is_prismatic[joint] else "rad"
 
 
 def _shown_unit(factor: float, unit: str) -> dict[str, Any]:

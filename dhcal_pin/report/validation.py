@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -36,13 +36,13 @@ class Validation:
     paths: Sequence[str]  #: File of each measurement.
     accuracies: Mapping[str, Accuracy]  #: Accuracy by the name of the model; the last one is that of `chain`.
     #: Nominal robot and the instrument parameters it was judged with, if there is one.
-    reference: tuple[Chain, Mapping[str, float]] | None = None
-    remarks: Sequence[str] = ()  #: Sentences on the figures.
-    warnings: Sequence[str] = ()  #: What a reader must know before relying on the figures.
-    notes: Sequence[str] = ()  #: What of the input is not used.
-    inputs: Mapping[str, str] = field(default_factory=dict)  #: SHA-256 of each input file by path.
+    reference: tuple[Chain, Mapping[str, float]] | None
+    remarks: Sequence[str]  #: Sentences on the figures.
+    warnings: Sequence[str]  #: What a reader must know before relying on the figures.
+    notes: Sequence[str]  #: What of the input is not used.
+    inputs: Mapping[str, str]  #: SHA-256 of each input file by path.
     #: Characteristics of poses according to ISO 9283, if they were asked for.
-    characteristics: PoseCharacteristics | None = None
+    characteristics: PoseCharacteristics | None
 
 
 def validation_page(validation: Validation) -> str:

@@ -268,10 +268,7 @@ def _common_normal(origin: Array) -> tuple[float, float]:
 def _row_through_origin(origin: Array, arm_length: float, offset_first: bool) -> tuple[float, float]:
     """Return t1 and d2 of a row with β that passes through one of the two origins.
 
-    With `offset_first` the row passes through the next origin: d1 is the robot's own offset along the first
-        axis
-    and d2 is 0. Otherwise it passes through the first origin: d1 is 0 and d2 is the offset along the next
-        axis.
+    With `offset_first` it is the next origin, and d2 is 0. Otherwise it is the first one, and d1 is 0.
     """
     rotation, p = origin[:3, :3], origin[:3, 3]
     d2 = 0.0 if offset_first else float(p[2] / rotation[2, 2])

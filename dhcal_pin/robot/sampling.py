@@ -91,6 +91,11 @@ def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[
     )
 
 
+def random_configurations(chain: Chain, count: int) -> Array:
+    """Draw configurations (count, n) evenly from the joint range, the same in each call."""
+    return np.random.default_rng(0).uniform(*joint_range(chain), (count, chain.n_joints))
+
+
 def limits_with_margin(chain: Chain, angle: float, length: float) -> tuple[Array, Array]:
     """Return the joint limits, (n,) each, less a margin for revolute [rad] and prismatic [m] joints."""
     # The margin is at most a quarter of the range, so that half of it remains.

@@ -80,7 +80,7 @@ class GravityLoads:
     link_vectors: Array
     reference_temperature: float
     tip: str
-    payload: Payload | None = None
+    payload: Payload | None
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @property
@@ -246,11 +246,9 @@ class Transmission:
         return np.tensordot(self.link_terms, terms[-len(LINK_TERMS) :, 0], (0, 0))
 
     def locate(self, entries: Array) -> tuple[Array, Array, Array]:
-        """Find what each of some coefficients scales.
+        """Find the motion, the term and its joint of each of some coefficients, shape (e,) each.
 
-        Returns:
-            Number of the motion, shape (e,): those of the joints are 0 to n-1, those of the growth of links
-            follow. Number of the term, shape (e,), and of its joint, shape (e,).
+        Motions 0 to n-1 are those of the joints; those of the growth of links follow.
         """
         n, n_links = len(self.linear), self.link_terms.shape[1]
         first_link_term = len(self.coefficients) - self.link_terms.size

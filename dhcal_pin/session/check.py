@@ -41,7 +41,7 @@ from ..estimation.initialization import make_problem
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
-from ..measurements.base import Measurement, Noise
+from ..measurements.base import Measurement, Noise, instrument_values
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from .causes import Block, Cause, Constant
@@ -285,7 +285,7 @@ class _CheckModel:
         values, shared, own = self.problem.instruments(self.x), [], []
         for item in self.data:
             frames, m = self.chain.forward_kinematics(item.conditions()), len(item.rows)
-            u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
+            u = instrument_values(item, values)
             observation = item.observation_matrix(frames, u, item.residual(frames, u))
 
             def whitened(motions: Array, item=item, observation=observation) -> Array:

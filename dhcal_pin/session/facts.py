@@ -227,7 +227,7 @@ class Session:
     changes: RobotChanges
     timeline: Timeline
     chain: Chain
-    is_ordered: bool = True
+    is_ordered: bool
     causes: tuple[Cause, ...] = ()
     events: tuple[Event, ...] = ()
     drifts: tuple[SlowChange, ...] = ()

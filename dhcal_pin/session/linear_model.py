@@ -17,7 +17,7 @@ from .._kernels import apply_observation_matrix
 from .._typing import Array
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, instrument_values
 from ..robot.chain import Chain
 from ..robot.error_families import MIN_LINK_LENGTH
 from .causes import HELD_SIZE, Block
@@ -171,7 +171,7 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         block = out[:, : item.residual_dim, start : start + len(item.rows)]
         start += len(item.rows)
         frames = chain.forward_kinematics(item.conditions())
-        u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
+        u = instrument_values(item, values)
         residual = item.residual(frames, u)
         observation = item.observation_matrix(frames, u, residual)
         block[-1] = residual

@@ -109,12 +109,7 @@ class RobotChanges:
         return replace(self, **{kind: replace(motion, steps=steps)})
 
     def carried_to(self, base: Array, tool: Array) -> RobotChanges:
-        """Return the changes of the same robot with the base pose M·B and the tool pose T·N⁻¹.
-
-        Args:
-            base: Motion M, (4, 4) [m].
-            tool: Motion N, (4, 4) [m].
-        """
+        """Return the changes of the same robot with the base M·B and tool T·N⁻¹, M and N (4, 4) [m]."""
         by_tool = se3.adjoint(tool)
         drifts = tuple((shape, twists @ by_tool.T) for shape, twists in self.tool.drifts)
         return replace(
@@ -126,14 +121,9 @@ class RobotChanges:
     def conditions(
         self, conditions: Conditions, chain: Chain, numbers: Array, times: Array, later: Array | None
     ) -> Conditions:
-        """Return the conditions of samples with the changes.
+        """Return the conditions of m samples with the changes, by their numbers and times (m,).
 
-        Args:
-            conditions: Conditions of m samples without changes.
-            chain: Robot with the base frame in which the base drifts.
-            numbers: Numbers of the samples, (m,).
-            times: Times of the samples, (m,).
-            later: Joint positions by the lag later, (m, n); None without a lag.
+        The base drifts in that of the chain. `later` are the joint positions by the lag later, (m, n).
         """
         values: dict[str, Any] = {}
         if not self.base.is_identity:
@@ -200,14 +190,10 @@ def apply_changes(
 def update(
     changes: RobotChanges, causes: Sequence[Cause], steps: Sequence[Array], base: Array, links: Array
 ) -> RobotChanges:
-    """Return the changes after increments of the coefficients of causes.
+    """Return the changes after increments (F·c,) of the coefficients of each cause.
 
-    Args:
-        changes: Changes before.
-        causes: Causes.
-        steps: Increments of the coefficients of each cause, (F·c,) each.
-        base: Pose of the base (4, 4) at the end [m].
-        links: Columns of the growth of each link in the linear model, (k+1,).
+    `base` is the pose of the base (4, 4) at the end [m], `links` are the columns of the growth of each link
+    in the linear model, (k+1,).
     """
     motions = {"base": changes.base, "tool": changes.tool}
     zeros: list[tuple[int, Change, Array]] = []

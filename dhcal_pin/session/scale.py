@@ -25,7 +25,6 @@ import numpy as np
 from .._typing import Array
 from ..estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, base, placement, tool
 from ..estimation.problem import Problem
-from ..robot.chain import BASE_FRAME
 from .facts import MAX_SCALE_CHANGE, Scale
 from .linear_model import Layout, inverse, measures_positions, whitened_rows
 
@@ -50,10 +49,7 @@ MAX_SAMPLES = 100
 def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
     errors = problem.errors
-    outside = (BASE_FRAME, errors.chain.tool_frame_index)
-    is_arm = np.array(
-        [p.error_frame not in outside and p.coefficient_index is None for p in errors.parameters], bool
-    )
+    is_arm = errors.is_of_arm & np.array([p.coefficient_index is None for p in errors.parameters], bool)
     is_length = is_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
     if not measures_positions(problem.data) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:

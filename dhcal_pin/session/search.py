@@ -31,7 +31,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, residual_of
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, solve_information, whitened_rows
@@ -283,8 +283,7 @@ class _Search:
 
     def _base(self) -> Array:
         """Return the pose of the base (4, 4) at the current unknowns [m]."""
-        errors = self.layout.problem.errors
-        return errors.at(self.layout.errors_at(self.x)[: len(errors.parameters)]).base
+        return self.layout.problem.chain(self.layout.errors_at(self.x)).base
 
     # ------------------------------------------------------------------------------------------- test
     def best_cause(self, fit: LinearFit) -> Cause | None:
@@ -598,7 +597,7 @@ class _Search:
         """Move steps between two fitted samples to where the held-out samples between them fit best."""
         timeline, layout = self.timeline, self.layout
         full = layout.errors_at(self.x)
-        chain = layout.problem.errors.at(full[: len(layout.problem.errors.parameters)])
+        chain = layout.problem.chain(full)
         values = layout.problem.instruments(full)
         held_out = timeline.numbers[timeline.n_fitted :]
         for i, cause in enumerate(self.causes):
@@ -615,9 +614,7 @@ class _Search:
                 for item, numbers in zip(items, held_out, strict=True):
                     part = item.take(np.isin(numbers, between))
                     if len(part.rows):
-                        u = np.array([values[parameter.name] for parameter in part.instrument_parameters])
-                        frames = chain.forward_kinematics(part.conditions())
-                        costs[new] += float(np.sum(np.abs(part.residual(frames, u))))
+                        costs[new] += float(np.sum(np.abs(residual_of(part, chain, values))))
             best = min(costs, key=lambda number: costs[number])
             self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, best)
             self.causes[i] = replace(cause, shape=Step(best))
@@ -711,16 +708,9 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
-    """Find what happened during a session.
+    """Find what happened during a session, from an approximate solution x (p,) with base and tool.
 
-    Args:
-        problem: Problem with initialized base and tool.
-        x: Approximate solution, (p,).
-        holdout: Held-out measurements, which only count for the timeline.
-        is_ordered: Whether the samples are in the order of measurement; else only files may differ.
-
-    Returns:
-        Causes and changes of the robot.
+    Held-out measurements only count for the timeline. Without an order only files may differ.
     """
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(RobotChanges(), timeline, chain, is_ordered)

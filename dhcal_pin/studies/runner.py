@@ -24,7 +24,7 @@ from ..estimation.parameters import select_parameters
 from ..measurements import KINDS
 from ..measurements.base import Noise, concatenate
 from ..parallel import SERIAL, TaskExecutor
-from ..units import parse_noise
+from ..units import column_header, parse_noise
 from .grid import MAX_SEEDS, PLANNED, Case, Setting, StudyGrid, Task, draw_configurations
 
 # Number of test poses at which each calibrated robot is compared with its true robot.
@@ -124,7 +124,7 @@ def result_table(study: StudyGrid, blocks: Sequence[list[list[float]]]) -> tuple
     a setting are None.
     """
     names = [field.name for field in fields(Setting)]
-    measures = [f"{name}[{unit}]" if unit else name for name, unit in MEASURE_UNITS.items()]
+    measures = [column_header(name, unit) for name, unit in MEASURE_UNITS.items()]
     header = [*names, "calibrations", *measures, "position_rms_p90[m]"]
     results = np.array([row for block in blocks for row in block]).reshape(len(study.cases), study.seeds, -1)
     rows = []

@@ -42,9 +42,9 @@ def rig_lines(rig: MountedRig, base: Array, size: float) -> dict[str, Any]:
     for name, moves, pose, segments, points in (*cameras, *boards):
         # The page draws in the frame of the base link.
         in_frame = pose if moves else se3.inverse(base) @ pose
-        ends = segments.reshape(-1, 3) @ in_frame[:3, :3].T + in_frame[:3, 3]
+        ends = se3.transform_points(in_frame, segments.reshape(-1, 3))
         parts.append({"name": name, "moves": bool(moves), "segments": np.round(ends, 6).tolist()})
-        anchors.append(np.round(points @ in_frame[:3, :3].T + in_frame[:3, 3], 6))
+        anchors.append(np.round(se3.transform_points(in_frame, points), 6))
     rays = [
         {
             "camera": i,

@@ -14,14 +14,13 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.uncertainty import Predictor
-from ..robot.sampling import joint_range
+from ..formatting import round_down
+from ..robot.sampling import random_configurations
 
 # Configurations that are drawn; a cell of a robot with six joints contains about ten of them.
 N_CONFIGURATIONS = 6000
 # Cells along the largest extent of the workspace, at least.
 MIN_CELLS = 10
-# Lengths that a cell may have, times a power of ten.
-_ROUND = np.array([1.0, 2.0, 5.0, 10.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,22 +37,14 @@ class UncertaintyCells:
 def uncertainty_cells(predictor: Predictor) -> UncertaintyCells:
     """Predict the uncertainty of the tool position by cells."""
     chain = predictor.chain
-    q = np.random.default_rng(0).uniform(*joint_range(chain), (N_CONFIGURATIONS, chain.n_joints))
-    prediction = predictor.relative.predict(q)
-    base = se3.inverse(chain.base)
-    points = prediction.poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
+    prediction = predictor.relative.predict(random_configurations(chain, N_CONFIGURATIONS))
+    points = se3.transform_points(se3.inverse(chain.base), prediction.poses[:, :3, 3])
     variances = prediction.position_std**2
     is_finite = np.isfinite(variances)
     points, variances = points[is_finite], variances[is_finite]
     if not len(points):
         return UncertaintyCells(1.0, np.empty((0, 3), int), np.empty(0))
-    size = _round_length(float(np.ptp(points, axis=0).max()) / MIN_CELLS)
+    size = round_down(max(float(np.ptp(points, axis=0).max()) / MIN_CELLS, 1e-3))
     cells, index = np.unique(np.floor(points / size).astype(int), axis=0, return_inverse=True)
     index = index.reshape(-1)
     return UncertaintyCells(size, cells, np.sqrt(np.bincount(index, variances) / np.bincount(index)))
-
-
-def _round_length(length: float) -> float:
-    """Round a length down to 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(length, 1e-3)))
-    return float(power * _ROUND[np.searchsorted(_ROUND, max(length, 1e-3) / power * (1 + 1e-9)) - 1])

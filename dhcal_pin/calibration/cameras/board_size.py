@@ -24,7 +24,6 @@ from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
 from ...measurements.images.camera_parameters import POINTS_SET
-from ...robot.chain import BASE_FRAME
 from ..reweighting import Fit
 from .causes import MAX_SIZE_STEP, SIZE_STEP, find_minimum
 
@@ -104,8 +103,7 @@ def find_board_size(fit: Fit) -> BoardSize | None:
 
 def _lengths(errors: ErrorModel) -> Array:
     """Return which parameters are lengths of the arm, without base and tool, (p,)."""
-    frames = (BASE_FRAME, errors.chain.tool_frame_index)
-    return np.array([p.unit == "m" and p.error_frame not in frames for p in errors.parameters], bool)
+    return errors.is_of_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
 
 
 def _rms_correction(errors: ErrorModel, x: Array) -> float:

@@ -117,7 +117,7 @@ def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
     return item if rig is item.rig else item.with_rig(rig)
 
 
-def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None = None) -> Fit:
+def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> Fit:
     """Fit the model of some causes; noise and the sizes of the arm's errors are estimated."""
     fit = _first_fit(hand_eye, causes, start)
     errors = fit.problem.errors
@@ -149,9 +149,7 @@ def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
     data = tuple(item.initialized(errors.chain) for item in data)
     weights = np.array([1 / p.prior for p in errors.parameters])
     problem = make_problem(errors, data, weights, known)
-    first = start or {}
-    x = [first.get(p.name, p.nominal) - p.nominal for p in problem.instrument_parameters]
-    x = np.concatenate([np.zeros(len(weights)), x])
+    x = np.concatenate([np.zeros(len(weights)), problem.instrument_start(start or {})])
     solution = minimize(problem, "lm", x, _MAX_ITERATIONS, loose=True)
     return Fit(data, problem, solution, tuple(np.ones(len(item.rows)) for item in data))
 

@@ -66,7 +66,7 @@ def _with_corner_noise(fit: Fit) -> tuple[Measurement, ...]:
 
 def _errors_and_slopes(item: CameraCorners, problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return errors [px] and squared derivatives [px²/m²] of image coordinates, (m, 2) each."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chain = problem.chain(x)
     frames, u = chain.forward_kinematics(item.conditions()), problem.instrument_values_of(item, x)
     return item.errors(frames, u)["pixels"], np.sum(item.corner_derivative(frames, u) ** 2, 2)
 

@@ -27,7 +27,7 @@ from ...cameras.rig import Camera
 from ...estimation.robust import ZERO_WEIGHT
 from ...exceptions import DhcalError
 from ...formatting import Quantity, Table, format_quantity
-from ...measurements.base import Measurement
+from ...measurements.base import Measurement, errors_of, instrument_values
 from ...measurements.camera import CameraCorners
 from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
@@ -257,7 +257,7 @@ class HandEyeFit:
     fit: Fit  # Fit of the poses with the nominal arm; only base and tool of the robot may be unknown
     position_std: float  # Largest standard deviation of the position of a camera or a board [m]
     holdout: tuple[Measurement, ...]  # Held-out images, for the order of all images
-    unrelated: str = ""  # What shows that the images are not those of the joint values or of the robot
+    unrelated: str  # What shows that the images are not those of the joint values or of the robot
 
     @cached_property
     def diagnosis(self) -> HandEyeDiagnosis | None:
@@ -282,7 +282,7 @@ def largest_position_std(names: Sequence[str], covariance: Array) -> float:
 
 
 def diagnose_hand_eye(
-    fit: Fit, position_std: float, holdout: Sequence[Measurement] = ()
+    fit: Fit, position_std: float, holdout: Sequence[Measurement]
 ) -> HandEyeDiagnosis | None:
     """Find the likely cause of the error that a hand-eye calibration leaves."""
     inliers = _search(fit, fit.without_rejected().data, holdout)
@@ -342,10 +342,7 @@ def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, wei
     """Return the labels of images whose corners were all rejected, and that the causes do not explain."""
     is_rejected = (np.bincount(item.image, weights > 0.5, item.n_images) == 0)[item.image]
     rejected = apply_causes(hand_eye, state.causes, item.take(is_rejected))
-    errors = state.fit.problem.errors
-    chain = errors.at(state.fit.solution.x[: len(errors.parameters)])
-    u = np.array([state.values[p.name] for p in rejected.instrument_parameters])
-    pixels = rejected.errors(chain.forward_kinematics(rejected.q), u)["pixels"]
+    pixels = errors_of(rejected, state.fit.problem.chain(state.fit.solution.x), state.values)["pixels"]
     squares = np.bincount(rejected.image, np.sum(pixels**2, 1)) / np.bincount(rejected.image)
     is_wrong = np.sqrt(squares) > MIN_WRONG_RATIO * state.error.pixels
     first = np.unique(rejected.image, return_index=True)[1]
@@ -381,7 +378,7 @@ class _State:
         assert error is not None
         jitter = residual_jitter(fit)
         sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
-        scatter = jitter.noise * float(np.sqrt(np.mean(np.sum(sigma**2, 1))))
+        scatter = jitter.noise * se3.rms_length(sigma)
         growth = min(float(np.hypot(1.0, held_out_prediction_std(fit, folds))), MAX_LEFT_OUT_RATIO)
         return cls(causes, fit, error, scatter, growth * scatter, jitter.is_significant)
 
@@ -453,9 +450,9 @@ def _is_plausible(name: str, state: _State) -> bool:
     """Return whether errors of the arm are not far larger than manufacturing errors."""
     if name not in ARM_SETS:
         return True
-    errors = state.fit.problem.errors
-    chain = errors.at(state.fit.solution.x[: len(errors.parameters)])
-    return measure_correction(errors, chain).ratio < MAX_ARM_CORRECTION
+    problem = state.fit.problem
+    moved = measure_correction(problem.errors, problem.chain(state.fit.solution.x))
+    return moved.ratio < MAX_ARM_CORRECTION
 
 
 def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
@@ -602,13 +599,13 @@ def _corner_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     """Describe the board whose corners are displaced most."""
     largest = ("", 0.0, 0.0)
     item = _images(state.fit.data)
-    u = np.array([state.values[p.name] for p in item.instrument_parameters])
+    u = instrument_values(item, state.values)
     for number, (board, found) in enumerate(zip(_rig(hand_eye.data).boards, item.points(u), strict=True)):
         observed = np.unique(item.corner[item.board == number])
         if len(observed) < 3:
             continue
         moved = _without_rigid_motion(found[observed], board.points[observed])
-        rms = float(np.sqrt(np.mean(np.sum(moved**2, 1))))
+        rms = se3.rms_length(moved)
         if rms > largest[1]:
             largest = board.name, rms, float(np.sqrt(np.mean(moved[:, 2] ** 2)))
     name, rms, normal = largest

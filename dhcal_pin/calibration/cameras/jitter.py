@@ -72,7 +72,7 @@ def estimate_jitter(
     n_determined: float,
 ) -> Jitter:
     """Estimate the noise of corners and the displacement of images from the residuals of a fit."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chain = problem.chain(x)
     images: list[tuple[Array, Array]] = []
     is_stated = True
     for item, weight in zip(data, weights, strict=True):
@@ -165,7 +165,7 @@ def with_jitter(
     problem: Problem, x: Array, data: Sequence[Measurement], jitter: Jitter
 ) -> tuple[Measurement, ...]:
     """Give image coordinates the noise and the jitter that were estimated."""
-    chain = problem.errors.at(x[: len(problem.errors.parameters)])
+    chain = problem.chain(x)
     out: list[Measurement] = []
     for item in data:
         if isinstance(item, CameraCorners):

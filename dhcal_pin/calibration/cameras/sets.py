@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ...estimation.parameters import LOW_COST
+from ...estimation.parameters import LOW_COST, set_names
 from ...exceptions import InvalidArgumentError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
@@ -33,7 +33,7 @@ MAX_POINTS = 150
 
 def split_sets(parameters: str | Iterable[str]) -> tuple[list[str], list[str]]:
     """Separate the sets of the rig from those of the robot."""
-    names = [s.strip() for s in parameters.split(",")] if isinstance(parameters, str) else list(parameters)
+    names = set_names(parameters)
     return [name for name in names if name not in RIG_SETS], [name for name in names if name in RIG_SETS]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..._typing import Array
 from ...estimation.folds import Fold, factor_partition, solve_columns
-from ...measurements.base import Measurement
+from ...measurements.base import errors_of
 from ...measurements.camera import CameraCorners
 from ..reweighting import Fit
 
@@ -114,18 +114,12 @@ def _image_error(fit: Fit, parts: Sequence[tuple[Array, Sequence[Array]]]) -> Im
     """Compute the error of parts of the images, each at its own solution x (p,)."""
     problem, squares, distances, count = fit.problem, 0.0, 0.0, 0
     for x, fold in parts:
-        chain = problem.errors.at(x[: len(problem.errors.parameters)])
+        chain = problem.chain(x)
         for item, mask, weights in zip(fit.data, fold, fit.weights, strict=True):
             if isinstance(item, CameraCorners):
-                errors = _errors(item, mask & (weights > 0.5), problem.instrument_values_of(item, x), chain)
+                errors = errors_of(item.take(mask & (weights > 0.5)), chain, problem.instruments(x))
                 squares += float(np.sum(errors["pixels"] ** 2))
                 distances += float(np.sum(errors["board"] ** 2))
                 count += len(errors["pixels"])
     count = max(count, 1)
     return ImageError(float(np.sqrt(squares / count)), float(np.sqrt(distances / count)), count)
-
-
-def _errors(item: Measurement, mask: Array, u: Array, chain: Any) -> dict[str, Array]:
-    """Return the errors of some samples of a measurement."""
-    part = item.take(mask)
-    return part.errors(chain.forward_kinematics(part.conditions()), u)

@@ -7,7 +7,7 @@ samples is as fast as one of few.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,8 +35,6 @@ MAX_PARAMETERS, _MAX_NAMES = 40, 60
 _PRIOR_BANDS = (2.0, 1.0)
 # Longest text of a legend with several texts in a row.
 _MAX_LABEL_CHARS = 25
-# Number of parts of an axis with a median each, and fewest samples of a part.
-_MEDIAN_PARTS, _MIN_PART_SAMPLES = 12, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +53,7 @@ class SampleErrors:
     def from_fit(cls, fit: Evidence, group: str | None) -> SampleErrors:
         """Compute the errors of the fitted and the held-out samples."""
         norms, table = fit.error_norms, fit.residuals
-        choices = in_order(norms)
-        if group is not None and group not in choices:
-            raise UnknownNameError(f"group {group!r}: not measured; choose from {', '.join(choices)}")
-        name = group or choices[0]
+        name = _chosen_group(group, in_order(norms))
         before, after = norms[name]
         index = np.flatnonzero(np.isfinite(after))
         return cls(
@@ -98,6 +93,13 @@ class SampleErrors:
                 yield label, color, chosen, factor * self.after
 
 
+def _chosen_group(group: str | None, choices: Sequence[str]) -> str:
+    """Return a group of errors that was measured, the first one if none is chosen."""
+    if group is not None and group not in choices:
+        raise UnknownNameError(f"group {group!r}: not measured; choose from {', '.join(choices)}")
+    return group or choices[0]
+
+
 # --- errors ----------------------------------------------------------------------------------------
 
 
@@ -108,10 +110,7 @@ def plot_accuracy(fit: Evidence, ax: Axes | None = None, *, group: str | None = 
     comparisons = list(fit.comparisons)
     if regions is not None and all(each.title != "region hold-out" for each in comparisons):
         comparisons.insert(-1, regions)
-    choices = list(comparisons[0].after.groups)
-    if group is not None and group not in choices:
-        raise UnknownNameError(f"group {group!r}: not measured; choose from {', '.join(choices)}")
-    name = group or choices[0]
+    name = _chosen_group(group, list(comparisons[0].after.groups))
     rows = [each for each in comparisons if name in each.after.groups]
     factor, unit = plots.shown_unit(ERROR_GROUPS[name].unit)
     values = []
@@ -201,12 +200,9 @@ def _plot_medians(ax: Axes, x: Array, values: Array, state: str, unit: str) -> N
     """Plot the medians of the errors in equal parts of the horizontal axis."""
     if not len(x):
         return
-    edges = np.linspace(x.min(), x.max(), _MEDIAN_PARTS + 1)
-    part = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _MEDIAN_PARTS - 1)
-    full = [k for k in range(_MEDIAN_PARTS) if np.sum(part == k) >= _MIN_PART_SAMPLES]
-    if len(full) > 1:
-        medians = plots.shown_unit(unit)[0] * np.array([np.median(values[part == k]) for k in full])
-        centres = 0.5 * (edges[:-1] + edges[1:])[full]
+    centres, medians = plots.medians_by_part(x, values)
+    if len(centres) > 1:
+        medians = plots.shown_unit(unit)[0] * medians
         ax.plot(centres, medians, color=COLORS[state], linewidth=2.0, label=f"{state}, median")
 
 

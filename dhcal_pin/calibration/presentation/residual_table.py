@@ -22,7 +22,7 @@ import numpy as np
 
 from ..._typing import Array
 from ...estimation.robust import ZERO_WEIGHT
-from ...measurements.base import Measurement
+from ...measurements.base import Measurement, instrument_values
 from ..evaluation import fit_instrument_parameters
 from ..evidence import Evidence
 
@@ -164,7 +164,7 @@ def _holdout_residuals(fit: Evidence) -> Iterator[tuple[dict[str, Array], Array]
     values = fit_instrument_parameters(fit.chain, data, fit.instruments)
     for item in data:
         frames = fit.chain.forward_kinematics(item.conditions())
-        u = np.array([values[parameter.name] for parameter in item.instrument_parameters])
+        u = instrument_values(item, values)
         yield item.errors(frames, u), _root_mean_square(_with_fitted_sigma(fit, item).residual(frames, u))
 
 

@@ -24,7 +24,7 @@ from ... import se3
 from ..._typing import Array
 from ...estimation.uncertainty import Predictor
 from ...measurements.base import Measurement
-from ...robot.sampling import ConfigurationSampler, WorkspaceConstraints, joint_range
+from ...robot.sampling import ConfigurationSampler, WorkspaceConstraints, random_configurations
 from ..evaluation import position_errors
 
 # Configurations of a prediction by configurations, and of a map by cells.
@@ -58,8 +58,7 @@ class WorkspacePrediction:
 
 def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
     """Predict the accuracy in configurations all over the joint ranges, and in the measured ones."""
-    n = model.chain.n_joints
-    drawn = np.random.default_rng(0).uniform(*joint_range(model.chain), (N_PREDICTED_CONFIGURATIONS, n))
+    drawn = random_configurations(model.chain, N_PREDICTED_CONFIGURATIONS)
     measured = [item.configurations() for item in data if item.configurations_per_row > 0]
     base_from_measuring, relative = se3.inverse(model.chain.base), model.relative
 
@@ -68,12 +67,10 @@ def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> Workspac
             return np.empty((0, 3)), np.empty(0)
         predictions = [relative.predict(part) for part in np.array_split(q, -(-len(q) // CHUNK_SIZE))]
         points = np.concatenate([one.poses[:, :3, 3] for one in predictions])
-        points = points @ base_from_measuring[:3, :3].T + base_from_measuring[:3, 3]
+        points = se3.transform_points(base_from_measuring, points)
         return points, np.concatenate([one.position_std for one in predictions])
 
-    return WorkspacePrediction(
-        *predict(drawn), *predict(np.concatenate(measured) if measured else np.empty((0, n)))
-    )
+    return WorkspacePrediction(*predict(drawn), *predict(np.concatenate(measured) if measured else drawn[:0]))
 
 
 @dataclass(frozen=True, eq=False)

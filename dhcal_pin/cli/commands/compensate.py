@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_motion_options, add_urdf_options
+from ..options import JSON, ROBOT, add_motion_options, add_urdf_options, read_robot_or_table
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -116,19 +116,9 @@ def read_robots(args: Namespace) -> tuple[Chain, Chain]:
 
     import numpy as np
 
-    from ...io import read_robot
-    from ...io.robot import has_dh_table
     from ...io.sidecar import read_tool
 
-    nominal, calibrated = (
-        read_robot(
-            path,
-            None if has_dh_table(path) else args.tip,
-            package_dirs=args.package_dir,
-            root=None if has_dh_table(path) else args.root,
-        )
-        for path in (args.nominal, args.calibrated)
-    )
+    nominal, calibrated = (read_robot_or_table(path, args) for path in (args.nominal, args.calibrated))
     if nominal.tip != calibrated.tip and args.tip is None:
         raise InvalidArgumentError(
             f"{args.calibrated}: its tip is {calibrated.tip!r}, but the tip of {args.nominal} is "
@@ -224,7 +214,7 @@ def _program(result: Compensation, nominal: Chain) -> Program:
     )
 
 
-def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str = "rad") -> str:
+def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str) -> str:
     """Format corrected targets."""
     import numpy as np  # lazy import, as the following: they are slow to load
 

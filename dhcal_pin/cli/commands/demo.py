@@ -48,9 +48,7 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def run_demo(
-    folder: PathLike, json_target: str | None = None, verbosity: Verbosity = "normal"
-) -> dict[str, Any]:
+def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) -> dict[str, Any]:
     """Run experiment and simulations, show the results and write all files."""
     from ...calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
     from ...formatting import Table

@@ -12,7 +12,6 @@ from ..output_table import Output
 
 if TYPE_CHECKING:
     from ...io.check_history import Check
-    from ...session import Recheck
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
@@ -23,7 +22,6 @@ STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 class Checked(NamedTuple):
     """Result of a check, from which its output files are made."""
 
-    result: Recheck
     robot: str
     checks: list[Check]  # The checks of the history and this one
 
@@ -119,7 +117,7 @@ def run(args: Namespace) -> int:
         "files": written,
         "inputs": file_digests(inputs),
     }
-    contents = file_contents(outputs, Checked(result, robot_name(args.robot), [*earlier, now]))
+    contents = file_contents(outputs, Checked(robot_name(args.robot), [*earlier, now]))
     write_outputs(contents, args.json, document)
     shown = [path for name, path in written.items() if name != "json"]
     console.show(recheck_screen(result, shown), args.verbosity)

@@ -8,7 +8,14 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError, UnknownNameError
-from ..options import JSON, NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, ROBOT, add_urdf_options
+from ..options import (
+    JSON,
+    NON_NEGATIVE_INTEGER,
+    POSITIVE_INTEGER,
+    ROBOT,
+    add_urdf_options,
+    read_robot_or_table,
+)
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
@@ -77,7 +84,6 @@ def run(args: Namespace) -> int:
 
     from ...io import measurement_text, read_robot
     from ...io.rig_file import rig_text
-    from ...io.robot import has_dh_table
     from ...measurements import KINDS, Noise
     from ...robot.sampling import joint_range
     from ...units import parse_noise
@@ -97,8 +103,7 @@ def run(args: Namespace) -> int:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
     nominal = truth = read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
-        ends = (None, None) if has_dh_table(args.truth) else (args.tip, args.root)
-        truth = read_robot(args.truth, ends[0], root=ends[1])
+        truth = read_robot_or_table(args.truth, args)
         if truth.joint_names != nominal.joint_names:
             raise InvalidArgumentError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "

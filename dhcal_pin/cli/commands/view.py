@@ -17,6 +17,7 @@ from ..options import (
     ROBOT,
     add_open_option,
     add_urdf_options,
+    read_robot_or_table,
 )
 
 if TYPE_CHECKING:
@@ -71,8 +72,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
     from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ...io import read_measurements, read_robot
-    from ...io.robot import has_dh_table, robot_name
+    from ...io import read_measurements
+    from ...io.robot import robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
@@ -91,15 +92,7 @@ def run(args: Namespace) -> int:
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
     inputs = [*robots, *sidecars, *args.data, *([args.rig] if args.rig else [])]
     require_writable_outputs([page, args.json], inputs)
-    chains = [
-        read_robot(
-            path,
-            None if has_dh_table(path) else args.tip,
-            package_dirs=args.package_dir,
-            root=None if has_dh_table(path) else args.root,
-        )
-        for path in robots
-    ]
+    chains = [read_robot_or_table(path, args) for path in robots]
     sidecar = existing_sidecar(robots[-1])
     rig = _rig(args.rig, sidecar, chains[-1])
     data = [read_measurements(path, chains[0], rig=rig) for path in args.data]

@@ -46,11 +46,6 @@ class TriangularSystemBatch:
         return self.rows[:, :-1, -1]
 
     @property
-    def min_cost(self) -> Array:
-        """Costs that remain after the best steps, shape (b,)."""
-        return self.rows[:, -1, -1] ** 2
-
-    @property
     def cost(self) -> Array:
         """Costs at the current x, shape (b,)."""
         return _squared_norms(self.rows[:, :, -1])

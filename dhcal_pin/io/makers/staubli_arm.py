@@ -72,19 +72,7 @@ def read_joint_offsets(path: PathLike) -> list[float]:
 
 
 def correct_staubli_arm(path: PathLike, nominal: Chain) -> tuple[Chain, list[str]]:
-    """Apply the offsets of an arm to its nominal robot.
-
-    Args:
-        path: Path of the file.
-        nominal: Robot with the joints of the file in its order.
-
-    Returns:
-        The corrected chain, and notes.
-
-    Raises:
-        FileFormatError: The file is invalid, or has offsets whose meaning is not known.
-        InvalidArgumentError: The robot has other joints.
-    """
+    """Apply the offsets of an arm to its nominal robot, whose joints are in the order of the file."""
     offsets = read_joint_offsets(path)
     if len(offsets) != len(nominal.moving_joints) or nominal.prismatic[np.array(offsets) != 0].any():
         raise InvalidArgumentError(

@@ -101,7 +101,7 @@ def is_bag(path: PathLike) -> bool:
 
 
 def convert_bag(
-    path: PathLike, pose_topic: str | None, joint_topic: str | None = None, chain: Chain | None = None
+    path: PathLike, pose_topic: str | None, joint_topic: str | None, chain: Chain | None
 ) -> ConvertedBag:
     """Make a measurement file from the stops of a recording."""
     source = os.fspath(path)
@@ -136,7 +136,7 @@ def convert_bag(
     return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
 
 
-def read_bag_joints(path: PathLike, joint_topic: str | None = None) -> RecordedJoints:
+def read_bag_joints(path: PathLike, joint_topic: str | None) -> RecordedJoints:
     """Read all joint positions of a recording."""
     source = os.fspath(path)
     with _open_bag(source) as reader:

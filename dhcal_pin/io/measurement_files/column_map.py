@@ -125,8 +125,8 @@ class ColumnRule:
     content: str  # "length", "angle", "number" or "text"
     unit: str  # Unit of the vendor's column and of the offset
     source_column: str | int  # Header of the vendor's column, or its number counted from 1
-    scale: float = 1.0  # Factor
-    offset: float = 0.0  # Summand, in `unit`
+    scale: float  # Factor
+    offset: float  # Summand, in `unit`
 
 
 @dataclass(frozen=True)

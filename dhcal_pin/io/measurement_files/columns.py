@@ -85,12 +85,18 @@ def joint_units(chain: Chain, name: str) -> Mapping[str, float]:
     return LENGTHS if joint.type == "prismatic" else ANGLES
 
 
+def joint_column_names(names: Iterable[str]) -> list[str]:
+    """Return the columns of joints in the first and in the second configuration of a row."""
+    names = list(names)
+    return [prefix + name for prefix in ("", SECOND_PREFIX) for name in names]
+
+
 def column_contents(chain: Chain) -> dict[str, str]:
     """Return the content of each column that a measurement file of a robot can have."""
     joints = {
-        prefix + joint.name: "length" if joint.type == "prismatic" else "angle"
+        name: "length" if joint.type == "prismatic" else "angle"
         for joint in chain.urdf.joints
-        for prefix in ("", SECOND_PREFIX)
+        for name in joint_column_names([joint.name])
     }
     conditions = {
         column: CONDITIONS[name].quantity
@@ -136,7 +142,7 @@ def known_columns(chain: Chain) -> frozenset[str]:
     """Return the names of all columns that a measurement file of a robot can have."""
     names = [joint.name for joint in chain.urdf.joints]
     conditions = [name for columns in condition_columns(chain).values() for name in columns]
-    return _KNOWN | {prefix + name for name in names for prefix in ("", SECOND_PREFIX)} | {*conditions}
+    return _KNOWN.union(joint_column_names(names), conditions)
 
 
 def value_table(table: DataTable, chain: Chain) -> DataTable:
@@ -172,7 +178,7 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     if has_tool_poses(values):
         return False
     names = set(table.columns)
-    joints = {prefix + joint for joint in chain.joint_names for prefix in ("", SECOND_PREFIX)}
+    joints = {*joint_column_names(chain.joint_names)}
     n_unknown = len(names - known_columns(chain))
     if set(values.columns) & VALUE_COLUMNS:
         return not names & joints and n_unknown >= chain.n_joints
@@ -187,8 +193,8 @@ def check_columns(table: DataTable, chain: Chain) -> list[str]:
     for name, column in columns.items():
         if name not in known and not _can_be_ignored(table, column, known):
             raise unknown_column_error(table.header_location, name, known, columns, chain.joint_names)
-    other_joints = {prefix + name for name in joints_off_the_chain(chain) for prefix in ("", SECOND_PREFIX)}
-    used = {columns[name].index for name in columns if name in known - other_joints}
+    used_names = known.difference(joint_column_names(joints_off_the_chain(chain)))
+    used = {columns[name].index for name in columns if name in used_names}
     return [
         table.column_label(index)
         for index, cell in enumerate(table.headers)

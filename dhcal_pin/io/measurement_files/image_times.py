@@ -39,9 +39,7 @@ def image_time(name: str) -> float | None:
     return value * next((factor for least, factor in _SUBDIVISIONS if value >= least), 1.0)
 
 
-def read_recorded_joints(
-    path: PathLike, images: Sequence[str], joint_topic: str | None = None
-) -> ImageJoints:
+def read_recorded_joints(path: PathLike, images: Sequence[str], joint_topic: str | None) -> ImageJoints:
     """Read the joint values at the times of images from a recording."""
     source, times = os.fspath(path), np.empty(len(images))
     for i, image in enumerate(images):

@@ -13,7 +13,7 @@ import numpy as np
 from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError
-from ...units import ANGLES
+from ...units import ANGLES, column_header
 from ..tables import DataTable, TextLayout, read_table
 from ..tables.data_frame import is_data_frame
 from .column_map import PATH_PARTS, ColumnMap, ColumnRule, Rotation
@@ -73,7 +73,7 @@ class _VendorTable:
 
 
 def read_mapped_table(
-    source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str = ""
+    source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str
 ) -> DataTable:
     """Read a file of another maker as a table with the project's own columns.
 
@@ -91,7 +91,7 @@ def read_mapped_table(
             f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
         )
     vendor = vendor.without_bad_rows()
-    columns = {_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules}
+    columns = {column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules}
     if column_map.rotation:
         columns |= _rotation_columns(vendor, column_map.rotation)
     for name, text in column_map.constants.items():
@@ -107,11 +107,6 @@ def read_mapped_table(
         description=table.description,
         notes=table.notes,
     )
-
-
-def _header(name: str, unit: str) -> str:
-    """Return the header cell of a column of the project."""
-    return f"{name}[{unit}]" if unit else name
 
 
 def _fill_placeholders(text: str, source: PathLike | Any) -> str:
@@ -154,14 +149,16 @@ def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, Arr
     columns = [vendor.values(name) for name in notation.columns]
     if notation.convention in ("rotvec", "quaternion"):
         names = ROTVEC if notation.convention == "rotvec" else [f"q{letter}" for letter in notation.order]
-        return {_header(name, notation.unit): values for name, values in zip(names, columns, strict=True)}
+        return {
+            column_header(name, notation.unit): values for name, values in zip(names, columns, strict=True)
+        }
     values = np.stack(columns, -1)
     if notation.convention == "euler":
         rotations = euler_to_matrix(values / ANGLES[notation.unit], notation.axes, notation.frame)
     else:
         rotations = _orthonormalized(values.reshape(-1, 3, 3), vendor.table)
     components = np.ascontiguousarray(se3.log3(rotations).T)
-    return {_header(name, "rad"): column for name, column in zip(ROTVEC, components, strict=True)}
+    return {column_header(name, "rad"): column for name, column in zip(ROTVEC, components, strict=True)}
 
 
 def euler_to_matrix(angles: Array, axes: str, frame: str) -> Array:

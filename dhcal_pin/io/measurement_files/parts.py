@@ -13,6 +13,7 @@ from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..tables import parse_lines
 from ..tables.text import BLANK_CHARACTERS
+from ..tabular import unreadable
 from .reading import parse_measurements
 
 # Samples, or a function that reads them. The function is small enough to be sent to another process.
@@ -58,9 +59,7 @@ def iter_measurements(
                     yield partial(_read_part, source, chain, header, first_line, start, end)
                     start, first_line, count = end, line_number + 1, 0
     except OSError as error:
-        raise FileFormatError(
-            f"{source}: cannot read it: {error.strerror}; give the path of a file"
-        ) from error
+        raise unreadable(source, error) from error
     except UnicodeDecodeError as error:
         raise FileFormatError(f"{source}: the header is not UTF-8; save the file as UTF-8") from error
     # A file without rows has one empty part, so that reading it raises the error.

@@ -158,9 +158,9 @@ def open_measurement_table(
 def has_image_coordinates(
     source: PathLike | Any,
     chain: Chain,
-    columns: PathLike | None = None,
-    servos: ServoFile | None = None,
-    sheet: str = "",
+    columns: PathLike | None,
+    servos: ServoFile | None,
+    sheet: str,
 ) -> bool:
     """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
     table = open_measurement_table(source, chain, columns, servos, sheet)

@@ -38,8 +38,8 @@ class TargetPoses:
     near: Array | None
     units: Mapping[str, str]
     lines: Array
-    notes: tuple[str, ...] = ()
-    conditions: Conditions | None = None
+    notes: tuple[str, ...]
+    conditions: Conditions | None
 
 
 def read_targets(path: PathLike, chain: Chain) -> TargetPoses:

@@ -26,7 +26,7 @@ from ...robot.inverse_kinematics import (
 )
 from ...robot.sampling import joint_range
 from ..tables import DataTable
-from .columns import QUATERNION, SECOND_PREFIX, TOOL_POSE
+from .columns import QUATERNION, TOOL_POSE, joint_column_names
 
 # Largest difference of the solution from a pose [m]; rotations by the characteristic length of the robot.
 _MAX_DIFFERENCE = 5e-7
@@ -61,8 +61,7 @@ def solve_tool_poses(table: DataTable, chain: Chain, values: Mapping[str, Array]
 
 def _require_no_joints(table: DataTable, chain: Chain) -> None:
     """Raise an error if a table with poses has the column of a joint."""
-    names = [prefix + joint for prefix in ("", SECOND_PREFIX) for joint in chain.joint_names]
-    present = [name for name in names if name in table.columns]
+    present = [name for name in joint_column_names(chain.joint_names) if name in table.columns]
     if present:
         pose = [name for name in (*TOOL_POSE, *QUATERNION) if name in table.columns]
         raise FileFormatError(

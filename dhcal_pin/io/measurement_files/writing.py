@@ -12,7 +12,7 @@ from ...exceptions import FileFormatError
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
-from ...units import ANGLES, LENGTHS, UNITS
+from ...units import ANGLES, LENGTHS, UNITS, column_header
 from ..tabular import csv_text
 from .columns import ISO_POINT, SECOND_PREFIX, check_joint_names, condition_columns, joint_units
 
@@ -42,7 +42,7 @@ def value_columns(data: Measurement) -> dict[str, list[Any]]:
     columns: dict[str, list[Any]] = {}
     for name, values in data.to_columns().items():
         unit = next(iter(UNITS[data.columns[name]]), "")
-        columns[f"{name}[{unit}]" if unit else name] = values.tolist() if unit else list(values)
+        columns[column_header(name, unit)] = values.tolist() if unit else list(values)
     return columns
 
 
@@ -53,9 +53,8 @@ def _condition_columns(data: Measurement, chain: Chain) -> dict[str, list[Any]]:
         values = getattr(data.recorded, name, None)
         if values is not None:
             unit = next(iter(UNITS[CONDITIONS[name].quantity]), "")
-            ending = f"[{unit}]" if unit else ""
             by_column = zip(names, values.reshape(len(values), -1).T.tolist(), strict=True)
-            columns |= {column + ending: numbers for column, numbers in by_column}
+            columns |= {column_header(column, unit): numbers for column, numbers in by_column}
     return columns
 
 
@@ -63,8 +62,8 @@ def configurations_text(
     q: Array,
     chain: Chain,
     comments: Sequence[str],
-    angle_unit: str = "rad",
-    decimals: int | None = None,
+    angle_unit: str,
+    decimals: int | None,
     iso_points: Sequence[str] = (),
 ) -> str:
     """Return the CSV text of joint positions, with the points of a test according to ISO 9283 if given."""

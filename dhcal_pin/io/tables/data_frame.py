@@ -14,6 +14,7 @@ import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
+from ..tabular import unreadable
 from .table import DataTable, require_few_rows
 from .text import TextLayout, detect_decimal
 
@@ -56,9 +57,7 @@ def read_parquet(path: PathLike, layout: TextLayout) -> DataTable:
             require_few_rows(source, file.metadata.num_rows)
             table = file.read()
     except OSError as error:
-        raise FileFormatError(
-            f"{source}: cannot read it: {error.strerror or error}; give the path of a file"
-        ) from error
+        raise unreadable(source, error) from error
     except pyarrow.ArrowInvalid as error:
         raise FileFormatError(f"{source}: not a Parquet file: {error}; save the table again") from error
     columns = {

@@ -20,15 +20,14 @@ from .text import DETECTED, TextLayout, read_text_table
 class TableFormat(NamedTuple):
     """File format of a table."""
 
-    name: str  # Name in messages
     endings: tuple[str, ...]  # Endings of file names, lower case; none for the format of all other files
     read: Callable[[PathLike, TextLayout], DataTable]  # Function that reads a file
 
 
 FORMATS = (
-    TableFormat("Excel", (".xlsx", ".xlsm"), read_spreadsheet),
-    TableFormat("Parquet", (".parquet", ".pq"), read_parquet),
-    TableFormat("text", (), read_text_table),
+    TableFormat((".xlsx", ".xlsm"), read_spreadsheet),
+    TableFormat((".parquet", ".pq"), read_parquet),
+    TableFormat((), read_text_table),
 )
 # Endings of files that cannot be read, and what to do with them.
 _UNREADABLE = {

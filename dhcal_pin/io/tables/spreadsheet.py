@@ -16,6 +16,7 @@ from zipfile import BadZipFile, ZipFile
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError, UnknownNameError
+from ..tabular import unreadable
 from .table import DataTable, units_under_header
 from .text import TextLayout, detect_decimal
 
@@ -48,9 +49,7 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
     except FileFormatError:  # also a ValueError
         raise
     except OSError as error:
-        raise FileFormatError(
-            f"{source}: cannot read it: {error.strerror or error}; give the path of a file"
-        ) from error
+        raise unreadable(source, error) from error
     except (BadZipFile, InvalidFileException, KeyError, ValueError) as error:
         raise FileFormatError(f"{source}: not an Excel workbook: {error}; save it as .xlsx") from error
     filled = {title: rows for title, rows in sheets.items() if rows}

@@ -15,8 +15,8 @@ class ViewLimits:
     """Limits of a useful view of a board."""
 
     #: Smallest distance of the middle of the board from the camera [m]; nearer is not sharp.
-    min_distance: float = 0.2
-    max_distance: float = 1.5  #: Largest distance [m].
+    min_distance: float
+    max_distance: float  #: Largest distance [m].
     #: Largest angle between the normal of the board and the line of sight [rad].
     max_angle: float = np.deg2rad(50.0)
     min_share: float = 1.0  #: Smallest share of the corners in the image.

@@ -23,9 +23,7 @@ POINTS_SET = "points"
 
 def pose_parameters(prefix: str, pose: Array | None) -> list[InstrumentParameter]:
     """Build the six parameters of the pose of a camera or a board."""
-    values = np.full(6, np.nan)
-    if pose is not None:
-        values = np.concatenate([pose[:3, 3], se3.log3(pose[:3, :3])])
+    values = np.full(6, np.nan) if pose is None else se3.position_and_rotvec(pose)
     return [
         InstrumentParameter(
             f"{prefix}.{name}",

@@ -33,6 +33,7 @@ from ...exceptions import NotObservableError
 from ...robot.chain import Chain
 from ...robot.conditions import Conditions
 from ..mounting import Mount, MountedRig
+from .camera_parameters import POSE_NAMES
 
 # Largest RMS distance in the image, X/Z and Y/Z, of a pose that is used, as a multiple of the median one.
 _MAX_RATIO = 5.0
@@ -135,9 +136,8 @@ def first_values(item: Corners, views: BoardViews, chain: Chain, used: Array) ->
         ("board", boards, item.rig.boards, item.rig.board_mounts),
     ):
         for number, pose in poses.items():
-            local = se3.inverse(mounts[number].link_pose) @ pose
-            numbers = np.concatenate([local[:3, 3], se3.log3(local[:3, :3])])
-            names = [f"{prefix}_{entries[number].name}.{name}" for name in ("x", "y", "z", "rx", "ry", "rz")]
+            numbers = se3.position_and_rotvec(se3.inverse(mounts[number].link_pose) @ pose)
+            names = [f"{prefix}_{entries[number].name}.{name}" for name in POSE_NAMES]
             values |= dict(zip(names, numbers.tolist(), strict=True))
     return values
 
