@@ -57,7 +57,7 @@ const CONTROLS = {
 
 // A message of the command, in the words of the page.
 function spoken(text) {
-  return text.replace(/(--[a-z-]+) FILE( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
+  return text.replace(/(--[a-z-]+) (?:FILE|RIG\.toml)( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
     .replace(/--[a-z][a-z-]*/g, option => CONTROLS[option] ?? `${option} of the command line`);
 }
 
@@ -68,7 +68,7 @@ const named = role => [...files].filter(([, entry]) => entry.role === role).map(
 
 async function roleOf(file) {
   const { name } = file;
-  if (/\.calibration\.toml$/i.test(name)) return "beside";
+  if (/\.(calibration\.toml|stl|dae|obj|mtl|glb|zip|pdf|docx?|md|html?)$/i.test(name)) return "beside";
   if (ROBOT.test(name)) return "robot";
   if (/\.json$/i.test(name)) return "servos";
   if (/\.(png|jpe?g|bmp|tiff?|webp|mp4|mov|avi|mkv|webm)$/i.test(name)) return "images";
@@ -320,7 +320,7 @@ async function inspect() {
 
 // What a message of the check needs is said beside its control, too.
 const NEEDS = [
-  ["tip-error", /--tip|tip link/, "Choose the link that carries the measured point. The check below says why."],
+  ["tip-error", /--tip|tip link|unknown link/, "Choose the link that carries the measured point. The check below says why."],
   ["needed-file", /--servos/, "Add the servo file: the measurements have counts of servos."],
   ["needed-file", /--rig/, "Add the rig file: the measurements are image coordinates. If you have none, make one above."],
 ];
@@ -428,9 +428,11 @@ function cancel() {
 
 function clearResult() {
   for (const link of links.splice(0)) URL.revokeObjectURL(link);
-  if (!running) sessionStorage.removeItem("job");
   $("result").hidden = true;
-  $("status").textContent = "";
+  if (!running) {
+    sessionStorage.removeItem("job");
+    $("status").textContent = "";
+  }
   showError("run-error", "");
 }
 

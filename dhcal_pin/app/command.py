@@ -180,7 +180,8 @@ class _Run:
         if self.status in (0, *accepted):
             return {}
         if self.status == _INVALID_INPUT:
-            return {"error": _SEE_HELP.sub("", _PREFIX.sub("", self._last_line))}
+            text = _SEE_HELP.sub("", _PREFIX.sub("", self._last_line))
+            return {"error": text.replace("choose another output path", "rename it: a result has this name")}
         return {"error": f"the calculation ended unexpectedly (exit status {self.status}); try fewer samples"}
 
 

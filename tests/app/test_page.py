@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from pages import AXE, READY, VIEWPORT, listen
+from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin.app.server
@@ -192,20 +193,20 @@ def test_refused_remedies_need_the_files(page, example):
 
 
 def test_the_check_names_what_is_missing_beside_its_control(page):
-    page.click("#example")
-    page.wait_for_selector("#check .card.ok")
-    page.click("text=Rows of each image (20)")
-    assert "00.png\t24" in page.inner_text("#check")
-    page.fill("#tip", "")
-    page.locator("#tip").blur()
+    """The servo file, the tip and the rig of the example are missing, and are added in turn."""
+    corners, motors = ((name, (EXAMPLE / name).read_text()) for name in ("corners.csv", "so101.json"))
+    drop(page, ("so101.urdf", (URDF / "so101.urdf").read_text()), corners)
+    page.wait_for_selector("#needed-file:has-text('Add the servo file')")
+    drop(page, motors)
     page.wait_for_selector("#tip-error:not([hidden])")
     assert page.get_attribute("#tip", "placeholder") == "moving_jaw_link"
+    page.click("text=Rows of each image (20)")
+    assert "00.png\t24" in page.inner_text("#check")
     page.fill("#tip", "gripper_frame_link")
     page.locator("#tip").blur()
-    for name, text in (("rig.toml", "Add the rig file"), ("so101.json", "Add the servo file")):
-        page.click(f'[aria-label="Remove {name}"]')
-        page.wait_for_selector(f"#needed-file:has-text('{text}')")
+    page.wait_for_selector("#needed-file:has-text('Add the rig file')")
     assert page.is_hidden("#tip-error")
+    assert "RIG.toml" not in page.inner_text("#check")
 
 
 def test_figures_of_the_page_count_as_the_command_does(page):

@@ -109,6 +109,13 @@ def test_errors_are_one_line(app, example, request_changes, words):
     assert app.contents() == []
 
 
+def test_a_measurement_file_with_the_name_of_a_result_is_to_be_renamed(app, example):
+    files = {"ur10.urdf": (example / "ur10.urdf").read_bytes(), "residuals.csv": b"x"}
+    body, headers = form(files, {"robot": "ur10.urdf", "data": ["residuals.csv"], "tip": "tool0"})
+    error = "residuals.csv: is an input file; rename it: a result has this name"
+    assert post(app, "calibrate", body, **headers)[1] == [{"error": error}]
+
+
 @pytest.mark.parametrize(
     "name", ["../ur10.urdf", "a/b.urdf", "-o.urdf", ".hidden.urdf", "example:ur10", "a\\b.urdf", "x" * 300]
 )
