@@ -173,7 +173,7 @@ def open_request(app, body, headers):
     connection.sendall(head.encode() + body)
     answer = connection.recv(1000)
     assert b"200 OK" in answer
-    return connection, re.search(rb"Job: (\S+)", answer)[1].decode()
+    return connection, re.findall(rb"Job: (\S+)", answer)[0].decode()
 
 
 def test_a_cancelled_run_leaves_nothing(app, example):
