@@ -302,9 +302,9 @@ async function inspect() {
   const controller = checking = new AbortController();
   $("check").replaceChildren(element("p", { className: "hint" }, READING));
   const cards = [];
-  const show = ({ boards, error, result }) => {
+  const show = ({ boards, notes, error, result }) => {
     if (controller.signal.aborted) return;
-    if (boards) cards.push(...boards.map(boardCard));
+    if (boards) cards.push(...boards.map(boardCard), ...notes.map(text => element("p", { className: "card warning" }, spoken(text))));
     else if (error) cards.push(element("p", { className: "error" }, spoken(error)));
     else cards.push(...result.files.map(fileCard));
     $("check").replaceChildren(...cards, ...(boards ? [element("p", { className: "hint" }, READING)] : []));

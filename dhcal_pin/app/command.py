@@ -4,7 +4,7 @@ A crash or a lack of memory ends that process only, and it can be stopped at any
 messages for the page, dictionaries that JSON can hold:
 
 - `{"phase": TEXT, "step": N, "total": N}`: progress;
-- `{"boards": [...]}`: in how many photographs each board was found;
+- `{"boards": [...], "notes": [TEXT]}`: in how many photographs each board was found, and notes on them;
 - `{"error": TEXT}`: one line that says what is wrong and what is expected; the last message;
 - `{"result": DOCUMENT, ...}`: the JSON document of the command; the last message. A calibration adds `status`
   (`done` or `refused`), `screen` (what the command shows) and `files`: name, label, use and content in
@@ -66,7 +66,8 @@ async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any]
         if error := await _detect(upload, folder):
             yield error
             return
-        yield {"boards": _read_json(folder)["boards"]}
+        found = _read_json(folder)
+        yield {key: found[key] for key in ("boards", "notes")}
     kept = [word for name in ("tip", "columns", "rig", "servos") for word in upload.option(name)]
     robot = [f"--robot={upload.robot}", *kept] if upload.robot else upload.option("rig")
     run = _Run(folder)

@@ -379,7 +379,7 @@ def photographed(tmp_path_factory):
     return folder
 
 
-def photograph_form(folder, count, **changes):
+def photograph_form(folder, count, other_files=None, **changes):
     """Form with some of the photographs and all files that belong to them."""
     files = {path.name: path.read_bytes() for path in sorted((folder / "photographs").iterdir())[:count]}
     request = {"images": list(files), "data": ["counts.csv"], "robot": "so101.urdf", "rig": "rig.toml"}
@@ -387,7 +387,7 @@ def photograph_form(folder, count, **changes):
     files |= {name: (folder / name).read_bytes() for name in ("so101.urdf", "rig.toml", "so101.json")}
     counts = (folder / "counts.csv").read_text().splitlines(keepends=True)
     files["counts.csv"] = "".join(counts[: 1 + count]).encode()
-    return form(files, request | changes)
+    return form(files | (other_files or {}), request | changes)
 
 
 def test_photographs_are_searched(app, photographed):
@@ -398,8 +398,12 @@ def test_photographs_are_searched(app, photographed):
     # The corners are checked as those of a file.
     (corners,) = last["result"]["files"]
     assert (corners["path"], corners["configurations"], corners["problem"]) == ("corners.csv", 2, "")
-    body, headers = photograph_form(photographed, 2, servos="")
-    assert "expected --servos" in post(app, "inspect", body, **headers)[1][-1]["error"]
+    rig = (photographed / "rig.toml").read_text().replace("columns = 8", "columns = 5")
+    rig = rig.replace("rows = 5", "rows = 8").encode()
+    body, headers = photograph_form(photographed, 2, {"rig.toml": rig}, servos="")
+    found, last = post(app, "inspect", body, **headers)[1]
+    assert found["notes"] == ["board paper was printed with columns = 8, rows = 5; write so in rig.toml"]
+    assert "expected --servos" in last["error"]
     body, headers = photograph_form(photographed, 2, rig="")
     assert "rig" in post(app, "calibrate", body, **headers)[1][-1]["error"]
 
