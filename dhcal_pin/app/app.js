@@ -117,7 +117,6 @@ function filesChanged() {
   showFiles();
   showLinks();
   showHoldoutFiles();
-  sessionStorage.files = [...files.keys()].join(", ");
   // Images have errors of their own, and all of them are needed.
   const hasRig = named("rig").length > 0;
   if (hasRig && !$("parameters").disabled) $("holdout").value = $("parameters").value = "";
@@ -130,6 +129,7 @@ function filesChanged() {
 function showFiles() {
   const images = named("images"), others = [...files].filter(([, { role }]) => role !== "images");
   const rest = images.length ? [photographsItem(images)] : [];
+  sessionStorage.files = [...(images.length ? [count(images.length, "photograph")] : []), ...others.map(([name]) => name)].join(", ");
   $("files").replaceChildren(...rest, ...others.map(([name, { file, role }]) => {
     const use = element("select", { ariaLabel: `Use of ${name}` },
       ...Object.entries(ROLES).map(([value, text]) => element("option", { value, selected: value === role }, text)));
@@ -320,13 +320,13 @@ async function inspect() {
 
 // What a message of the check needs is said beside its control, too.
 const NEEDS = [
-  ["tip-error", /--tip|tip link|unknown link/, "Choose the link that carries the measured point. The check below says why."],
-  ["needed-file", /--servos/, "Add the servo file: the measurements have counts of servos."],
-  ["needed-file", /--rig/, "Add the rig file: the measurements are image coordinates. If you have none, make one above."],
+  ["tip-error", text => /--tip|tip link/.test(text) || text.includes(`unknown link '${$("tip").value.trim()}'`), "Choose the link that carries the measured point. The check below says why."],
+  ["needed-file", text => text.includes("--servos"), "Add the servo file: the measurements have counts of servos."],
+  ["needed-file", text => text.includes("--rig"), "Add the rig file: the measurements are image coordinates. If you have none, make one above."],
 ];
 
 function showNeeds(texts) {
-  const needs = NEEDS.filter(([, pattern]) => texts.some(text => pattern.test(text)));
+  const needs = NEEDS.filter(([, isMeant]) => texts.some(isMeant));
   for (const id of ["tip-error", "needed-file"]) showError(id, needs.find(need => need[0] === id)?.[2] ?? "");
 }
 

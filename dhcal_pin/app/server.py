@@ -41,7 +41,7 @@ MAX_RUNS = 4
 # Number of calibrations whose messages are kept after their end.
 MAX_KEPT = 8
 # Time that a page may take to load again before its calibration is stopped [s].
-RELOAD_S = 5.0
+RELOAD_S = 10.0
 # Largest number of a port.
 MAX_PORT = 65535
 # Largest part of a form that contains no file content [bytes].

@@ -152,10 +152,9 @@ def test_refusal_shows_the_remedy_and_applies_it(page, example):
 def test_a_loaded_page_shows_its_calibration_again(page, example):
     drop_with_tip(page, *example_files(example))
     page.click("#calibrate")
-    page.wait_for_function("sessionStorage.job")
+    page.wait_for_function("() => sessionStorage.job")
     page.reload()
     assert "add them again: ur10.urdf, laser.csv" in page.inner_text("#file-error")
-    assert page.is_visible("#cancel")
     page.wait_for_selector("#result .card.ok")
     shown = page.inner_text("#result")
     assert page.is_disabled("#calibrate")
@@ -174,7 +173,7 @@ def test_a_loaded_page_shows_its_calibration_again(page, example):
 def test_a_cancelled_calibration_does_not_come_back(page, example):
     drop_with_tip(page, *example_files(example))
     page.click("#calibrate")
-    page.wait_for_function("sessionStorage.job")
+    page.wait_for_function("() => sessionStorage.job")
     page.click("#cancel")
     page.wait_for_selector("text=Cancelled. Nothing was kept.")
     page.reload()
@@ -267,7 +266,8 @@ DROP_PHOTOGRAPH = """async () => {
 
 def test_a_rig_file_is_made_and_its_board_is_printed(page, example, tmp_path, monkeypatch):
     page.evaluate(DROP_PHOTOGRAPH)
-    page.wait_for_function("document.getElementById('rig-width').value === '320'")
+    page.wait_for_function("() => document.getElementById('rig-width').value === '320'")
+    assert page.evaluate("sessionStorage.files") == "1 photograph"
     page.select_option("#rig-place", "world")
     page.fill("#rig-square", "25")
     page.fill("#rig-ruler", "149.5")
@@ -309,6 +309,7 @@ def test_errors_are_shown_as_one_line(page, example):
     page.click("#calibrate")
     page.wait_for_selector("#run-error:not([hidden])")
     assert "ur10.urdf: unknown link 'nowhere'" in page.inner_text("#run-error")
+    page.wait_for_selector("#tip-error:not([hidden])")
     assert page.is_hidden("#result")
     # The size is checked before anything is sent.
     page.evaluate("document.documentElement.dataset.limit")
