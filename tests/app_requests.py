@@ -73,22 +73,28 @@ def form(files: dict[str, bytes], request: Any) -> tuple[bytes, dict[str, str]]:
 def post(
     app: App, operation: str, body: bytes = b"", path: str | None = None, **headers: str
 ) -> tuple[int, list[Any]]:
-    """Status and messages of a request with the headers of the app's own page, unless others are given."""
+    """Status and messages of a form with the headers of the app's own page, unless others are given."""
+    return ask(app, "POST", operation, body, path, **headers)[:2]
+
+
+def ask(
+    app: App, method: str, operation: str, body: bytes = b"", path: str | None = None, **headers: str
+) -> tuple[int, list[Any], str]:
+    """Status, messages and job of a request."""
     parts = urlsplit(app.url)
     all_headers = {"Host": parts.netloc, "Origin": f"http://{parts.netloc}", "Content-Length": str(len(body))}
     all_headers |= {name.replace("_", "-"): value for name, value in headers.items()}
     connection = HTTPConnection(parts.hostname or "", parts.port, timeout=60)
     with closing(connection):
-        connection.putrequest("POST", (parts.path if path is None else path) + operation, skip_host=True)
+        connection.putrequest(method, (parts.path if path is None else path) + operation, skip_host=True)
         for name, value in all_headers.items():
             if value:
                 connection.putheader(name, value)
         connection.endheaders(body)
         answer = connection.getresponse()
         text = answer.read().decode()
-        return answer.status, [json.loads(line) for line in text.splitlines()] if answer.status == 200 else [
-            text
-        ]
+        messages = [json.loads(line) for line in text.splitlines()] if answer.status == 200 else [text]
+        return answer.status, messages, answer.headers.get("Job", "")
 
 
 def example_form(example: Path, **request: Any) -> tuple[bytes, dict[str, str]]:

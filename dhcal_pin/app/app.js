@@ -1,4 +1,5 @@
 // The page keeps the files. Each request sends them with the options; the answer is one JSON message per line.
+// The server keeps the messages of calibrations; the page keeps the name of the last one while it is loaded again.
 "use strict";
 
 const LIMIT = Number(document.documentElement.dataset.limit);
@@ -12,6 +13,7 @@ const SINGLE = ["robot", "columns", "rig", "servos"];
 const ROBOT = /\.(urdf|dh\.toml|dh\.csv|ya?ml)$/i;
 // Fewer photographs seldom determine an arm.
 const MIN_PHOTOGRAPHS = 12;
+const READING = "Reading the files …";
 // Pause before the files are checked again after a change [ms].
 const CHECK_DELAY = 300;
 
@@ -55,7 +57,7 @@ const CONTROLS = {
 
 // A message of the command, in the words of the page.
 function spoken(text) {
-  return text.replace(/(--[a-z-]+) FILE( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
+  return text.replace(/(--[a-z-]+) (?:FILE|RIG\.toml)( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
     .replace(/--[a-z][a-z-]*/g, option => CONTROLS[option] ?? `${option} of the command line`);
 }
 
@@ -66,7 +68,7 @@ const named = role => [...files].filter(([, entry]) => entry.role === role).map(
 
 async function roleOf(file) {
   const { name } = file;
-  if (/\.calibration\.toml$/i.test(name)) return "beside";
+  if (/\.(calibration\.toml|stl|dae|obj|mtl|glb|zip|pdf|docx?|md|html?)$/i.test(name)) return "beside";
   if (ROBOT.test(name)) return "robot";
   if (/\.json$/i.test(name)) return "servos";
   if (/\.(png|jpe?g|bmp|tiff?|webp|mp4|mov|avi|mkv|webm)$/i.test(name)) return "images";
@@ -127,6 +129,7 @@ function filesChanged() {
 function showFiles() {
   const images = named("images"), others = [...files].filter(([, { role }]) => role !== "images");
   const rest = images.length ? [photographsItem(images)] : [];
+  sessionStorage.files = [...(images.length ? [count(images.length, "photograph")] : []), ...others.map(([name]) => name)].join(", ");
   $("files").replaceChildren(...rest, ...others.map(([name, { file, role }]) => {
     const use = element("select", { ariaLabel: `Use of ${name}` },
       ...Object.entries(ROLES).map(([value, text]) => element("option", { value, selected: value === role }, text)));
@@ -251,10 +254,11 @@ function form(request) {
   return out;
 }
 
-// Sends the files and passes each message of the answer on.
+// Sends the files, or follows a job without any, and passes each message of the answer on.
 async function send(operation, body, signal, onMessage) {
-  const response = await fetch(operation, { method: "POST", body, signal });
+  const response = await fetch(operation, { method: body ? "POST" : "GET", body, signal });
   if (!response.ok) throw new Error((await response.text()).trim());
+  if (operation === "calibrate") sessionStorage.job = response.headers.get("Job") ?? "";
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   let rest = "", last = {};
   for (;;) {
@@ -278,13 +282,14 @@ function updateButtons() {
   const missing = [...(named("robot").length ? [] : ["a robot"]), ...(named("data").length ? [] : [measured]),
     ...(hasImages && !named("rig").length ? ["a rig file with camera and board"] : [])];
   $("cancel").hidden = $("progress").hidden = !running;
-  $("calibrate").disabled = !!running || missing.length > 0;
+  for (const button of document.querySelectorAll("#calibrate, #result .buttons button")) button.disabled = !!running || missing.length > 0;
   $("needed").textContent = running || !missing.length ? "" : `Add ${missing.join(" and ")}.`;
 }
 
 function check() {
   clearTimeout(timer);
   checking?.abort();
+  showNeeds([]);
   updateButtons();
   if (!named("data").length && !named("images").length) {
     $("check").replaceChildren(element("p", { className: "hint" }, "The content of the files is shown here."));
@@ -295,17 +300,34 @@ function check() {
 
 async function inspect() {
   const controller = checking = new AbortController();
-  $("check").replaceChildren(element("p", { className: "hint" }, "Reading the files …"));
-  const show = message => {
+  $("check").replaceChildren(element("p", { className: "hint" }, READING));
+  const cards = [];
+  const show = ({ boards, notes, error, result }) => {
     if (controller.signal.aborted) return;
-    const cards = message.error ? [element("p", { className: "error" }, spoken(message.error))] : message.result.boards ? message.result.boards.map(boardCard) : message.result.files.map(fileCard);
-    $("check").replaceChildren(...cards);
+    if (boards) cards.push(...boards.map(boardCard), ...notes.map(text => element("p", { className: "card warning" }, spoken(text))));
+    else if (error) cards.push(element("p", { className: "error" }, spoken(error)));
+    else cards.push(...result.files.map(fileCard));
+    $("check").replaceChildren(...cards, ...(boards ? [element("p", { className: "hint" }, READING)] : []));
+    $("tip").placeholder = result?.robot?.tip ?? "last link of the chain";
+    showNeeds([error ?? "", ...(result?.files.map(file => file.problem) ?? [])]);
   };
   try {
     await send("inspect", form({ data: named("data") }), controller.signal, show);
   } catch (error) {
     if (error.name !== "AbortError") show({ error: failure(error) });
   }
+}
+
+// What a message of the check needs is said beside its control, too.
+const NEEDS = [
+  ["tip-error", text => /--tip|tip link/.test(text) || text.includes(`unknown link '${$("tip").value.trim()}'`), "Choose the link that carries the measured point. The check below says why."],
+  ["needed-file", text => text.includes("--servos"), "Add the servo file: the measurements have counts of servos."],
+  ["needed-file", text => text.includes("--rig"), "Add the rig file: the measurements are image coordinates. If you have none, make one above."],
+];
+
+function showNeeds(texts) {
+  const needs = NEEDS.filter(([, isMeant]) => texts.some(isMeant));
+  for (const id of ["tip-error", "needed-file"]) showError(id, needs.find(need => need[0] === id)?.[2] ?? "");
 }
 
 const count = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
@@ -333,6 +355,10 @@ function fileCard(file) {
     column.coverage === null ? "" : `${Math.round(100 * column.coverage)} %`]);
   out.append(element("details", {}, element("summary", {}, count(file.columns.length, "column")),
     table(`Columns of ${file.path}`, ["column", "unit", "use", "smallest", "largest", "limits", "visited 5° bins"], rows)));
+  for (const { name, counts } of file.columns.filter(({ role, counts }) => role === "other" && Object.keys(counts).length)) {
+    out.append(element("details", {}, element("summary", {}, `Rows of each ${name} (${Object.keys(counts).length})`),
+      table(`Rows of each ${name} in ${file.path}`, [name, "rows"], Object.entries(counts))));
+  }
   return out;
 }
 
@@ -368,11 +394,16 @@ async function calibrate(force = false) {
     parameters: $("parameters").value, holdout: holdout.value, "skip-bad-rows": $("skip-bad-rows").checked, mend: mends, force,
   };
   clearResult();
+  await watch("calibrate", form(request));
+}
+
+// Shows a calibration that the request starts, or follows without a form, until its end.
+async function watch(operation, body = null) {
   $("status").textContent = "The calibration is running.";
   setRunning(new AbortController());
   $("cancel").focus();
   try {
-    await send("calibrate", form(request), running.signal, message => {
+    await send(operation, body, running.signal, message => {
       if (message.phase) showProgress(message);
       else if (message.error) throw new Error(spoken(message.error));
       else showResult(message);
@@ -389,10 +420,19 @@ async function calibrate(force = false) {
   else if (focused) $("calibrate").focus();
 }
 
+function cancel() {
+  if (sessionStorage.job) fetch(`job/${sessionStorage.job}`, { method: "DELETE" }).catch(() => {});
+  sessionStorage.removeItem("job");
+  running?.abort();
+}
+
 function clearResult() {
   for (const link of links.splice(0)) URL.revokeObjectURL(link);
   $("result").hidden = true;
-  $("status").textContent = "";
+  if (!running) {
+    sessionStorage.removeItem("job");
+    $("status").textContent = "";
+  }
   showError("run-error", "");
 }
 
@@ -403,11 +443,12 @@ function showProgress({ phase, step, total }) {
 // Rows of the accuracy table, the most important one first.
 function accuracies(result) {
   const sets = [
-    [`${count(result.samples_holdout, "hold-out row")}`, "holdout_"], ["cross-validation", "cross_validated_"],
-    ["left-out regions of joint space", "holdout_region_"], [`${count(result.samples, "fitted row")}`, ""],
+    ["hold-out", "holdout_"], ["cross-validated", "cross_validated_"], ["left-out regions of joint space", "holdout_region_"], ["fitted", ""],
   ];
   const out = [];
-  for (const [judged, prefix] of sets) {
+  for (const [title, prefix] of sets) {
+    const { n_samples, n_outliers } = result.comparisons.find(each => each.title === title) ?? {};
+    const judged = n_samples === undefined ? title : `${count(n_samples, `${title} row`)}${n_outliers ? `, without ${count(n_outliers, "outlier")}` : ""}`;
     const before = result[`${prefix}before`], after = result[`${prefix}after`];
     if (!before || !after || (prefix === "holdout_" && !result.samples_holdout)) continue;
     const add = (quantity, key, format) => {
@@ -440,10 +481,11 @@ function showResult({ result, status, screen, files: outputs }) {
     parts.push(element("h3", {}, `${quantity}, ${judged}`),
       element("dl", { className: "headline" }, value("before", before), value("after", after)));
   }
-  for (const quantity of new Set(rows.map(([name]) => name))) {
-    const shown = rows.filter(([name]) => name === quantity).map(([, ...row]) => row);
-    parts.push(table(quantity, ["judged on", "before", "after"], shown));
-  }
+  const tables = [...new Set(rows.map(([name]) => name))].map(quantity =>
+    table(quantity, ["judged on", "before", "after"], rows.filter(([name]) => name === quantity).map(([, ...row]) => row)));
+  // Nothing may rely on the errors of a robot that is not written.
+  if (isRefused && rows.length) parts.push(element("details", {}, element("summary", {}, "Errors of the refused fit"), ...tables));
+  else if (rows.length) parts.push(...tables, ...jointSpace(result));
   if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings.map(spoken))));
   parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem)));
   parts.push(element("details", {}, element("summary", {}, "The same on the command line"),
@@ -451,6 +493,15 @@ function showResult({ result, status, screen, files: outputs }) {
   $("result").replaceChildren(...parts);
   $("result").hidden = false;
 }
+
+// Where the accuracy holds.
+function jointSpace({ covered_share: covered, reached_share: reached }) {
+  if (covered === null || reached === null) return [];
+  return [element("p", {}, `The measured region is ${percent(covered)} of joint space. Accuracy unknown: ${percent(1 - reached)} of joint space, far from all measured poses.`)];
+}
+
+// A share of random configurations is never exactly 0 or 100 %.
+const percent = share => share < 0.01 ? "under 1 %" : share > 0.99 ? "over 99 %" : `${Math.round(100 * share)} %`;
 
 const outputName = outputs => outputs.find(({ name }) => /_calibrated\.(json|urdf)$/.test(name))?.name ?? "calibrated.urdf";
 
@@ -471,12 +522,12 @@ function remedies(reasons) {
   return out;
 }
 
-function downloadItem({ name, label, content }) {
+function downloadItem({ name, label, use, content }) {
   const bytes = Uint8Array.from(atob(content), char => char.charCodeAt(0));
   const type = name.endsWith(".html") ? "text/html" : "application/octet-stream";
   const href = URL.createObjectURL(new Blob([bytes], { type }));
   links.push(href);
-  const out = element("li", {}, element("span", { className: "label" }, label),
+  const out = element("li", {}, element("span", { className: "label" }, label, element("small", {}, use)),
     element("a", { href, download: name, ariaLabel: `Download ${name}` }, name));
   if (type === "text/html") out.append(element("a", { href, target: "_blank", ariaLabel: `Open ${name} in a new tab` }, "Open"));
   return out;
@@ -498,7 +549,7 @@ for (const button of document.querySelectorAll("[data-paper]")) button.onclick =
 $("rig-text").oninput = rigEdited;
 $("rig-save").onclick = async () => {
   const content = btoa(String.fromCodePoint(...new Uint8Array(await rigFile().arrayBuffer())));
-  downloadItem({ name: "rig.toml", label: "", content }).querySelector("a").click();
+  downloadItem({ name: "rig.toml", label: "", use: "", content }).querySelector("a").click();
 };
 $("rig-use").onclick = async () => {
   showError("rig-error", "");
@@ -519,4 +570,6 @@ $("example").onclick = async () => {
 };
 $("options").onsubmit = event => event.preventDefault();
 $("calibrate").onclick = () => calibrate();
-$("cancel").onclick = () => running?.abort();
+$("cancel").onclick = cancel;
+if (sessionStorage.files) showError("file-error", `The page was loaded again, which removes its files. To calibrate, add them again: ${sessionStorage.files}`);
+if (sessionStorage.job) watch(`job/${sessionStorage.job}`);

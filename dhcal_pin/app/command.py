@@ -4,9 +4,11 @@ A crash or a lack of memory ends that process only, and it can be stopped at any
 messages for the page, dictionaries that JSON can hold:
 
 - `{"phase": TEXT, "step": N, "total": N}`: progress;
+- `{"boards": [...], "notes": [TEXT]}`: in how many photographs each board was found, and notes on them;
 - `{"error": TEXT}`: one line that says what is wrong and what is expected; the last message;
 - `{"result": DOCUMENT, ...}`: the JSON document of the command; the last message. A calibration adds `status`
-  (`done` or `refused`), `screen` (what the command shows) and `files`: name, label and content in base64.
+  (`done` or `refused`), `screen` (what the command shows) and `files`: name, label, use and content in
+  base64.
 
 A request without the files that a command needs raises `InvalidArgumentError`; the server sends it as an
 error.
@@ -29,8 +31,8 @@ from typing import Any
 from ..exceptions import InvalidArgumentError
 from .upload import Upload
 
-# Module that is the command `dhcal`.
-_PROGRAM = f"{__name__.split('.')[0]}.cli"
+# Module that is the command `dhcal`, and the one that ends it with the server.
+_PROGRAM, _CHILD = f"{__name__.split('.')[0]}.cli", f"{__package__}.child"
 # Exit status of invalid input and of a refused calibration.
 _INVALID_INPUT, _REFUSED = 2, 3
 # Longest line that a command may print [bytes].
@@ -41,6 +43,18 @@ _SEE_HELP = re.compile(r"; see dhcal \w+ --help$")
 _REPORT, _SCENE, _RESULT, _RESIDUALS = "report.html", "scene.html", "result.json", "residuals.csv"
 # Corners that are found in photographs, and the page with a board.
 _CORNERS, _BOARD = "corners.csv", "board.pdf"
+# Files of a calibration, by their names or by what follows the name of the robot: what each is, and its use.
+OUTPUTS = {
+    ".json": ("Corrected calibration of LeRobot", "copy it over the old file of the arm"),
+    ".urdf": ("Corrected URDF", "use it in place of the old one; keep the sidecar beside it"),
+    ".calibration.toml": ("Sidecar", "base, tool and joint errors, which dhcal reads with the URDF"),
+    ".servos.toml": ("Servo file with the new zeros", "for counts of servos with the old homing offsets"),
+    _REPORT: ("Report", "accuracy, corrections and warnings, to read and to keep"),
+    _SCENE: ("3-D scene", "the robot before and after, to look at"),
+    _CORNERS: ("Corners in the photographs", "measurements in place of the photographs"),
+    _RESIDUALS: ("Residuals", "the error of each row, to find wrong rows"),
+    _RESULT: ("All figures as JSON", "for other programs"),
+}
 # Phase of a search for corners.
 _DETECTING = {"phase": "finding the board in the photographs", "step": 1, "total": 1}
 
@@ -49,14 +63,21 @@ async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any]
     """Yield messages about what the measurement files in a folder contain."""
     upload.require_data()
     if upload.images:
-        error = await _detect(upload, folder)
-        yield error or {"result": _read_json(folder)}
-        return
+        if error := await _detect(upload, folder):
+            yield error
+            return
+        found = _read_json(folder)
+        yield {key: found[key] for key in ("boards", "notes")}
     kept = [word for name in ("tip", "columns", "rig", "servos") for word in upload.option(name)]
     robot = [f"--robot={upload.robot}", *kept] if upload.robot else upload.option("rig")
     run = _Run(folder)
-    await run.finish("inspect", *upload.data, *robot, f"--json={_RESULT}")
+    await run.finish("inspect", *_measurements(upload), *robot, f"--json={_RESULT}")
     yield run.error() or {"result": _read_json(folder)}
+
+
+def _measurements(upload: Upload) -> tuple[str, ...]:
+    """Return the names of the measurement files, with the corners in place of the table of photographs."""
+    return (_CORNERS, *upload.data[1:]) if upload.images else upload.data
 
 
 async def _detect(upload: Upload, folder: Path) -> dict[str, str]:
@@ -76,18 +97,16 @@ async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, An
     if not upload.robot:
         raise InvalidArgumentError("no robot file; add a URDF or a DH table")
     upload.require_data()
-    data = upload.data
     if upload.images:
         yield _DETECTING
         if error := await _detect(upload, folder):
             yield error
             return
-        data = (_CORNERS, *data[1:])
     stem = f"{upload.robot_name}_calibrated"
     is_lerobot = any(word.lower().endswith(".json") for word in upload.option("servos"))
     output = f"{stem}.json" if is_lerobot else f"{stem}.urdf"
     files = [f"--report={_REPORT}", f"--scene={_SCENE}", f"--json={_RESULT}", f"--residuals={_RESIDUALS}"]
-    words = [upload.robot, *data, *upload.options, "-o", output, *files, "--progress=lines"]
+    words = [upload.robot, *_measurements(upload), *upload.options, "-o", output, *files, "--progress=lines"]
     run = _Run(folder)
     screen = []
     async with aclosing(run.lines("calibrate", *words)) as lines:
@@ -99,24 +118,14 @@ async def calibrate(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, An
     if error := run.error(_REFUSED):
         yield error
         return
-    labels = {
-        f"{stem}.json": "Corrected calibration of LeRobot",
-        f"{stem}.urdf": "Corrected URDF",
-        f"{stem}.servos.toml": "Servos with corrected zeros",
-        f"{stem}.calibration.toml": "Sidecar: base, tool and joint errors",
-        _REPORT: "Report",
-        _SCENE: "3-D scene",
-        **({_CORNERS: "Corners in the photographs"} if upload.images else {}),
-        _RESIDUALS: "Residuals of all rows",
-        _RESULT: "All figures as JSON",
-    }
+    result = _read_json(folder)
+    written = {*result["files"].values(), *([_CORNERS] if upload.images else [])}
+    names = {stem + key if key.startswith(".") else key: about for key, about in OUTPUTS.items()}
     yield {
-        "result": _read_json(folder),
+        "result": result,
         "status": "refused" if run.status == _REFUSED else "done",
         "screen": "\n".join(screen),
-        "files": [
-            _content(folder / file, label) for file, label in labels.items() if (folder / file).exists()
-        ],
+        "files": [_content(folder / name, *about) for name, about in names.items() if name in written],
     }
 
 
@@ -125,12 +134,13 @@ async def board(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any], 
     run = _Run(folder)
     rig = [word.partition("=")[2] for word in upload.option("rig")]
     await run.finish("board", *rig, *upload.option("paper"), "-o", _BOARD)
-    yield run.error() or {"result": {}, "files": [_content(folder / _BOARD, "Board to print")]}
+    yield run.error() or {"result": {}, "files": [_content(folder / _BOARD, "Board to print", "")]}
 
 
-def _content(path: Path, label: str) -> dict[str, str]:
+def _content(path: Path, label: str, use: str) -> dict[str, str]:
     """Return a file for the page."""
-    return {"name": path.name, "label": label, "content": base64.b64encode(path.read_bytes()).decode()}
+    content = base64.b64encode(path.read_bytes()).decode()
+    return {"name": path.name, "label": label, "use": use, "content": content}
 
 
 def _read_json(folder: Path) -> Any:
@@ -171,7 +181,8 @@ class _Run:
         if self.status in (0, *accepted):
             return {}
         if self.status == _INVALID_INPUT:
-            return {"error": _SEE_HELP.sub("", _PREFIX.sub("", self._last_line))}
+            text = _SEE_HELP.sub("", _PREFIX.sub("", self._last_line))
+            return {"error": text.replace("choose another output path", "rename it: a result has this name")}
         return {"error": f"the calculation ended unexpectedly (exit status {self.status}); try fewer samples"}
 
 
@@ -179,9 +190,9 @@ class _Run:
 async def _started(words: Sequence[str], folder: Path) -> AsyncIterator[asyncio.subprocess.Process]:
     """Start `dhcal` in a folder; at the end of the block it and all processes it started are stopped."""
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", _PROGRAM, *words),
+        *(sys.executable, "-m", _CHILD, _PROGRAM, *words),
         cwd=folder,
-        stdin=asyncio.subprocess.DEVNULL,
+        stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.PIPE,
         limit=_MAX_LINE_BYTES,

@@ -1,8 +1,8 @@
 """Server of the page: accepts files from this computer's browser, runs a command, streams its messages.
 
-The answer to a request has one JSON message per line (see `command`). The calculation belongs to the request:
-when the browser closes the connection, it is stopped and its folder is removed. Requests do not share
-anything, so several browsers can work at once.
+The answer to a request has one JSON message per line (see `command`). The request starts a job, whose folder
+is removed at its end. A job that no request follows is stopped. The header `Job` of a calibration names its
+job: a page that is loaded again follows it, from the first message, while it runs and after its end.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import signal
 import time
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import aclosing, contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 from typing import Any
 
 import tornado.httpserver
 import tornado.iostream
+import tornado.locks
 import tornado.netutil
 import tornado.web
 
@@ -36,6 +38,10 @@ from .upload import MAX_FILES, Upload
 DEFAULT_LIMIT = 100 * 10**6
 # Largest number of calculations at once; each needs a processor and memory.
 MAX_RUNS = 4
+# Number of calibrations whose messages are kept after their end.
+MAX_KEPT = 8
+# Time that a page may take to load again before its calibration is stopped [s].
+RELOAD_S = 10.0
 # Largest number of a port.
 MAX_PORT = 65535
 # Largest part of a form that contains no file content [bytes].
@@ -124,25 +130,111 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+class Job:
+    """Run of an operation: its messages, and the requests that follow it.
+
+    Attributes:
+        task: The run.
+    """
+
+    def __init__(self, messages: AsyncGenerator[dict[str, Any], None], patience: float) -> None:
+        """Start a run; it is stopped when nothing has followed it for `patience` seconds."""
+        self._patience = patience
+        self._messages: list[dict[str, Any] | None] = []
+        self._grown = tornado.locks.Condition()
+        self._n_followers = 0
+        self.task = asyncio.create_task(self._collect(messages))
+
+    async def _collect(self, messages: AsyncGenerator[dict[str, Any], None]) -> None:
+        """Keep all messages, and None after the last one."""
+        try:
+            async with aclosing(messages):
+                async for message in messages:
+                    self._add(message)
+        except DhcalError as error:
+            self._add({"error": message_line(error)})
+        finally:
+            self._add(None)
+
+    def _add(self, message: dict[str, Any] | None) -> None:
+        """Keep a message and wake those who wait for it."""
+        self._messages.append(message)
+        self._grown.notify_all()
+
+    async def follow(self) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield all messages, from the first one to the end of the run."""
+        self._n_followers += 1
+        try:
+            for number in count():
+                if number == len(self._messages):
+                    await self._grown.wait()
+                message = self._messages[number]
+                if message is None:
+                    return
+                yield message
+        finally:
+            self._n_followers -= 1
+            asyncio.get_running_loop().call_later(self._patience, self._stop_if_left)
+
+    def _stop_if_left(self) -> None:
+        """Stop the run if nothing follows it."""
+        if not self._n_followers:
+            self.task.cancel()
+
+
 class _Service:
     """What the requests share.
 
     Attributes:
         folder: Folder in which each calculation has a folder of its own.
         limit: Largest size of all files of a request [bytes].
-        tasks: Calculations that are running.
+        jobs: Jobs that run, and calibrations that have ended, by their names.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
         self.folder = folder
         self.limit = limit
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.jobs: dict[str, Job] = {}
+
+    def start(self, operation: Operation, content_type: str, body: bytearray) -> str:
+        """Start an operation on the files of a form, and return the name of its job."""
+        ended = [name for name, job in self.jobs.items() if job.task.done()]
+        if len(self.jobs) - len(ended) >= MAX_RUNS:
+            raise InvalidArgumentError(f"{MAX_RUNS} calculations are running; wait until one of them ends")
+        for name in ended[: -MAX_KEPT + 1]:
+            del self.jobs[name]
+        name = new_token()
+        is_kept = operation is command.calibrate
+        job = Job(self._messages(operation, content_type, body), RELOAD_S if is_kept else 0)
+        self.jobs[name] = job
+        job.task.add_done_callback(lambda task: self._remove(name, is_kept, task))
+        return name
+
+    def _remove(self, name: str, is_kept: bool, task: asyncio.Task[None]) -> None:
+        """Forget a job that has ended, unless a page may ask for its messages again."""
+        if task.cancelled() or not is_kept:
+            self.jobs.pop(name, None)
+
+    async def _messages(
+        self, operation: Operation, content_type: str, body: bytearray
+    ) -> AsyncGenerator[dict[str, Any], None]:
+        """Yield the messages of an operation on the files of a form."""
+        try:
+            upload = Upload.from_form(content_type, bytes(body))
+        finally:
+            body.clear()
+        with TemporaryDirectory(dir=self.folder) as name:
+            upload.save(Path(name))
+            async with aclosing(operation(upload, Path(name))) as messages:
+                async for message in messages:
+                    yield message
 
     async def stop(self) -> None:
-        """Stop all calculations and wait until their folders are removed."""
-        for task in self.tasks:
+        """Stop all jobs and wait until their folders are removed."""
+        tasks = [job.task for job in self.jobs.values()]
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _routes(service: _Service) -> list[tuple[Any, ...]]:
@@ -155,6 +247,7 @@ def _routes(service: _Service) -> list[tuple[Any, ...]]:
     }
     return [
         ("example", _ExampleHandler),
+        (r"job/([\w-]+)", _JobHandler, {"service": service}),
         *((path, _PageHandler, {"file": file, "limit": service.limit}) for path, file in pages.items()),
         *(
             (path, _RunHandler, {"service": service, "operation": operation})
@@ -196,60 +289,83 @@ class _ExampleHandler(_Handler):
         self.write({"files": files, "tip": "gripper_frame_link"})
 
 
+class _FollowHandler(_Handler):
+    """Handler whose answer has the messages of a job."""
+
+    _answer: asyncio.Task[None] | None = None
+
+    def prepare(self) -> None:
+        # Before the files arrive. A browser does not send the origin of a request that only reads.
+        if self.request.method != "GET" and not is_same_origin(self.request):
+            raise tornado.web.HTTPError(403, reason="this page may not send files to dhcal")
+        self.set_header("Content-Type", "application/x-ndjson")
+
+    def on_connection_close(self) -> None:
+        if self._answer:
+            self._answer.cancel()
+
+    async def _follow(self, job: Job) -> None:
+        """Send all messages of a job, until its end or until the browser is gone."""
+        self._answer = asyncio.create_task(self._send_all(job))
+        with suppress(asyncio.CancelledError):
+            await self._answer
+
+    async def _send_all(self, job: Job) -> None:
+        """Send the name and all messages of a job."""
+        async with aclosing(job.follow()) as messages:
+            await self._flush()
+            async for message in messages:
+                await self._send(message)
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        """Send a message."""
+        self.write(json.dumps(message) + "\n")
+        await self._flush()
+
+    async def _flush(self) -> None:
+        """Send what was written, if the browser is still there."""
+        with suppress(tornado.iostream.StreamClosedError):
+            await self.flush()
+
+
 @tornado.web.stream_request_body
-class _RunHandler(_Handler):
+class _RunHandler(_FollowHandler):
     """Runs one operation on the files of a form."""
 
     def initialize(self, service: _Service, operation: Operation) -> None:
         self._service = service
         self._operation = operation
         self._body = bytearray()
-        self._task: asyncio.Task[None] | None = None
-
-    def prepare(self) -> None:
-        # Before the files arrive.
-        if not is_same_origin(self.request):
-            raise tornado.web.HTTPError(403, reason="this page may not send files to dhcal")
 
     def data_received(self, chunk: bytes) -> None:
         self._body += chunk
 
     async def post(self) -> None:
-        self.set_header("Content-Type", "application/x-ndjson")
-        if len(self._service.tasks) >= MAX_RUNS:
-            await self._send({"error": f"{MAX_RUNS} calculations are running; wait until one of them ends"})
-            return
-        self._task = asyncio.create_task(self._run())
-        self._service.tasks.add(self._task)
         try:
-            await self._task
-        except asyncio.CancelledError:
-            # The browser is gone, or the server stops.
-            pass
-        finally:
-            self._service.tasks.discard(self._task)
-
-    def on_connection_close(self) -> None:
-        if self._task:
-            self._task.cancel()
-
-    async def _run(self) -> None:
-        """Send all messages of the operation."""
-        try:
-            try:
-                upload = Upload.from_form(self.request.headers.get("Content-Type", ""), bytes(self._body))
-            finally:
-                self._body.clear()
-            with TemporaryDirectory(dir=self._service.folder) as name:
-                folder = Path(name)
-                upload.save(folder)
-                async with aclosing(self._operation(upload, folder)) as messages:
-                    async for message in messages:
-                        await self._send(message)
+            name = self._service.start(
+                self._operation, self.request.headers.get("Content-Type", ""), self._body
+            )
         except DhcalError as error:
             await self._send({"error": message_line(error)})
+            return
+        self.set_header("Job", name)
+        await self._follow(self._service.jobs[name])
 
-    async def _send(self, message: dict[str, Any]) -> None:
-        self.write(json.dumps(message) + "\n")
-        with suppress(tornado.iostream.StreamClosedError):
-            await self.flush()
+
+class _JobHandler(_FollowHandler):
+    """Follows a job from its first message, or stops it."""
+
+    def initialize(self, service: _Service) -> None:
+        self._service = service
+
+    async def get(self, name: str) -> None:
+        if job := self._service.jobs.get(name):
+            await self._follow(job)
+        else:
+            text = "this calibration is no longer kept; add the files and calibrate again"
+            await self._send({"error": text})
+
+    def delete(self, name: str) -> None:
+        job = self._service.jobs.get(name)
+        if job and not job.task.cancel():
+            del self._service.jobs[name]

@@ -108,7 +108,7 @@ def _require_plain_name(name: str) -> None:
     if not is_plain or len(name.encode()) > _MAX_NAME_BYTES:
         raise InvalidArgumentError(
             f"{quote(name)}: unsuitable file name; expected one that begins with a letter or a digit and has "
-            "no slash and no colon"
+            f"no slash, no colon and at most {_MAX_NAME_BYTES} bytes"
         )
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._typing import Array
-from ..cameras.pose_from_points import direct_linear_transform
+from ..cameras.pose_from_points import determines_homography, direct_linear_transform
 from .opencv import require_opencv
 
 # Half the length of the edges that are used, in squares.
@@ -37,10 +37,10 @@ def refine_crossings(image: Array, points: Array, pixels: Array, width: float) -
     """Improve the corners of a board, and judge whether each is visible.
 
     The points are corners in squares, the pixels their image coordinates, shape (c, 2) each. Within `width`
-    squares from the edges there is nothing but the four squares. Fewer than four corners are returned as they
-    are.
+    squares from the edges there is nothing but the four squares. Corners that determine no homography are
+    returned as they are.
     """
-    if len(points) < 4:
+    if not determines_homography(points):
         return pixels, np.ones(len(points), bool)
     sides = _sides(points, pixels)
     lengths = np.linalg.norm(sides, axis=1)

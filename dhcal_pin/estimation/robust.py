@@ -155,7 +155,7 @@ def standardized_residuals(
         return standardize_mean_squares(np.sum(residual**2, 0) / k, k, is_good)
     # A residual that the fit makes zero for any measured value must not be divided by its variance.
     trace = np.trace(covariances, axis1=1, axis2=2)
-    regularized = covariances + np.fmax(MIN_VARIANCE, ROUNDING * trace)[:, None, None] * np.eye(k)
+    regularized = covariances + np.fmax(MIN_VARIANCE, ROUNDING * np.abs(trace))[:, None, None] * np.eye(k)
     return standardize_mean_squares(
         np.sum(residual.T * np.linalg.solve(regularized, residual.T[..., None])[..., 0], 1) / k, k, is_good
     )

@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 from pages import AXE, READY, VIEWPORT, listen
+from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin.app.server
+from dhcal_pin.calibration.summary import format_share
 from dhcal_pin.cli.main import main
 from dhcal_pin.io.rig_file import read_rig
 
@@ -58,6 +60,7 @@ def page(shared_page):
     """The page as it is when it is opened; another process of the browser would take half a second."""
     shared_page.set_viewport_size(VIEWPORT)
     shared_page.emulate_media(color_scheme="light")
+    shared_page.evaluate("sessionStorage.clear()")
     shared_page.reload()
     return shared_page
 
@@ -108,7 +111,13 @@ def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
         1e3 * result["holdout_before"]["position_rms_m"], rel=0.05
     )
     assert float(after.split()[0]) == pytest.approx(1e3 * result["holdout_after"]["position_rms_m"], rel=0.05)
-    assert "Verdict: ok" in page.inner_text("#result")
+    shown = page.inner_text("#result")
+    assert "Verdict: ok" in shown
+    counts = {each["title"]: each["n_samples"] for each in result["comparisons"]}
+    assert f"{counts['hold-out']} hold-out rows" in shown
+    assert f"{counts['fitted']} fitted rows" in shown
+    assert f"Accuracy unknown: {format_share(1 - result['reached_share'])} of joint space" in shown
+    assert "use it in place of the old one; keep the sidecar beside it" in shown
     assert "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3" in page.text_content("#result pre")
     for name in ("report.html", "scene.html"):
         with page.context.expect_page() as waiting:
@@ -127,6 +136,10 @@ def test_refusal_shows_the_remedy_and_applies_it(page, example):
     page.wait_for_selector("#result .refused")
     assert "The sign of joint elbow_joint is wrong" in page.inner_text("#result")
     assert page.locator('#downloads a[download$=".urdf"]').count() == 0
+    # The errors of a robot that is not written are no result.
+    assert page.is_hidden("#result table")
+    page.click("#result summary")
+    assert page.is_visible("#result table")
     page.click("text=Apply the change and calibrate again")
     page.wait_for_selector("#result .card.ok")
     assert "sign:elbow_joint" in page.inner_text("#mends")
@@ -134,6 +147,76 @@ def test_refusal_shows_the_remedy_and_applies_it(page, example):
     drop(page, ("laser.csv", "x"))
     assert page.is_hidden("#mends")
     assert page.is_hidden("#result")
+
+
+def test_a_loaded_page_shows_its_calibration_again(page, example):
+    drop_with_tip(page, *example_files(example))
+    page.click("#calibrate")
+    page.wait_for_function("() => sessionStorage.job")
+    page.reload()
+    assert "add them again: ur10.urdf, laser.csv" in page.inner_text("#file-error")
+    page.wait_for_selector("#result .card.ok")
+    shown = page.inner_text("#result")
+    assert page.is_disabled("#calibrate")
+    page.reload()
+    page.wait_for_selector("#result .card.ok")
+    assert page.inner_text("#result") == shown
+    assert download(page, "ur10_calibrated.urdf") == (example / "ur10_calibrated.urdf").read_bytes()
+    # Other files begin anew.
+    drop(page, *example_files(example))
+    page.wait_for_selector("#check .card.ok")
+    assert page.is_hidden("#file-error")
+    page.reload()
+    assert page.is_hidden("#result")
+
+
+def test_a_cancelled_calibration_does_not_come_back(page, example):
+    drop_with_tip(page, *example_files(example))
+    page.click("#calibrate")
+    page.wait_for_function("() => sessionStorage.job")
+    page.click("#cancel")
+    page.wait_for_selector("text=Cancelled. Nothing was kept.")
+    page.reload()
+    assert page.is_hidden("#cancel")
+    assert page.is_hidden("#run-error")
+
+
+def test_refused_remedies_need_the_files(page, example):
+    urdf, _ = example_files(example)
+    drop_with_tip(page, urdf, ("laser.csv", wrong_sign(example)))
+    page.click("#calibrate")
+    page.wait_for_selector("#result .refused")
+    page.reload()
+    page.wait_for_selector("#result .refused")
+    assert page.is_disabled("text=Apply the change and calibrate again")
+
+
+def test_the_check_names_what_is_missing_beside_its_control(page):
+    """The servo file, the tip and the rig of the example are missing, and are added in turn."""
+    corners, motors = ((name, (EXAMPLE / name).read_text()) for name in ("corners.csv", "so101.json"))
+    drop(page, ("so101.urdf", (URDF / "so101.urdf").read_text()), corners)
+    page.wait_for_selector("#needed-file:has-text('Add the servo file')")
+    drop(page, motors)
+    page.wait_for_selector("#tip-error:not([hidden])")
+    assert page.get_attribute("#tip", "placeholder") == "moving_jaw_link"
+    page.click("text=Rows of each image (20)")
+    assert "00.png\t24" in page.inner_text("#check")
+    page.fill("#tip", "gripper_frame_link")
+    page.locator("#tip").blur()
+    page.wait_for_selector("#needed-file:has-text('Add the rig file')")
+    assert page.is_hidden("#tip-error")
+    assert "RIG.toml" not in page.inner_text("#check")
+
+
+def test_figures_of_the_page_count_as_the_command_does(page):
+    """A fit to images of another board can reject all but one image and has no error there."""
+    accuracy = {"residual_rms": 1e-9, "unit": "px"}
+    result = {"before": accuracy, "after": accuracy, "comparisons": [
+        {"title": "fitted", "n_samples": 24, "n_outliers": 480}
+    ]}  # fmt: skip
+    assert (
+        page.evaluate("result => accuracies(result)[0]", result)[1] == "24 fitted rows, without 480 outliers"
+    )
 
 
 def test_a_proposed_column_map_is_used(page, example):
@@ -183,7 +266,8 @@ DROP_PHOTOGRAPH = """async () => {
 
 def test_a_rig_file_is_made_and_its_board_is_printed(page, example, tmp_path, monkeypatch):
     page.evaluate(DROP_PHOTOGRAPH)
-    page.wait_for_function("document.getElementById('rig-width').value === '320'")
+    page.wait_for_function("() => document.getElementById('rig-width').value === '320'")
+    assert page.evaluate("sessionStorage.files") == "1 photograph"
     page.select_option("#rig-place", "world")
     page.fill("#rig-square", "25")
     page.fill("#rig-ruler", "149.5")
@@ -225,6 +309,7 @@ def test_errors_are_shown_as_one_line(page, example):
     page.click("#calibrate")
     page.wait_for_selector("#run-error:not([hidden])")
     assert "ur10.urdf: unknown link 'nowhere'" in page.inner_text("#run-error")
+    page.wait_for_selector("#tip-error:not([hidden])")
     assert page.is_hidden("#result")
     # The size is checked before anything is sent.
     page.evaluate("document.documentElement.dataset.limit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
@@ -12,14 +13,16 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from urllib.parse import urlsplit
 
 import psutil
 import pytest
-from app_requests import example_form, form, post, start_app
+from app_requests import ask, example_form, form, post, start_app
 from robots import ROOT, URDF
 
+from dhcal_pin.app import command
+from dhcal_pin.app.server import MAX_KEPT, Job, _Service
 from dhcal_pin.app.upload import MAX_FILES, Upload
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
@@ -106,6 +109,13 @@ def test_errors_are_one_line(app, example, request_changes, words):
     assert app.contents() == []
 
 
+def test_a_measurement_file_with_the_name_of_a_result_is_to_be_renamed(app, example):
+    files = {"ur10.urdf": (example / "ur10.urdf").read_bytes(), "residuals.csv": b"x"}
+    body, headers = form(files, {"robot": "ur10.urdf", "data": ["residuals.csv"], "tip": "tool0"})
+    error = "residuals.csv: is an input file; rename it: a result has this name"
+    assert post(app, "calibrate", body, **headers)[1] == [{"error": error}]
+
+
 @pytest.mark.parametrize(
     "name", ["../ur10.urdf", "a/b.urdf", "-o.urdf", ".hidden.urdf", "example:ur10", "a\\b.urdf", "x" * 300]
 )
@@ -161,27 +171,104 @@ def open_request(app, body, headers):
     head += f"Content-Type: {headers['Content-Type']}\r\nContent-Length: {len(body)}\r\n\r\n"
     connection = socket.create_connection((parts.hostname, parts.port), timeout=30)
     connection.sendall(head.encode() + body)
-    assert b"200 OK" in connection.recv(1000)
-    return connection
+    answer = connection.recv(1000)
+    assert b"200 OK" in answer
+    return connection, re.findall(rb"Job: (\S+)", answer)[0].decode()
 
 
 def test_a_cancelled_run_leaves_nothing(app, example):
     body, headers = example_form(example)
     server = psutil.Process(app.process.pid)
-    connection = open_request(app, body, headers)
-    assert app.contents()
+    connection, job = open_request(app, body, headers)
+    wait_until(lambda: app.contents() and server.children(recursive=True))
+    assert ask(app, "DELETE", f"job/{job}", Origin="http://evil.example")[0] == 403
     assert server.children(recursive=True)
-    connection.close()
+    assert ask(app, "DELETE", f"job/{job}")[:2] == (200, [])
     wait_until(lambda: not server.children(recursive=True) and app.contents() == [])
+    assert "no longer kept" in ask(app, "GET", f"job/{job}")[1][0]["error"]
+    connection.close()
+
+
+def test_a_calibration_is_followed_again_while_it_runs_and_after_its_end(app, example):
+    body, headers = example_form(example)
+    connection, job = open_request(app, body, headers)
+    connection.close()
+    _, messages, _ = ask(app, "GET", f"job/{job}")
+    assert result_of(messages)["status"] == "done"
+    assert len(messages) > 3
+    assert ask(app, "GET", f"job/{job}")[1] == messages
+    # What a page asks for at each change is not kept.
+    assert ask(app, "GET", f"job/{ask(app, 'POST', 'inspect', body, **headers)[2]}")[1] == [
+        {"error": "this calibration is no longer kept; add the files and calibrate again"}
+    ]
+    assert ask(app, "DELETE", f"job/{job}")[0] == 200
+    assert "error" in ask(app, "GET", f"job/{job}")[1][0]
+
+
+async def endless():
+    yield {"phase": "fit"}
+    await asyncio.Event().wait()
+
+
+def test_a_job_that_nothing_follows_is_stopped():
+    async def run():
+        job = Job(endless(), 0.01)
+        async with aclosing(job.follow()) as one, aclosing(job.follow()) as other:
+            assert await anext(one) == await anext(other) == {"phase": "fit"}
+            await one.aclose()
+            await asyncio.sleep(0.05)
+            assert not job.task.done()
+        async with aclosing(job.follow()) as again:
+            await anext(again)
+            await asyncio.sleep(0.05)
+            assert not job.task.done()
+        await asyncio.wait([job.task])
+        return job.task.cancelled()
+
+    assert asyncio.run(run())
+
+
+def test_the_last_calibrations_are_kept(tmp_path):
+    async def run():
+        service = _Service(tmp_path, 0)
+        names = []
+        for _ in range(MAX_KEPT + 3):
+            names.append(service.start(command.calibrate, "", bytearray()))
+            await asyncio.wait([service.jobs[names[-1]].task])
+        return list(service.jobs) == names[-MAX_KEPT:]
+
+    assert asyncio.run(run())
+
+
+def test_a_calculation_ends_with_a_killed_server(tmp_path, monkeypatch):
+    """The system closes the pipe of a process that is killed."""
+    (tmp_path / "endless.py").write_text("import time\nwhile True: time.sleep(1)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(command, "_PROGRAM", "endless")
+
+    async def run():
+        async with command._started((), tmp_path) as process:
+            assert process.stdin is not None
+            process.stdin.close()
+            return await asyncio.wait_for(process.wait(), 30)
+
+    assert asyncio.run(run()) == -signal.SIGKILL
+
+
+def test_the_guide_names_the_use_of_each_file():
+    text = (ROOT / "docs/howto/app.md").read_text()
+    for ending, (label, use) in command.OUTPUTS.items():
+        assert re.search(rf"\| `\w*{re.escape(ending)}` \| {re.escape(f'{label}: {use}')} \|", text), ending
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_the_end_of_the_server_removes_everything(number, example, tmp_path):
     app = start_app(tmp_path / "app")
     body, headers = example_form(example)
-    connection = open_request(app, body, headers)
-    children = psutil.Process(app.process.pid).children(recursive=True)
-    assert children
+    connection, _ = open_request(app, body, headers)
+    server = psutil.Process(app.process.pid)
+    wait_until(server.children)
+    children = server.children(recursive=True)
     assert app.stop(number) == 0
     assert not psutil.wait_procs(children, timeout=10)[1]
     assert list(app.folder.iterdir()) == []
@@ -292,7 +379,7 @@ def photographed(tmp_path_factory):
     return folder
 
 
-def photograph_form(folder, count, **changes):
+def photograph_form(folder, count, other_files=None, **changes):
     """Form with some of the photographs and all files that belong to them."""
     files = {path.name: path.read_bytes() for path in sorted((folder / "photographs").iterdir())[:count]}
     request = {"images": list(files), "data": ["counts.csv"], "robot": "so101.urdf", "rig": "rig.toml"}
@@ -300,13 +387,23 @@ def photograph_form(folder, count, **changes):
     files |= {name: (folder / name).read_bytes() for name in ("so101.urdf", "rig.toml", "so101.json")}
     counts = (folder / "counts.csv").read_text().splitlines(keepends=True)
     files["counts.csv"] = "".join(counts[: 1 + count]).encode()
-    return form(files, request | changes)
+    return form(files | (other_files or {}), request | changes)
 
 
 def test_photographs_are_searched(app, photographed):
     body, headers = photograph_form(photographed, 2)
-    (board,) = result_of(post(app, "inspect", body, **headers)[1])["result"]["boards"]
+    found, last = post(app, "inspect", body, **headers)[1]
+    (board,) = found["boards"]
     assert (board["images"], board["used"]) == (2, 2)
+    # The corners are checked as those of a file.
+    (corners,) = last["result"]["files"]
+    assert (corners["path"], corners["configurations"], corners["problem"]) == ("corners.csv", 2, "")
+    rig = (photographed / "rig.toml").read_text().replace("columns = 8", "columns = 5")
+    rig = rig.replace("rows = 5", "rows = 8").encode()
+    body, headers = photograph_form(photographed, 2, {"rig.toml": rig}, servos="")
+    found, last = post(app, "inspect", body, **headers)[1]
+    assert found["notes"] == ["board paper was printed with columns = 8, rows = 5; write so in rig.toml"]
+    assert "expected --servos" in last["error"]
     body, headers = photograph_form(photographed, 2, rig="")
     assert "rig" in post(app, "calibrate", body, **headers)[1][-1]["error"]
 

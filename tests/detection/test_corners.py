@@ -19,6 +19,7 @@ from dhcal_pin.detection import (
     read_image,
     render_images,
 )
+from dhcal_pin.detection.crossings import refine_crossings
 from dhcal_pin.detection.video import read_stills
 from dhcal_pin.exceptions import DhcalError
 
@@ -192,3 +193,12 @@ def test_pdf_has_the_size_of_the_board(board):
     box = text.split(b"/MediaBox [0 0 ")[1].split(b"]")[0].split()
     _, size = black_rectangles(board)
     np.testing.assert_allclose(np.array(box, float) * 25.4 / 72, 1e3 * np.array(size) + 20, atol=1e-3)
+
+
+def test_corners_of_one_line_are_kept_as_they_are():
+    """The rig states a board with two columns of corners, of which an image shows one."""
+    points = np.array([[1.0, y] for y in range(1, 8)])
+    pixels = np.array([[100.0, 40.0 * y] for y in range(1, 8)])
+    found, is_visible = refine_crossings(np.zeros((400, 400), np.uint8), points, pixels, 0.1)
+    assert np.array_equal(found, pixels)
+    assert is_visible.all()

@@ -15,6 +15,7 @@ from dhcal_pin.estimation.robust import (
     FAR_REJECTED,
     FAR_THRESHOLD,
     KEPT,
+    MIN_VARIANCE,
     TRIMMED,
     WEIGHT_FUNCTIONS,
     ZERO_WEIGHT,
@@ -299,3 +300,9 @@ def test_samples_whose_residuals_are_hardly_determined_have_standardized_residua
     covariances = np.eye(2) + 1e20 * np.outer(direction, direction) * np.ones((5, 1, 1))
     t = standardized_residuals(np.arange(10.0).reshape(2, 5), covariances)
     assert np.isfinite(t).all()
+
+
+def test_covariances_that_rounding_errors_make_negative_have_an_inverse():
+    """A fit to images of another board has predictions of 1e7 px, whose covariances are not determined."""
+    covariances = np.array([[[-1e20, 0], [0, -MIN_VARIANCE]], np.eye(2)])
+    assert np.isfinite(standardized_residuals(np.ones((2, 2)), covariances)[0])

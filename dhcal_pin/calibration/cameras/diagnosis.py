@@ -627,10 +627,7 @@ def _arm_text(_: HandEyeData, state: _State) -> tuple[str, str]:
     """Describe the errors of the arm."""
     errors = state.fit.problem.errors
     x = state.fit.solution.x[: len(errors.parameters)]
-    remedy = (
-        "Estimate the arm, too, without --parameters. If it was kept, take images in a larger part of joint "
-        "space."
-    )
+    remedy = "Estimate the arm, too, without --parameters. If it was kept, the images do not decide that."
     if state.causes.arm == ARM_SETS[OFFSETS]:
         offsets = {p.name: v for p, v in zip(errors.parameters, x, strict=True) if p.name.endswith("offset")}
         name = max(offsets, key=lambda each: abs(offsets[each]))

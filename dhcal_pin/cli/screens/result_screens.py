@@ -21,7 +21,6 @@ from .screen import Block, Screen, list_first
 
 if TYPE_CHECKING:
     from ..._typing import Array
-    from ...cameras.rig import Rig
     from ...compensation import Compensation
     from ...detection import BoardDetection
     from ...diagnostics import Difference
@@ -88,27 +87,23 @@ def validation_screen(
 
 
 def detection_screen(
-    rig: Rig, detections: Sequence[BoardDetection], notes: Sequence[str], files: Sequence[str]
+    detections: Sequence[BoardDetection], notes: Sequence[str], files: Sequence[str]
 ) -> Screen:
     """Describe which corners were found in images."""
     from ...detection import unused_images  # lazy import: only this command needs it
 
-    found, warnings = [], list(notes)
+    found = []
     for detection in detections:
         n_corners = sum(len(image.corner) for image in detection.used)
         found.append(
             f"board {detection.board.name}: {n_corners} corners in {len(detection.used)} of "
             f"{len(detection.images)} images"
         )
-        if difference := detection.layout.describe(detection.board):
-            warnings.append(
-                f"board {detection.board.name} was printed with {difference}; write so in {rig.source}"
-            )
-    warnings += [f"{path}: not used, {problem}" for path, problem in unused_images(detections)]
+    unused = [f"{path}: not used, {problem}" for path, problem in unused_images(detections)]
     return Screen(
         [
             Block(found, is_verdict=True),
-            Block([f"warning: {text}" for text in warnings], "yellow", noun="warning", rank=2),
+            Block([f"warning: {text}" for text in (*notes, *unused)], "yellow", noun="warning", rank=2),
             files_block(files),
         ]
     )
