@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from .. import io, plausibility
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images, has_joint_values
@@ -35,7 +36,6 @@ from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableErr
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
-from ..io.servo_file import ServoFile, read_servos
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument
 from ..measurements.base import Measurement
@@ -43,8 +43,6 @@ from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.hypotheses import JOINT_CHANGES, mend
-from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
@@ -120,7 +118,7 @@ def run_job(
 
     `shown` has the paths of outputs as they are listed, where these differ from those that are written.
     """
-    servos = read_servos(job.servos) if job.servos else None
+    servos = io.read_servos(job.servos) if job.servos else None
     inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
@@ -190,8 +188,9 @@ def _holdout_file(job: Job) -> str | None:
 
 def checked_inputs(job: Job) -> list[str]:
     """Check the paths of a job; return those of its input files."""
-    servos = read_servos(job.servos) if job.servos else None
-    if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
+    servos = io.read_servos(job.servos) if job.servos else None
+    joint_changes = plausibility.JOINT_CHANGES if servos else ()
+    if changes := [key for key in job.mend if key.partition(":")[0] in joint_changes]:
         raise InvalidArgumentError(
             f"--mend {changes[0]}: not allowed with --servos; expected a corrected servo file, or --turned "
             "JOINT for a wrong sign"
@@ -235,12 +234,12 @@ def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> Meas
         return file
     data = file.data
     for key in keys:
-        data = mend(chain, data, key)
+        data = plausibility.mend(chain, data, key)
     is_held_out = np.isin(data.rows, file.holdout.rows)
     return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
 
 
-def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frames: bool) -> _JobData:
+def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_frames: bool) -> _JobData:
     """Read all measurements and split them by their `set` columns and by --holdout."""
     holdout_file = _holdout_file(job)
     fit: list[Measurement] = []
@@ -250,7 +249,7 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
     notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
-    limited = with_wide_limits(chain) if LOW_COST in chain.parameters else chain
+    limited = plausibility.with_wide_limits(chain) if LOW_COST in chain.parameters else chain
     for path in [*job.data, *filter(None, [holdout_file])]:
         read = read_measurement_file(
             path,
@@ -430,7 +429,7 @@ def _write_job(
     data: _JobData,
     inputs: Sequence[str],
     hint: str,
-    servos: ServoFile | None,
+    servos: io.ServoFile | None,
     shown: Mapping[str, str],
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""

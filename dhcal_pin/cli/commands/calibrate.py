@@ -62,7 +62,7 @@ def run(args: Namespace) -> int:
 
 @contextmanager
 def _without_collections() -> Iterator[None]:
-    """Collect no cyclic garbage: a calibration leaves little, and the loaded modules take 0.1 s to examine."""
+    """Collect no cyclic garbage: a calibration leaves little; to examine loaded modules takes 0.1 s."""
     was_enabled = gc.isenabled()
     gc.disable()
     # The interpreter collects once more when it exits.
