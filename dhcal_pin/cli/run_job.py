@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,8 @@ class CalibrationOutcome:
     """Result of a calibration job whose files are written."""
 
     fit: Result
-    document: dict[str, Any]  # Result as a JSON document
+    make_document: Callable[[], dict[str, Any]]  # Function that collects the result as a JSON document
+    settings: Mapping[str, str]  # Choices as text, by name
     files: dict[str, str]  # Paths of the files written, by what they are
     n_rows: dict[str, int]  # Number of rows that were read, by measurement file
     fitted: dict[str, Measurement]  # Measurements that were fitted, by file
@@ -106,6 +108,11 @@ class CalibrationOutcome:
     notes: dict[str, list[str]]  # What of the input is not used, by file
     moved_zeros: list[str]  # How the zeros of servos move
     hint: str  # Suggestion to use --extend; empty if there is none
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """Result as a JSON document, collected on first use."""
+        return self.make_document()
 
 
 def run_job(
@@ -459,13 +466,10 @@ def _write_job(
         held_out.setdefault(path, []).extend(rows.tolist())
     # Without the bundle, which holds the document, so that a repetition without one gives an equal document.
     listed = {name: path for name, path in files.items() if name != "bundle"}
-    document = _job_document(fit, data, (outliers, held_out), listed, source)
-    if job.bundle:
-        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, document)
-    write_outputs(contents, job.json, document)
-    return CalibrationOutcome(
+    outcome = CalibrationOutcome(
         fit=fit,
-        document=document,
+        make_document=partial(_job_document, fit, data, (outliers, held_out), listed, source),
+        settings=source.settings,
         files=files,
         n_rows=data.n_rows,
         fitted=data.fit,
@@ -479,6 +483,10 @@ def _write_job(
         moved_zeros=moved_zeros,
         hint=hint,
     )
+    if job.bundle:
+        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, outcome.document)
+    write_outputs(contents, job.json, outcome.document if job.json else None)
+    return outcome
 
 
 def _provenance(
