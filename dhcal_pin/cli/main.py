@@ -154,11 +154,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         with interrupt:
             if (outputs := _outputs_module()) is not None:
                 outputs.forget_written_files()
-            # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded. The
-            # parser loads it to check the name of a robot.
+            args = build_parser().parse_args(argv)
+            # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
             for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
                 os.environ.setdefault(name, "1")
-            args = build_parser().parse_args(argv)
             return args.run(args)
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, KeyboardInterrupt) or interrupt.is_received:
