@@ -12,14 +12,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from .exceptions import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 _Task = TypeVar("_Task")
 _Output = TypeVar("_Output")
@@ -68,6 +68,9 @@ def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskE
             threads = sum(client.nthreads().values())
             yield TaskExecutor(client.get_executor(pure=False), 2 * max(threads, 1))
     elif jobs > 1:
+        from concurrent.futures import ProcessPoolExecutor  # lazy import, as the following: few runs need it
+        from multiprocessing import get_context
+
         with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=end_with_parent) as pool:
             yield TaskExecutor(pool, 2 * jobs)
     else:
@@ -80,6 +83,9 @@ def end_with_parent() -> None:
     A worker waits for its next task on a pipe that its siblings hold open as well. Without this function it
     would wait for ever, and keep standard output open. A worker that is saving files completes that first.
     """
+    from multiprocessing import parent_process  # lazy import, as the following: only in workers
+    from multiprocessing.connection import wait
+
     parent = parent_process()
     if parent is not None:
 

@@ -16,9 +16,12 @@ import os
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ._typing import PathLike
 from .exceptions import InvalidArgumentError, UnknownNameError
+
+if TYPE_CHECKING:
+    from ._typing import PathLike  # loads NumPy, which the parser of the command line does not need
 
 # Beginning of the names of robots of example-robot-data.
 EXAMPLE_PREFIX = "example:"

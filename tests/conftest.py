@@ -20,7 +20,7 @@ from robots import missing, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
-from dhcal_pin.plausibility.mixups import NO_EVIDENCE, Diagnosis
+from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
 

@@ -8,20 +8,19 @@ from functools import cached_property
 
 import numpy as np
 
+from .. import plausibility
 from .._typing import Array
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
 from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
+from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import Diagnosis, diagnose_mixups
-from ..plausibility.signs import SignDecision
+from ..plausibility.mixups import diagnose_mixups
 from ..session import Session
+from . import cameras
 from .cameras.arm_types import INDUSTRIAL, ArmType
-from .cameras.board_size import BoardSize
-from .cameras.diagnosis import HandEyeDiagnosis, HandEyeFit
-from .cameras.stages import Stage
 from .cross_validation import (
     FoldComparison,
     Generalization,
@@ -75,14 +74,14 @@ class Evidence(FittedModel):
 
     region_comparison: Comparison | None = None
     input_warnings: tuple[str, ...] = ()
-    camera_stages: tuple[Stage, ...] = ()
-    hand_eye_fit: HandEyeFit | None = None
-    board_size: BoardSize | None = None
+    camera_stages: tuple[cameras.Stage, ...] = ()
+    hand_eye_fit: cameras.HandEyeFit | None = None
+    board_size: cameras.BoardSize | None = None
     is_kept_nominal: bool = False
     earlier_diagnosis: Diagnosis | None = None
     session: Session | None = None
     with_auto: Callable[[], Evidence] | None = None
-    signs: SignDecision | None = None
+    signs: plausibility.SignDecision | None = None
     arm_type: ArmType = INDUSTRIAL
 
     @cached_property
@@ -116,7 +115,7 @@ class Evidence(FittedModel):
         return [f"Too few measurements: {applied} correction applied. Measure more poses."]
 
     @property
-    def hand_eye(self) -> HandEyeDiagnosis | None:
+    def hand_eye(self) -> cameras.HandEyeDiagnosis | None:
         """Error of cameras and boards on the nominal arm and its likely cause.
 
         None if the calibrated arm fits the images, without images, and with fewer than five configurations.

@@ -144,10 +144,10 @@ def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int
 
     Returns the number of other samples, and s₀/s_g.
     """
-    from scipy.special import gammainc  # lazy import: slow
-
     if len(groups) > MAX_FEW:
         return None
+    from scipy.special import gammainc  # lazy import: slow
+
     system = linearize_and_factor(problem, x, small_angle=False)
     root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
     if not 0 < root.shape[1] <= MAX_COORDINATES:

@@ -29,6 +29,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .. import plausibility
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
@@ -46,25 +47,12 @@ from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.evidence import HAND_BUILT
-from ..plausibility.signs import SignDecision, decide_signs, first_errors, known_signs
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
-from . import model_selection
-from .cameras import (
-    arm_type,
-    default_sets,
-    exchange_axes,
-    has_images,
-    held_values,
-    reorder,
-    require_joint_values,
-    split_sets,
-    with_stated_distortion,
-)
-from .cameras.image_session import find_image_session, fit_with_changes
-from .cameras.procedure import ImageFitting, calibrate_images, require_shown_families, with_common_start
+from . import cameras, model_selection
+from .cameras import arm_type, default_sets, has_images, held_values, require_joint_values, split_sets
 from .cross_validation import leave_regions_out
 from .result import Result, make_result
 from .reweighting import Fit, reweight
@@ -185,14 +173,16 @@ def calibrate(
     signs = None
     if turned != "auto":
         names = turned.split(",") if isinstance(turned, str) else turned
-        signs = known_signs(chain, [name.strip() for name in names if name != "none"])
+        signs = plausibility.known_signs(chain, [name.strip() for name in names if name != "none"])
     elif LOW_COST in robot_sets:
         if progress:
             progress("signs of the joints", 1, 1)
-        signs = decide_signs(chain, data)
+        signs = plausibility.decide_signs(chain, data)
     chain = signs.apply(chain) if signs else chain
-    data, exchanges = exchange_axes(chain, data)
-    holdout = reorder(holdout, exchanges)
+    exchanges: Sequence[cameras.Exchange] = ()
+    if has_images(data):
+        data, exchanges = cameras.exchange_axes(chain, data)
+        holdout = cameras.reorder(holdout, exchanges)
     of_images = None
     arm = arm_type(robot_sets)
     if session != "off" and method == "lm" and has_images(data):
@@ -207,20 +197,20 @@ def calibrate(
             turned="none",
             executor=executor,
         )
-        of_images = find_image_session(chain, data, holdout, of_poses, arm)
+        of_images = cameras.find_image_session(chain, data, holdout, of_poses, arm)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
     errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
     families = _extension_families(extend, errors, method, priors)
     _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
-        require_shown_families(extend, families)
+        cameras.require_shown_families(extend, families)
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
-    first = first_errors(chain, data) if LOW_COST in robot_sets else {}
+    first = plausibility.first_errors(chain, data) if LOW_COST in robot_sets else {}
     start = partial(
         _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
     )
     if of_images and not of_images.changes.is_empty:
-        of_images, fit, holdout = fit_with_changes(of_images, data, holdout, start)
+        of_images, fit, holdout = cameras.fit_with_changes(of_images, data, holdout, start)
     else:
         fit = start(data)
     # The confirmation of changes and the calibration itself often need the same fits.
@@ -245,8 +235,8 @@ def calibrate(
         return replace(make_result(fit, 1.0, holdout, method), signs=signs)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
-        fitting = ImageFitting(groups, stages, max_iterations, progress, arm)
-        images = calibrate_images(fitting, fit, chain, holdout, exchanges, families)
+        fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)
+        images = cameras.calibrate_images(fitting, fit, chain, holdout, exchanges, families)
         return replace(images, signs=signs, with_auto=with_auto, session=of_images)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
@@ -283,11 +273,14 @@ def _first_fit(
 ) -> Fit:
     """Initialize base, tool and instruments, and solve for the first time, from first errors of the robot."""
     started = replace(errors, chain=errors.at(_start(errors, first))) if first else errors
-    data = with_common_start(errors.chain, data)
+    if has_images(data):
+        data = cameras.with_common_start(errors.chain, data)
     started, data, weights = _initialize(started, data, known, options.max_iterations, options.is_robust)
     if not first:
         errors = started
-    data, distortion = with_stated_distortion(data)
+    distortion: Mapping[str, float] = {}
+    if has_images(data):
+        data, distortion = cameras.with_stated_distortion(data)
     problem = make_problem(errors, data, prior_weights(errors, priors), known)
     problem = replace(problem, executor=options.executor)
     if priors == "none":
@@ -332,7 +325,7 @@ def _calibrate_samples(
     families: Sequence[str],
     holdout: tuple[Measurement, ...],
     extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
-    signs: SignDecision | None,
+    signs: plausibility.SignDecision | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     inliers = fit.without_rejected().problem

@@ -20,8 +20,7 @@ from ..io.origins_file import without_negligible_moves
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS, error_group
-from . import summary
-from .cameras.diagnosis import largest_position_std
+from . import cameras, summary
 from .cross_validation import refit
 from .estimates import Estimate, make_estimates
 from .evaluation import Accuracy, accuracy, compute_errors
@@ -96,7 +95,7 @@ class Result(Evidence, ResultPlots):
         """
         if self.errors.only_frames():
             return 0.0
-        return largest_position_std([p.name for p in self.parameters], self.covariance)
+        return cameras.largest_position_std([p.name for p in self.parameters], self.covariance)
 
     def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
         """Compute the accuracy of the calibrated chain on other measurements.

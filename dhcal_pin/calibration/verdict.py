@@ -16,16 +16,17 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..distributions import student_cdf
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..formatting import format_quantity, join_names
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
+from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
-from ..plausibility.mixups import Diagnosis
 from ..robot.chain import BASE_FRAME
-from .cameras.image_checks import MAX_IMAGE_OUTLIER_SHARE, small_ranges
+from . import cameras
 from .evaluation import accuracy, fit_nominal
 from .evidence import Evidence
 from .partition import configuration_groups
@@ -208,7 +209,7 @@ def _few_images(fit: Evidence) -> list[Finding]:
         f"{images} too few for the zeros and signs of this arm. Take at least {needed - count} more, better "
         f"{advised - count}."
     )
-    if small := small_ranges(fit.chain, fit.data):
+    if small := cameras.small_ranges(fit.chain, fit.data):
         text += f" Turn the joints that moved less than half of their range: {', '.join(small)}."
     return [Finding("refused", text)]
 
@@ -378,8 +379,6 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
     paired = fit.held_out_errors
     if paired is None or not (fit.shrinkage_factor and fit.errors.has_arm):
         return []
-    from scipy.special import stdtrit  # lazy import: slow
-
     head = fit.comparisons[0]
     group, after = next(iter(head.after.groups.items()))
     before, change = head.before.groups[group], paired.t
@@ -390,7 +389,7 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return [Finding("refused", text)]
     # Left-out regions have shown already that the arm is wrong if images change it, and without estimates of
     # cameras and boards the nominal arm would fit worse than before.
-    if fit.camera_stages or change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
+    if fit.camera_stages or student_cdf(change, len(paired.before) - 1) < MAX_CHANCE:
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
@@ -467,7 +466,7 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 def _outliers(fit: Evidence) -> list[Finding]:
     """Advise caution if many samples are outliers; refuse images that are mostly outliers."""
     n_outliers = fit.n_outliers
-    is_refused = bool(fit.camera_stages) and n_outliers > MAX_IMAGE_OUTLIER_SHARE * fit.n_samples
+    is_refused = bool(fit.camera_stages) and n_outliers > cameras.MAX_IMAGE_OUTLIER_SHARE * fit.n_samples
     # Images that differ because of a wrong lens or a wrong arm are no outliers.
     is_explained = fit.hand_eye is not None and bool(fit.hand_eye.causes) and not is_refused
     if is_explained:

@@ -130,7 +130,6 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
     """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io.camera_files import camera_files
     from ..io.robot import urdf_files
     from ..report.provenance import file_digests
     from ..robot import urdf_edit
@@ -167,6 +166,8 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
         list(file_digests(options["data"]).values()),
     )
     if options["camera_files"]:
+        from ..io.camera_files import camera_files  # lazy import: only for cameras
+
         data = contents[output]
         assert isinstance(data, bytes)
         for frame in frames(data):

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from .. import io, plausibility
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images, has_joint_values
@@ -35,7 +37,6 @@ from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableErr
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
-from ..io.servo_file import ServoFile, read_servos
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument
 from ..measurements.base import Measurement
@@ -43,8 +44,6 @@ from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import TaskExecutor
-from ..plausibility.hypotheses import JOINT_CHANGES, mend
-from ..plausibility.signs import with_wide_limits
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
@@ -94,7 +93,8 @@ class CalibrationOutcome:
     """Result of a calibration job whose files are written."""
 
     fit: Result
-    document: dict[str, Any]  # Result as a JSON document
+    make_document: Callable[[], dict[str, Any]]  # Function that collects the result as a JSON document
+    settings: Mapping[str, str]  # Choices as text, by name
     files: dict[str, str]  # Paths of the files written, by what they are
     n_rows: dict[str, int]  # Number of rows that were read, by measurement file
     fitted: dict[str, Measurement]  # Measurements that were fitted, by file
@@ -109,6 +109,11 @@ class CalibrationOutcome:
     moved_zeros: list[str]  # How the zeros of servos move
     hint: str  # Suggestion to use --extend; empty if there is none
 
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """Result as a JSON document, collected on first use."""
+        return self.make_document()
+
 
 def run_job(
     job: Job,
@@ -120,7 +125,7 @@ def run_job(
 
     `shown` has the paths of outputs as they are listed, where these differ from those that are written.
     """
-    servos = read_servos(job.servos) if job.servos else None
+    servos = io.read_servos(job.servos) if job.servos else None
     inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
     ROBOT_FORMATS[robot_ending(job.output)].require(chain, job.output, vars(job))
@@ -190,8 +195,9 @@ def _holdout_file(job: Job) -> str | None:
 
 def checked_inputs(job: Job) -> list[str]:
     """Check the paths of a job; return those of its input files."""
-    servos = read_servos(job.servos) if job.servos else None
-    if servos and (changes := [key for key in job.mend if key.partition(":")[0] in JOINT_CHANGES]):
+    servos = io.read_servos(job.servos) if job.servos else None
+    joint_changes = plausibility.JOINT_CHANGES if servos else ()
+    if changes := [key for key in job.mend if key.partition(":")[0] in joint_changes]:
         raise InvalidArgumentError(
             f"--mend {changes[0]}: not allowed with --servos; expected a corrected servo file, or --turned "
             "JOINT for a wrong sign"
@@ -235,12 +241,12 @@ def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> Meas
         return file
     data = file.data
     for key in keys:
-        data = mend(chain, data, key)
+        data = plausibility.mend(chain, data, key)
     is_held_out = np.isin(data.rows, file.holdout.rows)
     return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
 
 
-def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frames: bool) -> _JobData:
+def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_frames: bool) -> _JobData:
     """Read all measurements and split them by their `set` columns and by --holdout."""
     holdout_file = _holdout_file(job)
     fit: list[Measurement] = []
@@ -250,7 +256,7 @@ def _read_data(chain: Chain, job: Job, servos: ServoFile | None, has_known_frame
     notes: dict[str, list[str]] = {}
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
-    limited = with_wide_limits(chain) if LOW_COST in chain.parameters else chain
+    limited = plausibility.with_wide_limits(chain) if LOW_COST in chain.parameters else chain
     for path in [*job.data, *filter(None, [holdout_file])]:
         read = read_measurement_file(
             path,
@@ -430,7 +436,7 @@ def _write_job(
     data: _JobData,
     inputs: Sequence[str],
     hint: str,
-    servos: ServoFile | None,
+    servos: io.ServoFile | None,
     shown: Mapping[str, str],
 ) -> CalibrationOutcome:
     """Write the outputs of a job, all or none; JSON and report explain why a robot was refused."""
@@ -460,13 +466,10 @@ def _write_job(
         held_out.setdefault(path, []).extend(rows.tolist())
     # Without the bundle, which holds the document, so that a repetition without one gives an equal document.
     listed = {name: path for name, path in files.items() if name != "bundle"}
-    document = _job_document(fit, data, (outliers, held_out), listed, source)
-    if job.bundle:
-        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, document)
-    write_outputs(contents, job.json, document)
-    return CalibrationOutcome(
+    outcome = CalibrationOutcome(
         fit=fit,
-        document=document,
+        make_document=partial(_job_document, fit, data, (outliers, held_out), listed, source),
+        settings=source.settings,
         files=files,
         n_rows=data.n_rows,
         fitted=data.fit,
@@ -480,6 +483,10 @@ def _write_job(
         moved_zeros=moved_zeros,
         hint=hint,
     )
+    if job.bundle:
+        contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, outcome.document)
+    write_outputs(contents, job.json, outcome.document if job.json else None)
+    return outcome
 
 
 def _provenance(

@@ -7,11 +7,14 @@ report. The robot is the same for these values, with the rest of the zeros in it
 from __future__ import annotations
 
 import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..calibration.result import Result
-from ..io.servo_file import ServoFile
+
+if TYPE_CHECKING:
+    from ..io.servo_file import ServoFile
 
 # Ending of the names of estimated zeros.
 _ZERO = ".offset"

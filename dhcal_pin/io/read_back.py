@@ -111,7 +111,9 @@ def _yourdfpy_reader() -> dict[str, Any]:
     trimesh.transformations = SimpleNamespace(
         compose_matrix=lambda translate, angles: se3.transform(pin.rpy.rpyToMatrix(angles), translate),
         translation_matrix=se3.translation,
-        rotation_matrix=lambda angle, axis: se3.exp6(np.r_[0, 0, 0, angle * axis / np.linalg.norm(axis)]),
+        rotation_matrix=lambda angle, axis: se3.transform(
+            pin.AngleAxis(angle, axis / np.linalg.norm(axis)).matrix(), np.zeros(3)
+        ),
     )
 
     def import_module(name: str, *args: Any) -> Any:

@@ -8,10 +8,13 @@ from __future__ import annotations
 import os
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from .._typing import PathLike
 from ..exceptions import UnknownNameError
 from ..ros_packages import resolve_robot_path
+
+if TYPE_CHECKING:
+    from .._typing import PathLike  # loads NumPy, which the parser of the command line does not need
 
 
 def _folders() -> tuple[Path, Path]:

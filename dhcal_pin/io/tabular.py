@@ -6,7 +6,6 @@ import csv
 import io
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -98,6 +97,8 @@ def read_toml(path: PathLike, max_bytes: int = MAX_TOML_BYTES) -> dict[str, Any]
 @lru_cache(maxsize=2)
 def _parse_toml(text: str) -> dict[str, Any]:
     """Parse TOML; a command reads the tables of one sidecar one after another."""
+    import tomllib  # lazy import: few commands read TOML
+
     return tomllib.loads(text)
 
 

@@ -37,6 +37,7 @@ from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
+from . import images
 from .base import Measurement, Noise, format_sigma, label_stops
 from .columns import Column
 from .groups import ErrorGroup, Group
@@ -47,15 +48,6 @@ from .images.camera_parameters import (
     camera_parameters,
     rig_parameters,
 )
-from .images.camera_start import (
-    BoardViews,
-    Corners,
-    estimate_views,
-    first_values,
-    moving_information,
-    moving_poses,
-)
-from .images.image_pose import ImagePose
 from .images.names import label_images, name_array, whole_images
 from .mounting import MountedRig, mount_rig
 from .pose import Pose
@@ -335,10 +327,10 @@ class CameraCorners(Measurement):
         return int(self.image.max(initial=-1)) + 1
 
     @property
-    def corners(self) -> Corners:
+    def corners(self) -> images.Corners:
         """Data of the corners for the first values of cameras and boards."""
         parts = self.rig, self.camera, self.board, self.corner, self.image
-        return Corners(self.conditions(), self.values, *parts)
+        return images.Corners(self.conditions(), self.values, *parts)
 
     def photographs(self) -> Array:
         """Return the name of the photograph of each sample, (m,); empty texts without photographs."""
@@ -590,26 +582,26 @@ class CameraCorners(Measurement):
         if all(np.isfinite(p.nominal) for p in self.instrument_parameters):
             return kept
         try:
-            return kept.with_values(first_values(self.corners, self.board_views, chain, is_used))
+            return kept.with_values(images.first_values(self.corners, self.board_views, chain, is_used))
         except NotObservableError as error:
             where = f"{self.source}: " if self.source else ""
             raise NotObservableError(f"{where}{error}") from None
 
     @cached_property
-    def board_views(self) -> BoardViews:
+    def board_views(self) -> images.BoardViews:
         """Poses of the boards in the cameras, from each image alone."""
-        return estimate_views(self.corners)
+        return images.estimate_views(self.corners)
 
     def tool_poses(self) -> Pose:
         """Return the poses of the tool, for some base and some tool, that the images show one by one."""
-        samples, poses = moving_poses(self.corners, self.board_views)
+        samples, poses = images.moving_poses(self.corners, self.board_views)
         return Pose(self.q[samples], poses)
 
-    def image_poses(self) -> ImagePose:
+    def image_poses(self) -> images.ImagePose:
         """Return the same poses with their covariances, lines and conditions."""
-        samples, poses = moving_poses(self.corners, self.board_views)
-        information = moving_information(self.corners, self.board_views, samples)
-        return ImagePose.of(self.q[samples], poses, information).replace(
+        samples, poses = images.moving_poses(self.corners, self.board_views)
+        information = images.moving_information(self.corners, self.board_views, samples)
+        return images.ImagePose.of(self.q[samples], poses, information).replace(
             rows=self.rows[samples],
             source=self.source,
             recorded=self.recorded and self.recorded[samples],

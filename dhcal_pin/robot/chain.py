@@ -33,7 +33,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -47,8 +47,6 @@ from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..messages import quote
 from .conditions import Conditions, SampleState
 from .dh import Convention, DHTable
-from .dh_extraction import Extraction, extract_dh
-from .dh_urdf import dh_to_urdf
 from .error_families import FAMILIES, ErrorFamily
 from .transmission import GravityLoads, Payload, Transmission, coefficient_indices, n_coefficients
 from .urdf import Urdf, parse_urdf, read_urdf, suggest_names
@@ -62,6 +60,9 @@ from .urdf_path import (
     link_on_path,
     placements,
 )
+
+if TYPE_CHECKING:
+    from .dh_extraction import Extraction
 
 # Index of the error frame of the base.
 BASE_FRAME = 0
@@ -195,6 +196,8 @@ class Chain:
         """
         if not isinstance(table, DHTable):
             raise InvalidArgumentError(f"table has type {type(table).__name__}; expected a DHTable")
+        from .dh_urdf import dh_to_urdf  # lazy import: only for DH tables
+
         text = dh_to_urdf(table, name)
         chain = cls.from_urdf(parse_urdf(text.encode(), f"{name}.urdf"), "tool0")
         return replace(chain, parameters="dh")
@@ -827,6 +830,8 @@ def extract_dh_table(chain: Chain, convention: Convention = "standard", hayati: 
             f"{chain.urdf.source}: joint {mimic!r} mimics another joint; a DH table cannot describe mimic "
             "joints, so calibrate the URDF itself"
         )
+    from .dh_extraction import extract_dh  # lazy import: only for DH tables
+
     return extract_dh(
         chain.link_transforms,
         chain.joint_names,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from .chain import Chain
-from .collision import CollisionChecker, Obstacle
+
+if TYPE_CHECKING:
+    from .collision import CollisionChecker, Obstacle
 
 # Number of draws per requested configuration before the workspace is considered too narrow.
 MAX_DRAWS_PER_SAMPLE = 200
@@ -62,6 +65,8 @@ class WorkspaceConstraints:
     @property
     def environment(self) -> tuple[Obstacle, ...]:
         """Floor and obstacles."""
+        from .collision import Obstacle  # lazy import: only for plans
+
         floor = () if self.floor is None else (Obstacle.floor(self.floor),)
         return (*floor, *self.obstacles)
 
@@ -128,6 +133,8 @@ class ConfigurationSampler:
         cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float
     ) -> ConfigurationSampler:
         """Create a sampler with margins to the joint limits."""
+        from .collision import CollisionChecker  # lazy import: only for plans
+
         checker = CollisionChecker.from_chain(chain, workspace.environment)
         return cls(chain, workspace, *joint_range(chain, angle, length), checker)
 

@@ -37,13 +37,19 @@ from .urdf import Urdf, UrdfJoint, suggest_names
 _MAX_MOVING_JOINTS = 64
 
 
+@lru_cache(maxsize=4)
+def _parsed_model(urdf: bytes) -> pin.Model:
+    """Build Pinocchio's model of a URDF; a calibration needs the same few URDFs many times."""
+    # Pinocchio separates numbers at spaces only; XML allows any white space.
+    text = urdf.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
+    with discard_native_messages():
+        return pin.buildModelFromXML(text)
+
+
 def build_model(urdf: Urdf) -> pin.Model:
     """Build Pinocchio's model of the whole robot."""
     try:
-        # Pinocchio separates numbers at spaces only; XML allows any white space.
-        text = urdf.data.decode("utf-8-sig").translate(dict.fromkeys(b"\t\r\n", " "))
-        with discard_native_messages():
-            return pin.buildModelFromXML(text)
+        return _parsed_model(urdf.data).copy()
     except (ValueError, RuntimeError) as error:
         raise FileFormatError(f"{urdf.source}: Pinocchio does not accept this URDF: {error}") from error
 

@@ -1,19 +1,5 @@
 """What happened during a session: events, drift, lag and scale, found from the order of the samples."""
 
-from .check import Recheck, recheck
-from .facts import History, Session, histories
-from .refinement import refine_changes
-from .scale import find_scale
-from .search import can_have_session, find_session
+import lazy_loader
 
-__all__ = [
-    "History",
-    "Recheck",
-    "Session",
-    "can_have_session",
-    "find_scale",
-    "find_session",
-    "histories",
-    "recheck",
-    "refine_changes",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

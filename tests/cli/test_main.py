@@ -34,7 +34,10 @@ def test_help_lists_all_commands(run):
     assert run("--version")[1].startswith("dhcal 0.")
 
 
-@pytest.mark.parametrize("args", [["--help"], ["calibrate"], ["calibrate", "--seed", "x"], ["--version"]])
+@pytest.mark.parametrize(
+    "args",
+    [["--help"], ["calibrate"], ["calibrate", "arm.urdf", "data.csv", "--seed", "x"], ["--version"]],
+)
 def test_help_and_argument_errors_load_nothing_heavy(args):
     script = (
         "import sys\n"

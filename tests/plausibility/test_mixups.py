@@ -12,7 +12,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
-from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups
+from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
 from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.robot import Chain
 
@@ -238,7 +238,7 @@ def test_hypotheses_that_add_errors_are_not_tried(ur10, monkeypatch):
         calls.append(arguments)
         return fit_evidence(*arguments)
 
-    monkeypatch.setattr(mixups, "fit_evidence", counted)
+    monkeypatch.setattr(trials, "fit_evidence", counted)
     found = diagnose_mixups(ur10, [data])
     assert found.is_suspicious
     assert not found.hypotheses

@@ -1,6 +1,7 @@
 """Public names of dhcal_pin.calibration.cameras; `__init__.py` loads each on first use."""
 
 from .arm_types import arm_type as arm_type
+from .axis_order import Exchange as Exchange
 from .axis_order import axis_stages as axis_stages
 from .axis_order import exchange_axes as exchange_axes
 from .axis_order import reorder as reorder
@@ -8,13 +9,22 @@ from .board_size import BoardSize as BoardSize
 from .board_size import find_board_size as find_board_size
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
+from .diagnosis import largest_position_std as largest_position_std
 from .gate import apply_gate as apply_gate
 from .gate import judge_stages as judge_stages
 from .gate import judge_target_points as judge_target_points
+from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
 from .image_checks import seen_ranges_warning as seen_ranges_warning
+from .image_checks import small_ranges as small_ranges
+from .image_session import find_image_session as find_image_session
+from .image_session import fit_with_changes as fit_with_changes
 from .lens_priors import lens_prior_groups as lens_prior_groups
 from .lens_priors import with_lens_priors as with_lens_priors
 from .lens_priors import with_stated_distortion as with_stated_distortion
+from .procedure import ImageFitting as ImageFitting
+from .procedure import calibrate_images as calibrate_images
+from .procedure import require_shown_families as require_shown_families
+from .procedure import with_common_start as with_common_start
 from .sets import DEFAULT_SETS as DEFAULT_SETS
 from .sets import HAND_EYE_SETS as HAND_EYE_SETS
 from .sets import MIXED_SETS as MIXED_SETS

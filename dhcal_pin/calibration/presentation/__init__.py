@@ -4,6 +4,6 @@
 `workspace`, and drawn in `fit_plots` with the functions of `dhcal_pin.plots`.
 """
 
-from .result_plots import ResultPlots
+import lazy_loader
 
-__all__ = ["ResultPlots"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from ... import formatting, plots
+from ... import formatting
 from ..._typing import Array
 from ...exceptions import InvalidArgumentError
+from .. import presentation
 from ..summary import generalization_lines, headline, largest_corrections
-from . import fit_plots
-from .curves import joint_curves
-from .workspace import predict_workspace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +45,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        return fit_plots.plot_accuracy(self._result, ax, group=group)
+        return presentation.plot_accuracy(self._result, ax, group=group)
 
     def plot_residuals(
         self, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
@@ -66,7 +64,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        return fit_plots.plot_residuals(self._result, ax, over=over, group=group)
+        return presentation.plot_residuals(self._result, ax, over=over, group=group)
 
     def plot_joint_corrections(self, ax: Sequence[Axes] | None = None) -> list[Axes]:
         """Plot the correction curve of each joint with its 95 % band and the gaps between measurements.
@@ -83,7 +81,9 @@ class ResultPlots:
         Raises:
             InvalidArgumentError: No joint has a correction curve, or the number of axes is another one.
         """
-        curves = joint_curves(self._result)
+        from ... import plots  # lazy import: slow to load
+
+        curves = presentation.joint_curves(self._result)
         if not curves:
             raise InvalidArgumentError(
                 "no joint has a correction curve; estimate harmonics with parameters or extend"
@@ -116,7 +116,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        return fit_plots.plot_parameters(self._result, ax, count=count)
+        return presentation.plot_parameters(self._result, ax, count=count)
 
     def plot_singular_values(self, ax: Axes | None = None) -> Axes:
         """Plot the singular values of the whitened Jacobian relative to the largest one.
@@ -130,7 +130,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        return fit_plots.plot_singular_values(self._result, ax)
+        return presentation.plot_singular_values(self._result, ax)
 
     def plot_correlation(self, ax: Axes | None = None) -> Axes:
         """Plot the correlation matrix of all estimated parameters.
@@ -144,7 +144,7 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        return fit_plots.plot_correlation(self._result, ax)
+        return presentation.plot_correlation(self._result, ax)
 
     def plot_workspace(self, ax: Axes | None = None, *, plane: str = "xz") -> Axes:
         """Plot a map of the predicted standard deviation of the tool position, with the measured positions.
@@ -159,8 +159,10 @@ class ResultPlots:
         Returns:
             The axes.
         """
-        workspace = predict_workspace(self._result, self._result.inliers)
-        return fit_plots.plot_workspace(workspace.points, workspace.std, workspace.measured, ax, plane=plane)
+        workspace = presentation.predict_workspace(self._result, self._result.inliers)
+        return presentation.plot_workspace(
+            workspace.points, workspace.std, workspace.measured, ax, plane=plane
+        )
 
     def to_dataframe(self) -> Any:
         """Return the estimates of all parameters as a `pandas.DataFrame`, one row per parameter.

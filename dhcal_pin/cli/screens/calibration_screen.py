@@ -53,7 +53,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
     by_file = summary.file_table([names[path] for path in outcome.fitted], fit.file_comparisons)
     blocks = [
-        Block(_robot_lines(fit, names[job.robot], outcome.document["settings"]["parameters"])),
+        Block(_robot_lines(fit, names[job.robot], outcome.settings["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
         Block(by_file if by_file else [], noun="file", rank=6, n_kept=4, has_space=True),
@@ -160,7 +160,7 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
             yield (
                 f"{names[path]}: {count} kept in the fit, not far from the other samples: a few do no harm; "
                 "--loss tukey down-weights them"
-                if outcome.document["settings"]["loss"] == "auto"
+                if outcome.settings["loss"] == "auto"
                 else f"{names[path]}: {count} kept in the fit; --loss auto excludes those far from the others"
             )
     for path, item in outcome.held_out:

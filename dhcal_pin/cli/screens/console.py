@@ -6,14 +6,12 @@ that uses rich.
 
 from __future__ import annotations
 
-import webbrowser
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress as ProgressBar
 from rich.text import Text
 
 from ..._typing import Progress
@@ -72,6 +70,8 @@ def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[
         # A disabled bar of older versions of rich prints an empty line.
         yield lambda count: None
         return
+    from rich.progress import Progress as ProgressBar  # lazy import: only on a terminal
+
     with ProgressBar(console=console) as bar:
         # The bar reads markup such as [bold] in its description.
         task = bar.add_task(escape(escape_control_characters(title)), total=total, completed=n_done)
@@ -85,5 +85,7 @@ def open_page(path: str) -> None:
 
 def open_url(url: str) -> None:
     """Open an address in the browser; without a browser print it."""
+    import webbrowser  # lazy import: only for pages
+
     if not webbrowser.open(url):
         print_lines(f"no browser found; open {url}")

@@ -22,7 +22,6 @@ from ...exceptions import FileFormatError, InvalidArgumentError
 from ...messages import quote
 from ...robot.chain import Chain, extract_dh_table
 from ...robot.dh import DHTable
-from ...robot.dh_extraction import extract_dh
 from ...robot.urdf import MAX_ORIGIN
 from ..origins_file import ORIGIN_KEYS
 from ..robot_format import ConvertedRobot, RobotSource
@@ -117,6 +116,8 @@ def read_ur_kinematics(path: PathLike) -> DHTable:
     origins.append(np.eye(4))
     n_joints = len(UR_JOINTS)
     no_limit = np.full(n_joints, np.inf)
+    from ...robot.dh_extraction import extract_dh  # lazy import: only for DH tables
+
     return extract_dh(origins, list(UR_JOINTS), np.zeros(n_joints), -no_limit, no_limit, "modified").table
 
 

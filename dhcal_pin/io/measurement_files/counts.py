@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,9 +11,11 @@ from ..._typing import Array
 from ...exceptions import FileFormatError, UnknownNameError
 from ...messages import quote
 from ...robot.chain import Chain
-from ..servo_file import Servo, ServoFile
 from ..tables import Column, DataTable
 from .columns import SECOND_PREFIX
+
+if TYPE_CHECKING:
+    from ..servo_file import Servo, ServoFile
 
 # Unit of counts in a header.
 TICKS = "ticks"

@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from ...measurements.pose import Pose
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS, Condition
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
-from ..servo_file import ServoFile
 from ..tables import Column, DataTable, TextLayout, format_lines, read_table
 from .columns import (
     AFTER,
@@ -56,6 +55,9 @@ from .columns import (
 )
 from .counts import with_joint_values
 from .tool_poses import solve_tool_poses
+
+if TYPE_CHECKING:
+    from ..servo_file import ServoFile
 
 # Smallest accepted standard deviation [m or rad]; no instrument is as accurate.
 _MIN_SIGMA = 1e-15

@@ -1,0 +1,79 @@
+"""What was mixed up in measurements, and which measurements are suspicious."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..formatting import format_quantity
+from .evidence import Evidence
+
+if TYPE_CHECKING:
+    from .hypotheses import Hypothesis
+
+# Evidence of too few measurements: nothing is known about them.
+NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
+# Measurements are suspicious if they need errors of this width, in default standard deviations, or leave
+# residuals of this size [m], [rad].
+_SUSPICIOUS_WIDTH, _SUSPICIOUS_LENGTH, _SUSPICIOUS_ANGLE = 4.0, 2e-3, 1e-2
+# Residuals that fall by this factor are named in the sentence.
+_MIN_NAMED_RATIO = 2.0
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Hypotheses that explain measurements decisively better than the measurements as they were read."""
+
+    before: Evidence  #: Evidence of the measurements as they were read.
+    #: Equivalent hypotheses, the simplest first; empty if none is decisive.
+    hypotheses: tuple[Hypothesis, ...] = ()
+    after: Evidence | None = None  #: Evidence with the first hypothesis.
+    source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
+    #: Whether each of several measurements fits the robot, but not all of them together.
+    fits_separately: bool = False
+
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether the measurements, as they were read, need large errors or leave large residuals."""
+        return is_suspicious(self.before)
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether a robot with errors of any size fits the measurements, if base and tool are free."""
+        return not leaves_residuals(self.before)
+
+    @property
+    def sentence(self) -> str:
+        """What was mixed up and what undoing it would change; only with a hypothesis."""
+        first, *others = (hypothesis.description for hypothesis in self.hypotheses)
+        assert self.after is not None
+        text = f"In {self.source}, {first}" if self.source else f"{first[0].upper()}{first[1:]}"
+        if others:
+            text += f" (or {' or '.join(others)})"
+        for before, after, unit in (
+            (self.before.length_scale, self.after.length_scale, "m"),
+            (self.before.angle_scale, self.after.angle_scale, "rad"),
+        ):
+            if before > _MIN_NAMED_RATIO * after:
+                sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
+                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}."
+        return f"{text}: undoing this makes the measurements fit a robot with ordinary errors."
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it; only with a hypothesis."""
+        where = f"@{self.source}" if self.source else ""
+        keys = [f"--mend {hypothesis.key}{where}" for hypothesis in self.hypotheses]
+        return f"Correct the measurements, or add {' or '.join(keys)}."
+
+
+def is_suspicious(evidence: Evidence) -> bool:
+    """Return whether measurements may be mixed up: they need large errors or leave large residuals."""
+    return evidence.width >= _SUSPICIOUS_WIDTH or leaves_residuals(evidence)
+
+
+def leaves_residuals(evidence: Evidence) -> bool:
+    """Return whether no robot fits the measurements, however large its errors are."""
+    return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE

@@ -1,0 +1,183 @@
+"""Trials of hypotheses about suspicious measurements: single ones and pairs, see `mixups`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from heapq import nsmallest
+from itertools import islice, permutations, product, starmap
+from typing import NamedTuple
+
+import numpy as np
+
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from .diagnosis import Diagnosis, is_suspicious, leaves_residuals
+from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
+from .hypotheses import AxisScale, Hypothesis, JointChange, OtherNotation, RowShift, both, list_hypotheses
+from .misfit import MAX_MISFIT, nominal_misfits
+
+# Logarithm of the ratio of evidence above which a hypothesis is decisive. Honest data reach 4.
+_MIN_LOG_RATIO = 15.0
+# Hypotheses within this difference of the best one are reported beside it.
+_MAX_LOG_TIE = 3.0
+# Number of pairs of mistakes with the smallest misfits, and of those among them that change the samples
+# differently, whose evidence is computed.
+_N_NEAR_PAIRS, _N_CLOSEST_PAIRS = 60, 12
+# Number of changes whose misfits are computed together.
+_N_TOGETHER = 1024
+# Samples are equal if no coordinate differs by more than this [m], [rad].
+_TOLERANCE = 1e-6
+# A hypothesis is left out if the misfit of the nominal robot exceeds the smallest one by this factor and the
+# least limit, or if it exceeds the largest limit, which depends on the errors that the robot may have.
+_MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
+_LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
+# A shift of the rows is tried if at least this share of the samples has a neighbouring row.
+_MIN_SHIFTED_SHARE = 0.25
+
+
+# Hypothesis, and samples after its change; None if it does not apply to them.
+_Change = tuple[Hypothesis, list[Measurement] | None]
+
+
+class _Candidate(NamedTuple):
+    """Hypothesis about samples, with the samples after its change."""
+
+    hypothesis: Hypothesis
+    changed: list[Measurement]
+    misfit: float  # Misfit of the nominal robot after the change
+
+
+class Trial(NamedTuple):
+    """Suspicious samples, and what single hypotheses say about them."""
+
+    chain: Chain
+    samples: Sequence[Measurement]
+    sets: str
+    before: Evidence
+    misfit: float  # Misfit of the nominal robot
+    candidates: Sequence[_Candidate]
+    single: Diagnosis  # Decisive hypotheses, with which the robot needs large errors, if any
+
+    def find_pair(self) -> Diagnosis:
+        """Look for two mistakes in measurements with positions, by which pairs are compared."""
+        is_plausible = self.misfit <= _LARGEST_MISFITS[self.sets] and not leaves_residuals(self.before)
+        if not self.misfit or (is_plausible and not self.single.hypotheses):
+            return self.single
+        pairs = _candidates(self.chain, _changes_of_pairs(self.candidates))
+        near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
+        largest, closest = _largest_misfit(self, near), list[_Candidate]()
+        for pair in near:
+            is_new = not any(_are_equal(pair, other) for other in closest)
+            if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
+                closest.append(pair)
+        found = _decisive(self, closest)
+        if _is_certain(found):
+            return found
+        far = [each.hypothesis for each in self.candidates if each.misfit > largest]
+        return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
+
+
+def try_hypotheses(
+    chain: Chain,
+    samples: Sequence[Measurement],
+    neighbourhood: Sequence[Measurement],
+    sets: str,
+    before: Evidence,
+) -> tuple[Diagnosis, Trial | None]:
+    """Look for one mistake in suspicious samples; return what was tried if it is not certain."""
+    listed = list_hypotheses(chain, samples)
+    candidates = list(_candidates(chain, ((each, _apply(each, samples, neighbourhood)) for each in listed)))
+    misfit = float(nominal_misfits(chain, [samples])[0])
+    trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before))
+    largest = _largest_misfit(trial)
+    found = _decisive(trial, [each for each in candidates if each.misfit <= largest])
+    return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
+
+
+def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
+    """Yield pairs of mistakes with the samples after both changes, in one order if the order does not matter.
+
+    Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
+    are listed if the coordinates as they were read suggest them. Rotations have one notation.
+    """
+    shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
+    joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
+    values = [each for each in singles if not isinstance(each.hypothesis.change, RowShift | JointChange)]
+    yield from starmap(_then, product(shifts, [*joints, *values]))
+    moved = [change.joints for each in joints if isinstance(change := each.hypothesis.change, JointChange)]
+    for i, j in permutations(range(len(joints)), 2):
+        if i < j or moved[i] & moved[j]:
+            yield _then(joints[i], joints[j])
+    for joint, value in product(joints, values):
+        # The change of joints is the faster one.
+        yield both(joint.hypothesis, value.hypothesis), joint.hypothesis.apply(value.changed)
+    for first, second in permutations(values, 2):
+        changes = first.hypothesis.change, second.hypothesis.change
+        if not isinstance(changes[1], AxisScale) and not all(isinstance(c, OtherNotation) for c in changes):
+            yield _then(first, second)
+
+
+def _then(first: _Candidate, second: _Candidate) -> _Change:
+    """Return the hypothesis that two mistakes were made, with the samples after both changes."""
+    return both(first.hypothesis, second.hypothesis), second.hypothesis.apply(first.changed)
+
+
+def _candidates(chain: Chain, changes: Iterable[_Change]) -> Iterator[_Candidate]:
+    """Compute the misfits of the changes that apply, of some of them at a time."""
+    pairs = ((hypothesis, changed) for hypothesis, changed in changes if changed is not None)
+    while part := list(islice(pairs, _N_TOGETHER)):
+        misfits = nominal_misfits(chain, [changed for _, changed in part])
+        yield from (_Candidate(*pair, misfit) for pair, misfit in zip(part, misfits.tolist(), strict=True))
+
+
+def _largest_misfit(trial: Trial, others: Sequence[_Candidate] = ()) -> float:
+    """Return the largest misfit of a hypothesis that is tried."""
+    smallest = min(trial.misfit, *(each.misfit for each in (*trial.candidates, *others)))
+    return float(np.clip(_MAX_MISFIT_RATIO * smallest, _MIN_MISFIT, _LARGEST_MISFITS[trial.sets]))
+
+
+def _are_equal(first: _Candidate, second: _Candidate) -> bool:
+    """Return whether two hypotheses change the samples alike."""
+    one, two = (
+        [array for item in each.changed for array in (item.q, item.positions(), item.rotations())]
+        for each in (first, second)
+    )
+    return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
+
+
+def _decisive(trial: Trial, candidates: Sequence[_Candidate]) -> Diagnosis:
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
+    scored = []
+    for hypothesis, changed, _ in candidates:
+        after = fit_evidence(trial.chain, changed, trial.sets)
+        log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
+        scored.append((log, hypothesis, after))
+    best = max((log for log, _, _ in scored), default=-np.inf)
+    ties = [(hypothesis, after) for log, hypothesis, after in scored if log >= best - _MAX_LOG_TIE]
+    ties = [(hypothesis, after) for hypothesis, after in ties if not leaves_residuals(after)]
+    if best - trial.before.log < _MIN_LOG_RATIO or not ties:
+        return Diagnosis(trial.before)
+    return Diagnosis(trial.before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
+
+
+def _is_certain(diagnosis: Diagnosis) -> bool:
+    """Return whether a robot with errors of ordinary size fits the samples after the change."""
+    return diagnosis.after is not None and not is_suspicious(diagnosis.after)
+
+
+def _count(data: Sequence[Measurement]) -> int:
+    """Return the number of samples."""
+    return sum(len(item.rows) for item in data)
+
+
+def _apply(
+    hypothesis: Hypothesis, samples: Sequence[Measurement], neighbourhood: Sequence[Measurement]
+) -> list[Measurement] | None:
+    """Apply a hypothesis to the samples; None if it does not apply to most of them."""
+    if not isinstance(hypothesis.change, RowShift):
+        return hypothesis.apply(samples)
+    shifted = hypothesis.apply(neighbourhood)
+    if shifted is None:
+        return None
+    kept = [item.take(np.isin(item.rows, drawn.rows)) for item, drawn in zip(shifted, samples, strict=True)]
+    return kept if _count(kept) >= _MIN_SHIFTED_SHARE * _count(samples) else None
