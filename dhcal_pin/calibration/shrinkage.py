@@ -45,7 +45,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from ..distributions import normal_cdf
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
 from ..estimation.solver import SolverResult
@@ -154,7 +153,9 @@ class _Evidence:
 
 def _largest_safe_factor(mean: Array, std: Array, posterior: Array, squared_change: float) -> float:
     """Find the largest factor whose probability of harm is accepted; 0 if there is none."""
+    from scipy.special import ndtr  # lazy import: slow, and few calibrations need it
+
     factors = np.linspace(1, 0, N_FACTORS)
-    probability = normal_cdf((0.5 * factors[:, None] * squared_change - mean) / std) @ posterior
+    probability = ndtr((0.5 * factors[:, None] * squared_change - mean) / std) @ posterior
     safe = np.flatnonzero(probability <= MAX_HARM_PROBABILITY)
     return float(factors[safe[0]]) if safe.size else 0.0

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..distributions import student_cdf
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
@@ -389,7 +388,9 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return [Finding("refused", text)]
     # Left-out regions have shown already that the arm is wrong if images change it, and without estimates of
     # cameras and boards the nominal arm would fit worse than before.
-    if fit.camera_stages or student_cdf(change, len(paired.before) - 1) < MAX_CHANCE:
+    from scipy.special import stdtrit  # lazy import: slow
+
+    if fit.camera_stages or change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]

@@ -39,7 +39,6 @@ from functools import cached_property, partial
 import numpy as np
 
 from .._typing import Array
-from ..distributions import chi_square_cdf
 from ..measurements.base import Measurement
 from . import qr
 from .normal_equations import NormalEquations
@@ -183,8 +182,10 @@ def standardize_ratios(ratios: Array, k: int | Array) -> Array:
 
 def is_chi_square(mean_squares: Array, k: int) -> bool:
     """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test)."""
-    parts = (N_PARTS * chi_square_cdf(k * mean_squares, k)).astype(int)
-    counts = np.bincount(np.minimum(parts, N_PARTS - 1), minlength=N_PARTS)
+    from scipy.special import gammaincinv  # lazy import: slow
+
+    bounds = gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
+    counts = np.bincount(np.searchsorted(bounds, mean_squares), minlength=N_PARTS)
     expected = len(mean_squares) / N_PARTS
     return bool(np.sum((counts - expected) ** 2) / expected <= MAX_PARTS_CHI_SQUARE)
 

@@ -23,7 +23,6 @@ from dataclasses import replace
 import numpy as np
 
 from .._typing import Array
-from ..distributions import normal_cdf
 from ..estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, base, placement, tool
 from ..estimation.problem import Problem
 from .facts import MAX_SCALE_CHANGE, Scale
@@ -85,7 +84,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
         or max(weights[-1].sum(), weights[:, -1].sum()) > EDGE
     ):
         return None
-    chance = 2 * float(np.sum(weights * normal_cdf(-np.sign(change) * changes * np.sqrt(information))))
+    from scipy.special import ndtr  # lazy import: slow
+
+    chance = 2 * float(np.sum(weights * ndtr(-np.sign(change) * changes * np.sqrt(information))))
     if chance > MAX_CHANCE:
         return None
     variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))
