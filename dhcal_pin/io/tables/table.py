@@ -65,7 +65,7 @@ class DataTable:
     cells: Sequence[Sequence[str]]  # Text of the cells of each row, m rows
     lines: Sequence[int]  # Line of each row in the file
     header_line: int  # Line of the header, or of the first row if the file has none
-    comments: tuple[str, ...]  # Text of the comment lines, without `#`
+    comments: tuple[str, ...] = ()  # Text of the comment lines, without `#`
     # Numbers of the columns that were parsed already, shape (m,) each, by column index.
     numbers: Mapping[int, Array] = field(default_factory=dict)
     decimal: str = "."  # Decimal sign of the cells
