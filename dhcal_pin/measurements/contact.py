@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._typing import Array
+from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from ..robot.inverse_kinematics import position_task, solve_within_limits
@@ -101,11 +102,16 @@ class PointContact(PointMeasurement):
     ) -> PointContact:
         """Return contacts with the first four tool points, in configurations moved onto them in turn."""
         q = conditions.q
-        points = chain.poses(q)[:4, :3, 3]
+        points = _simulated_points(chain, q)
         label = np.arange(len(q)) % len(points)
         targets = points[label] + noise.position * rng.standard_normal((len(q), 3))
         q = solve_within_limits(chain, position_task(targets), q, rng)
         return cls(q, [f"p{i + 1}" for i in label], noise.position or None)
+
+
+def _simulated_points(chain: Chain, q: Array) -> Array:
+    """Return the points that simulated contacts touch: the first four tool points."""
+    return chain.poses(q)[:4, :3, 3]
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -185,9 +191,11 @@ class PointDistance(PointMeasurement):
     def _simulate(
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> PointDistance:
-        """Return the six distances between four points of a rig of half a metre."""
-        points = np.array([[0, 0, 0], [0.5, 0, 0], [0, 0.4, 0], [0, 0, 0.3]])
-        pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
+        """Return the distances between the points that `PointContact` touches with these configurations."""
+        points = _simulated_points(chain, conditions.q)
+        pairs = [(i, j) for i in range(len(points)) for j in range(i + 1, len(points))]
+        if not pairs:
+            raise InvalidArgumentError("one sample has no pair of points; expected 2 samples or more")
         distances = np.array([np.linalg.norm(points[i] - points[j]) for i, j in pairs])
         distances += noise.position * rng.standard_normal(len(pairs))
         names = [(f"p{i + 1}", f"p{j + 1}") for i, j in pairs]

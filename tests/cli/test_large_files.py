@@ -85,7 +85,7 @@ def test_a_million_rows_are_calibrated(run, robot_folder):
     comment, header, *rows = Path("few.csv").read_text().splitlines()
     Path("data.csv").write_text("\n".join([comment, header, *rows * 1000]))
     text = assert_small(*CALIBRATE, "--extend", "none", seconds=30, size=1_500_000_000)
-    assert "row 1 of every 5 is used" in text
+    assert "200000 of 1000000 rows are used, drawn at random" in text
 
 
 def test_touched_points_with_a_robust_loss_take_seconds(robot_folder):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command_line import stdout_of, tool_positions
 
+from dhcal_pin.calibration import calibrate
 from dhcal_pin.io import read_measurement_file, read_robot
 from dhcal_pin.io.tables import read_table
 from dhcal_pin.robot import Chain
@@ -88,3 +89,20 @@ def test_joint_positions_respect_limits(run, robot_folder, lower, upper):
     assert lower <= q[:, 0].min() < q[:, 0].max() <= upper
     assert np.ptp(q[:, 0]) > 0.5 * min(upper - lower, 180)
     assert np.abs(q[:, 1:]).max() <= 180
+
+
+def test_known_distances_are_those_of_the_touched_points(run, robot_folder):
+    """Touches alone leave the size of the robot open; with distances of the same simulation it is found."""
+    for kind in ("point", "point_distance"):
+        words = ("-n", "60", "--errors", "1mm,0.3deg", "--kind", kind, "--seed", "4", "-o", f"{kind}.csv")
+        stdout_of(run("simulate", "arm.urdf", *words))
+    chain = Chain.from_urdf("arm.urdf")
+    files = ("point.csv", "point_distance.csv")
+    touches, known = (read_measurement_file(file, chain).data for file in files)
+    fit = calibrate(chain, [touches, known], "minimal,tool", extend="none")
+    points = np.array([[fit.instruments[f"point_{name}.{axis}"] for axis in "xyz"] for name in known.names])
+    lengths = np.linalg.norm(points[known.label[:, 1]] - points[known.label[:, 0]], axis=1)
+    np.testing.assert_allclose(lengths, known.values[:, 0], atol=1e-6)
+    status, _, err = run("simulate", "arm.urdf", "-n", "1", "--kind", "point_distance", "-o", "one.csv")
+    assert status == 2
+    assert "expected 2 samples or more" in err

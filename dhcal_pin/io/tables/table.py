@@ -195,17 +195,26 @@ class DataTable:
         return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
 
     def thinned(self, max_rows: int) -> DataTable:
-        """Return a table with at most a number of rows, evenly spaced, and a note if some are left out."""
-        step = -(-len(self.lines) // max_rows)
-        if step < 2:
+        """Return a table with at most a number of rows, drawn at random, and a note if some are left out.
+
+        Rows at regular distances could all be of one target, or none of them held out.
+        """
+        count = len(self.lines)
+        if count <= max_rows:
             return self
-        note = f"row 1 of every {step} is used, as more than {max_rows} rows do not improve a calibration"
+        rows = np.sort(np.random.default_rng(0).permutation(count)[:max_rows])
+        note = f"{max_rows} of {count} rows are used, drawn at random, as more do not improve a calibration"
+        return replace(self._with_rows(rows.tolist()), notes=(*self.notes, note))
+
+    def _with_rows(self, rows: Sequence[int]) -> DataTable:
+        """Return a table with some of the rows."""
         return replace(
             self,
-            cells=self.cells[::step],
-            lines=self.lines[::step],
-            numbers={index: column[::step] for index, column in self.numbers.items()},
-            notes=(*self.notes, note),
+            cells=self.cells.take(rows)
+            if isinstance(self.cells, _ColumnRows)
+            else [self.cells[row] for row in rows],
+            lines=[self.lines[row] for row in rows],
+            numbers={index: column[rows] for index, column in self.numbers.items()},
         )
 
     # --------------------------------------------------------------------------------------- bad rows
@@ -225,13 +234,8 @@ class DataTable:
             return table
         bad = {self.lines[row]: reasons[row] for row in sorted(reasons)}
         rows = [row for row in range(len(self.lines)) if row not in reasons]
-        return replace(
-            table,
-            cells=[self.cells[row] for row in rows],
-            lines=[self.lines[row] for row in rows],
-            numbers={index: column[rows] for index, column in table.numbers.items()},
-            bad_rows=dict(sorted({**self.bad_rows, **bad}.items())),
-        )
+        bad_rows = dict(sorted({**self.bad_rows, **bad}.items()))
+        return replace(table._with_rows(rows), bad_rows=bad_rows)
 
     def require_good_rows(self, alternative: str = "") -> None:
         """Require that no row was left out."""
@@ -286,15 +290,20 @@ class _ColumnRows(Sequence[list[str]]):
         return self._count
 
     def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            columns = [column[index] for column in self._columns]
-            return _ColumnRows(columns, len(range(self._count)[index]))
         if not -self._count <= index < self._count:
             raise IndexError(index)
         return [
             repr(float(column[index])) if isinstance(column, np.ndarray) else column[index]
             for column in self._columns
         ]
+
+    def take(self, rows: Sequence[int]) -> _ColumnRows:
+        """Return some of the rows."""
+        columns = [
+            column[rows] if isinstance(column, np.ndarray) else [column[row] for row in rows]
+            for column in self._columns
+        ]
+        return _ColumnRows(columns, len(rows))
 
 
 def format_lines(lines: Iterable[int]) -> str:

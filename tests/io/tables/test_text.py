@@ -13,7 +13,7 @@ from robots import write
 
 from dhcal_pin.exceptions import DhcalError, UnknownNameError
 from dhcal_pin.io import read_toml
-from dhcal_pin.io.tables import TextLayout, format_lines, read_table
+from dhcal_pin.io.tables import DataTable, TextLayout, format_lines, read_table
 from dhcal_pin.io.tables import table as tables
 from dhcal_pin.io.tabular import csv_text, require_usable_names
 
@@ -81,14 +81,25 @@ def test_units_of_two_places_must_agree(tmp_path):
         _ = read_table(write(tmp_path, "a.csv", "q[deg],x[mm]\ndeg,m\n1,2\n")).columns
 
 
-def test_a_thinned_table_has_every_second_row(tmp_path):
-    text = "a,b,c\n" + "".join(f"{i},{2 * i},w{i}\n" for i in range(7))
+def test_a_thinned_table_has_rows_of_all_kinds_in_their_order(tmp_path):
+    """Every second row would be of one kind only."""
+    text = "a,b,c\n" + "".join(f"{i},{2 * i},{'fh'[i % 2]}\n" for i in range(400))
     table = read_table(write(tmp_path, "a.csv", text))
-    assert table.thinned(7) is table
-    few = table.thinned(4)
-    assert (few.values(1).tolist(), few.lines) == ([0, 4, 8, 12], [2, 4, 6, 8])
-    assert few.text(few.columns["c"]) == ["w0", "w2", "w4", "w6"]
-    assert few.notes == ("row 1 of every 2 is used, as more than 4 rows do not improve a calibration",)
+    assert table.thinned(400) is table
+    few = table.thinned(200)
+    values = few.values(1)
+    assert len(values) == 200
+    assert np.all(np.diff(values) > 0)
+    assert few.lines == (values / 2 + 2).tolist()
+    kinds = few.text(few.columns["c"])
+    assert kinds == ["fh"[int(value / 2) % 2] for value in values]
+    # The number of rows of one kind is hypergeometric, 100 with a standard deviation of 5.
+    assert 80 < kinds.count("f") < 120
+    assert few.notes == ("200 of 400 rows are used, drawn at random, as more do not improve a calibration",)
+    by_columns = DataTable.from_columns(
+        "a", {"b": table.values(1), "c": table.text(table.columns["c"])}, table.lines
+    )
+    assert by_columns.thinned(200).text(by_columns.columns["c"]) == kinds
 
 
 @pytest.mark.parametrize("row", ["deg,1", "furlong,fathom", "deg,mm\ndeg,mm"])
