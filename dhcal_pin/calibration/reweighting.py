@@ -181,10 +181,11 @@ def _next_round(
         state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(solved, weighted, weights)
-        weights, change = robust.update_weights(weights, residuals, stage, state.weight_change)
-        weights = [
-            robust.reject_groups(w, t, item) for w, t, item in zip(weights, residuals, fit.data, strict=True)
+        wanted = [
+            robust.reject_groups(robust.sample_weights(t, stage), t, item)
+            for t, item in zip(residuals, fit.data, strict=True)
         ]
+        weights, change = robust.update_weights(weights, wanted, stage, state.weight_change)
     if any((w != 1).any() for w in weights):
         weighted = tuple(item.with_weights(w) for item, w in zip(weighted, weights, strict=True))
     start, priors = solution.x, update_prior_scales(problem, solution, groups)

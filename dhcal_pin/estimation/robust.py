@@ -236,29 +236,40 @@ class WeightChange:
     # Changes of each measurement's weights, shape (m,) each; empty before the first round.
     steps: tuple[Array, ...] = ()
     n_reversals: int = 0  # Number of rounds of this stage that nearly undid the change of the round before
+    # Samples that counted again after they had been rejected in this stage, (m,) each; empty at first.
+    has_returned: tuple[Array, ...] = ()
 
 
 def update_weights(
-    previous: Sequence[Array], residuals: Sequence[Array], stage: str, last: WeightChange
+    previous: Sequence[Array], weights: Sequence[Array], stage: str, last: WeightChange
 ) -> tuple[list[Array], WeightChange]:
-    """Compute the weights of the next round of IRLS.
+    """Compute the weights of the next round of IRLS from those that the residuals ask for.
 
     Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of samples
     with much leverage alternate again after that. From the second time on, every round makes a part of the
-    change only, and half of that part after each further time. Where samples either count or are rejected,
-    a sample near the limit may have no weight that its own residual confirms. From the second time on,
-    rejected samples then stay rejected.
+    change only, and half of that part after each further time.
+
+    Where samples either count or are rejected, the residual of a sample near the limit may agree with
+    neither. A sample that is rejected for the second time stays rejected.
     """
-    weights = [sample_weights(t, stage) for t in residuals]
+    weights = list(weights)
+    if WEIGHT_FUNCTIONS[stage][0] is _uniform:
+        has_returned = last.has_returned or [np.zeros(len(w), bool) for w in weights]
+        was_rejected = [w <= ZERO_WEIGHT for w in previous]
+        weights = [
+            np.where(rejected & returned, ZERO_WEIGHT, w)
+            for w, rejected, returned in zip(weights, was_rejected, has_returned, strict=True)
+        ]
+        returns = tuple(
+            returned | (rejected & (w > ZERO_WEIGHT))
+            for w, rejected, returned in zip(weights, was_rejected, has_returned, strict=True)
+        )
+        return weights, replace(weight_change(weights, previous), has_returned=returns)
     change = weight_change(weights, previous)
     is_stalled = change.size > OSCILLATION_RATIO * last.size
     is_reversed = is_stalled and sum(map(np.vdot, change.steps, last.steps)) < 0
     n_reversals = last.n_reversals + is_reversed
-    if WEIGHT_FUNCTIONS[stage][0] is _uniform:
-        if n_reversals > 1:
-            weights = [np.minimum(a, b) for a, b in zip(weights, previous, strict=True)]
-            change = weight_change(weights, previous)
-    elif damping := max(n_reversals - 1, int(is_stalled)):
+    if damping := max(n_reversals - 1, int(is_stalled)):
         part = 0.5**damping
         weights = [part * a + (1 - part) * b for a, b in zip(weights, previous, strict=True)]
     return weights, replace(change, n_reversals=n_reversals)

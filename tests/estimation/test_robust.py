@@ -24,6 +24,7 @@ from dhcal_pin.estimation.robust import (
     is_chi_square,
     reject_groups,
     residual_covariances,
+    sample_weights,
     standardized_residuals,
     update_weights,
 )
@@ -258,8 +259,8 @@ def test_weights_that_alternate_settle(slope):
     for _ in range(25):
         wanted = 0.5 + slope * (weights[0][0] - 0.5)
         # Huber's weight of this residual is the wanted one; the second sample is good.
-        residuals = [np.array([1.345 / min(max(wanted, 0.01), 1.0), 0.5])]
-        weights, last = update_weights(weights, residuals, "huber", last)
+        residuals = np.array([1.345 / min(max(wanted, 0.01), 1.0), 0.5])
+        weights, last = update_weights(weights, [sample_weights(residuals, "huber")], "huber", last)
         if last.size < 1e-3:
             break
     assert last.size < 1e-3
@@ -271,7 +272,8 @@ def test_a_sample_that_no_weight_agrees_with_stays_rejected():
     weights, last, found = [np.array([1.0, 1.0])], WeightChange(), []
     for _ in range(8):
         t = FAR_THRESHOLD + (0.1 if weights[0][0] > 0.5 else -0.1)
-        weights, last = update_weights(weights, [np.array([t, 0.5])], FAR_REJECTED, last)
+        wanted = [sample_weights(np.array([t, 0.5]), FAR_REJECTED)]
+        weights, last = update_weights(weights, wanted, FAR_REJECTED, last)
         found.append(weights[0][0] > 0.5)
         assert weights[0][1] == 1
     assert found == [False, True, *[False] * 6]
