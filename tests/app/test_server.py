@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import aclosing, suppress
 from urllib.parse import urlsplit
 
@@ -205,6 +206,12 @@ def test_a_calibration_is_followed_again_while_it_runs_and_after_its_end(app, ex
     assert "error" in ask(app, "GET", f"job/{job}")[1][0]
 
 
+def finished(coroutine):
+    """Run a coroutine in a thread of its own, as the browser of other tests has an event loop in this one."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(asyncio.run, coroutine).result()
+
+
 async def endless():
     yield {"phase": "fit"}
     await asyncio.Event().wait()
@@ -225,7 +232,7 @@ def test_a_job_that_nothing_follows_is_stopped():
         await asyncio.wait([job.task])
         return job.task.cancelled()
 
-    assert asyncio.run(run())
+    assert finished(run())
 
 
 def test_the_last_calibrations_are_kept(tmp_path):
@@ -237,7 +244,7 @@ def test_the_last_calibrations_are_kept(tmp_path):
             await asyncio.wait([service.jobs[names[-1]].task])
         return list(service.jobs) == names[-MAX_KEPT:]
 
-    assert asyncio.run(run())
+    assert finished(run())
 
 
 def test_a_calculation_ends_with_a_killed_server(tmp_path, monkeypatch):
@@ -252,7 +259,7 @@ def test_a_calculation_ends_with_a_killed_server(tmp_path, monkeypatch):
             process.stdin.close()
             return await asyncio.wait_for(process.wait(), 30)
 
-    assert asyncio.run(run()) == -signal.SIGKILL
+    assert finished(run()) == -signal.SIGKILL
 
 
 def test_the_guide_names_the_use_of_each_file():
