@@ -85,15 +85,18 @@ def read_mapped_table(
         return read_table(source, native)
     vendor = _VendorTable(read_table(source, column_map.layout), column_map)
     table = vendor.table
-    if missing := vendor.missing_columns():
-        raise FileFormatError(
-            f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the file "
-            f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
-        )
-    vendor = vendor.without_bad_rows()
-    columns = {column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules}
-    if column_map.rotation:
-        columns |= _rotation_columns(vendor, column_map.rotation)
+    with table.notes_in_errors():
+        if missing := vendor.missing_columns():
+            raise FileFormatError(
+                f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the file "
+                f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
+            )
+        vendor = vendor.without_bad_rows()
+        columns = {
+            column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules
+        }
+        if column_map.rotation:
+            columns |= _rotation_columns(vendor, column_map.rotation)
     for name, text in column_map.constants.items():
         columns[name] = [_fill_placeholders(text, source)] * len(vendor.table.lines)
     table = vendor.table

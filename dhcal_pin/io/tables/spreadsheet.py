@@ -1,7 +1,6 @@
 """Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
 
-The sheet that the layout names is read, else the first one with a row of several numbers, else the first one
-with content. Its rows are numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a
+The sheet that the layout names is read, else the one with the most rows of several numbers. Its rows are numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a
 text file. Of a formula the value is read that Excel saved with it.
 """
 
@@ -59,9 +58,7 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
         raise UnknownNameError(
             f"{source}: no sheet {layout.sheet!r} with content; choose from {', '.join(map(repr, filled))}"
         )
-    title = layout.sheet or next(
-        (each for each, rows in filled.items() if any(map(_has_numbers, rows))), next(iter(filled))
-    )
+    title = layout.sheet or max(filled, key=lambda each: sum(map(_has_numbers, filled[each])))
     rows = filled[title]
     others = [other for other in filled if other != title]
     notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()

@@ -49,7 +49,7 @@ class TextLayout:
 
     separator: str = ""  # Key of `SEPARATORS`; empty if it is to be detected
     decimal: str = ""  # Decimal sign; empty if it is to be detected
-    sheet: str = ""  # Sheet of a workbook; empty for the first one with numbers
+    sheet: str = ""  # Sheet of a workbook; empty for the one with the most rows of numbers
     skip: int = 0  # Number of lines before the header
     has_header: bool = True  # Whether the first row is a header
     # Start of a comment line; empty if there are none.
