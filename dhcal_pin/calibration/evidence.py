@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from .. import plausibility
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
@@ -125,8 +126,16 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
+        return self._diagnose(None)
+
+    def _diagnose(self, progress: Progress | None) -> Diagnosis:
+        """Look for mistakes in the measurements, if nobody did."""
         sets = HAND_BUILT if self.signs else MANUFACTURED
-        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets)
+        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets, progress)
+
+    def diagnosed(self, progress: Progress | None) -> Self:
+        """Return this with the mistakes that the verdict asks for, which can take long to look for."""
+        return replace(self, earlier_diagnosis=self._diagnose(progress))
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

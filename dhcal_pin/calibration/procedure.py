@@ -241,7 +241,7 @@ def calibrate(
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, extended, signs)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, progress)
     return replace(result, session=found, with_auto=with_auto)
 
 
@@ -326,12 +326,15 @@ def _calibrate_samples(
     holdout: tuple[Measurement, ...],
     extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
     signs: plausibility.SignDecision | None,
+    progress: Progress | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     inliers = fit.without_rejected().problem
     shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
     result = replace(make_result(fit, shrinkage_factor, holdout, "lm"), signs=signs)
     # Residuals of mixed-up measurements say nothing about other errors.
+    if families and shrinkage_factor == 1:
+        result = result.diagnosed(progress)
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = extended(fit, families)

@@ -369,6 +369,7 @@ def _calibrate(
             progress,
         )
         fit = replace(fit, region_comparison=regions)
+    fit = fit.diagnosed(progress)
     if progress:
         progress("accuracy and verdict", 1, 1)
     return fit
