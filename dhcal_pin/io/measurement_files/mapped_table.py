@@ -88,8 +88,8 @@ def read_mapped_table(
     with table.notes_in_errors():
         if missing := vendor.missing_columns():
             raise FileFormatError(
-                f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the file "
-                f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
+                f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the "
+                f"file ({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
             )
         vendor = vendor.without_bad_rows()
         columns = {

@@ -1,7 +1,8 @@
 """Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
 
-The sheet that the layout names is read, else the one with the most rows of several numbers. Its rows are numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a
-text file. Of a formula the value is read that Excel saved with it.
+The sheet that the layout names is read, else the one with the most rows of several numbers. Its rows are
+numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a text file. Of a formula the
+value is read that Excel saved with it.
 """
 
 from __future__ import annotations

@@ -120,6 +120,11 @@ def test_no_joint_name_heads_a_column_as_a_formula(name):
         require_usable_names([name], "arm.urdf")
 
 
+def test_spaces_at_the_ends_of_a_joint_name_are_named():
+    with pytest.raises(DhcalError, match="without spaces at its ends"):
+        require_usable_names([" a b"], "arm.urdf")
+
+
 # --- detection -------------------------------------------------------------------------------------
 
 
