@@ -73,4 +73,6 @@ def test_options_may_stand_between_names_of_files(words):
 def test_words_without_a_meaning_are_refused(words, capsys):
     with pytest.raises(SystemExit):
         build_parser().parse_args(words.split())
-    assert "unrecognized arguments" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "unrecognized arguments" in err
+    assert err.endswith(f"; see dhcal {words.split()[0]} --help\n")
