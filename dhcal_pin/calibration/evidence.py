@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -126,16 +125,7 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
-        return self._diagnose(None)
-
-    def _diagnose(self, progress: Progress | None) -> Diagnosis:
-        """Look for mistakes in the measurements, if nobody did."""
-        sets = HAND_BUILT if self.signs else MANUFACTURED
-        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets, progress)
-
-    def diagnosed(self, progress: Progress | None) -> Self:
-        """Return this with the mistakes that the verdict asks for, which can take long to look for."""
-        return replace(self, earlier_diagnosis=self._diagnose(progress))
+        return diagnose(self, None)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:
@@ -262,6 +252,12 @@ class Evidence(FittedModel):
         n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
         everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
         return Comparison("hold-out", n_counted, before, after, n_outliers, everything, *alone)
+
+
+def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
+    """Look for mistakes in the measurements of a calibration, if this was not done before."""
+    sets = HAND_BUILT if fit.signs else MANUFACTURED
+    return fit.earlier_diagnosis or diagnose_mixups(fit.errors.chain, fit.data, sets, progress)
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, str], float]:

@@ -54,6 +54,7 @@ from ..session import can_have_session, find_scale, find_session
 from . import cameras, model_selection
 from .cameras import arm_type, default_sets, has_images, held_values, require_joint_values, split_sets
 from .cross_validation import leave_regions_out
+from .evidence import diagnose
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import confirm_changes, without_changes
@@ -334,7 +335,7 @@ def _calibrate_samples(
     result = replace(make_result(fit, shrinkage_factor, holdout, "lm"), signs=signs)
     # Residuals of mixed-up measurements say nothing about other errors.
     if families and shrinkage_factor == 1:
-        result = result.diagnosed(progress)
+        result = replace(result, earlier_diagnosis=diagnose(result, progress))
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = extended(fit, families)
