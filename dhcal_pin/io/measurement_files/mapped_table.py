@@ -51,9 +51,7 @@ class _VendorTable:
 
     def missing_columns(self) -> list[str | int]:
         """Return the columns of the map that the file does not have."""
-        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
-        names = [*(rule.source_column for rule in self.column_map.rules), *rotation]
-        return [name for name in names if self.column_index(name) is None]
+        return [name for name in self.column_map.source_columns if self.column_index(name) is None]
 
     def without_bad_rows(self) -> _VendorTable:
         """Return the table without the rows that lack a number."""
@@ -79,8 +77,9 @@ def read_mapped_table(
 
     A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
     """
-    column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet))
-    native = TextLayout(sheet=sheet)
+    named = frozenset(name for name in column_map.source_columns if isinstance(name, str))
+    column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet, names=named))
+    native = TextLayout(sheet=sheet, names=known)
     if _is_native(source, native, known) and not _matches(source, column_map):
         return read_table(source, native)
     vendor = _VendorTable(read_table(source, column_map.layout), column_map)

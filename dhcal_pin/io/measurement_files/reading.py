@@ -109,7 +109,7 @@ def read_measurements(
             error.
         rig: Cameras and boards of image coordinates, on the chain.
         servos: Servos whose counts are in columns `NAME[ticks]`, see `dhcal_pin.io.read_servos`.
-        sheet: Sheet of an Excel workbook; the one with the most rows of numbers by default.
+        sheet: Sheet of an Excel workbook; by default the one with the most known columns.
 
     Returns:
         Samples of the kind that the columns select.
@@ -149,7 +149,7 @@ def open_measurement_table(
 ) -> DataTable:
     """Read the table of a measurement file, through a column map and a servo file if they are given."""
     if columns is None:
-        table = read_table(source, TextLayout(sheet=sheet))
+        table = read_table(source, TextLayout(sheet=sheet, names=known_columns(chain)))
     else:
         from .column_map import read_map  # lazy import, as the following: only for files of other makers
         from .mapped_table import read_mapped_table

@@ -66,7 +66,7 @@ def test_the_sheet_with_numbers_is_read(tmp_path):
         read_table(tmp_path / "a.xlsx", TextLayout(sheet="data"))
 
 
-def test_the_sheet_with_the_most_rows_of_numbers_is_read_and_errors_name_the_others(tmp_path):
+def test_the_sheet_with_the_most_known_columns_or_rows_is_read_and_errors_name_the_others(tmp_path):
     workbook = pytest.importorskip("openpyxl").Workbook()
     workbook.active.title = "Info"
     workbook.active.append(["Temperature", 21.5, 20.3, 19.1])
@@ -77,6 +77,8 @@ def test_the_sheet_with_the_most_rows_of_numbers_is_read_and_errors_name_the_oth
     workbook.save(tmp_path / "a.xlsx")
     assert read_table(tmp_path / "a.xlsx").headers == ("a", "b", "c")
     arm = Chain.from_dh(read_dh(write(tmp_path, "scara.dh.toml", SCARA)))
+    chosen = read_table(tmp_path / "a.xlsx", TextLayout(names={"Temperature"}))
+    assert chosen.headers == ("Temperature", "21.5", "20.3", "19.1")
     with pytest.raises(FileFormatError, match=r"a\.xlsx:1: .*; read sheet 'Info', not 'Data'$"):
         read_measurements(tmp_path / "a.xlsx", arm, sheet="Info")
 
