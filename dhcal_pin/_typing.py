@@ -14,3 +14,7 @@ Array = NDArray[Any]
 PathLike = str | os.PathLike[str]
 # Callback of a long computation: name of the phase, number of its current step, and largest number of steps.
 Progress = Callable[[str, int, int], None]
+
+
+def no_progress(phase: str, step: int, total: int) -> None:
+    """Receive the progress if nobody else does."""

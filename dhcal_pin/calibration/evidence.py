@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from .. import plausibility
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
@@ -125,8 +125,7 @@ class Evidence(FittedModel):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
-        sets = HAND_BUILT if self.signs else MANUFACTURED
-        return self.earlier_diagnosis or diagnose_mixups(self.errors.chain, self.data, sets)
+        return diagnose(self, None)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:
@@ -253,6 +252,12 @@ class Evidence(FittedModel):
         n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
         everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
         return Comparison("hold-out", n_counted, before, after, n_outliers, everything, *alone)
+
+
+def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
+    """Look for mistakes in the measurements of a calibration, if this was not done before."""
+    sets = HAND_BUILT if fit.signs else MANUFACTURED
+    return fit.earlier_diagnosis or diagnose_mixups(fit.errors.chain, fit.data, sets, progress)
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, str], float]:

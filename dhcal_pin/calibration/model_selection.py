@@ -66,7 +66,7 @@ from typing import Any
 import numpy as np
 
 from .._kernels.work_arrays import UnbufferedRows
-from .._typing import Array, Progress
+from .._typing import Array, Progress, no_progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.folds import (
@@ -587,7 +587,7 @@ def extend(
     n_configurations = len(np.unique(configuration_groups(judged.data)))
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
-    report = progress or _ignore
+    report = progress or no_progress
     report(PHASE, 1, _N_STEPS)
     trials, model, random_ratio, selected = select_families(judged, families)
     report(PHASE, 2, _N_STEPS)
@@ -623,10 +623,6 @@ def extend(
     groups = PriorGroups.none()
     final = reweight(extended, (stage,), groups, max_iterations, progress, leverages)
     return final, extension
-
-
-def _ignore(phase: str, step: int, total: int) -> None:
-    """Receive the progress if nobody else does."""
 
 
 def with_selected(

@@ -54,6 +54,7 @@ from ..session import can_have_session, find_scale, find_session
 from . import cameras, model_selection
 from .cameras import arm_type, default_sets, has_images, held_values, require_joint_values, split_sets
 from .cross_validation import leave_regions_out
+from .evidence import diagnose
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import confirm_changes, without_changes
@@ -241,7 +242,7 @@ def calibrate(
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, extended, signs)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, progress)
     return replace(result, session=found, with_auto=with_auto)
 
 
@@ -326,12 +327,15 @@ def _calibrate_samples(
     holdout: tuple[Measurement, ...],
     extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
     signs: plausibility.SignDecision | None,
+    progress: Progress | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     inliers = fit.without_rejected().problem
     shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
     result = replace(make_result(fit, shrinkage_factor, holdout, "lm"), signs=signs)
     # Residuals of mixed-up measurements say nothing about other errors.
+    if families and shrinkage_factor == 1:
+        result = replace(result, earlier_diagnosis=diagnose(result, progress))
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = extended(fit, families)

@@ -65,6 +65,8 @@ class _LazyCommandParser(CommandParser):
             # argparse ends a list of names at the first option.
             setattr(found, last[0].dest, [*getattr(found, last[0].dest), *others])
             others = []
+        if others:
+            self.error(f"unrecognized arguments: {' '.join(others)}")
         return found, others
 
     def declare_arguments(self) -> None:

@@ -132,7 +132,7 @@ COLUMNS: dict[str, Any] = {"metavar": "MAP.toml", "help": "column map of files i
 SHEET: dict[str, Any] = {
     "metavar": "NAME",
     "default": "",
-    "help": "sheet of Excel files (default: the first one with rows of numbers)",
+    "help": "sheet of Excel files (default: the one with the most known columns, then the most rows)",
 }
 SERVOS: dict[str, Any] = {
     "metavar": "FILE",

@@ -17,6 +17,7 @@ from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import read_configurations, read_measurement_file, read_targets
 from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
+from ..io.servo_file import read_servos
 from ..io.settings import read_priors
 from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
 from ..io.tables import read_table
@@ -59,7 +60,19 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
     space = workspace_constraints(args)
     candidates, rows = _read_candidates(args, chain)
     rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
-    data = [read_measurement_file(path, chain, args.columns, rig=rig).data for path in args.data or []]
+    servos = read_servos(args.servos) if args.servos else None
+    data = [
+        read_measurement_file(
+            path,
+            chain,
+            args.columns,
+            skip_bad_rows=args.skip_bad_rows,
+            rig=rig,
+            servos=servos,
+            sheet=args.sheet,
+        ).data
+        for path in args.data or []
+    ]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
     images, noise = None, None
@@ -111,7 +124,7 @@ def _read_candidates(args: Namespace, chain: Chain) -> tuple[int | Array, Array]
     if not args.candidates_from:
         of_images = N_LOW_COST_CANDIDATES if LOW_COST in chain.parameters else N_IMAGE_CANDIDATES
         return args.candidates or (of_images if args.rig else N_CANDIDATES), np.zeros(0, int)
-    candidates = read_configurations(args.candidates_from, chain, args.columns)
+    candidates = read_configurations(args.candidates_from, chain, args.columns, args.sheet)
     rows = np.arange(len(candidates))
     if args.rig:
         # A table of image coordinates has one row per corner.

@@ -152,9 +152,11 @@ def _add_calibration_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--instrument", **options.INSTRUMENT)
     parser.add_argument(
-        "--data", metavar="DATA", nargs="+", help="existing measurements to complement, as CSV files"
+        "--data", **{**options.DATA, "help": f"existing measurements to complement: {options.DATA['help']}"}
     )
     parser.add_argument("--columns", **options.COLUMNS)
+    parser.add_argument("--sheet", **options.SHEET)
+    parser.add_argument("--skip-bad-rows", action="store_true", **options.SKIP_BAD_ROWS)
 
 
 def _add_search_options(parser: ArgumentParser) -> None:

@@ -26,6 +26,7 @@ from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure, summary
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images, has_joint_values
 from ..calibration.cross_validation import leave_regions_out
+from ..calibration.evidence import diagnose
 from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
@@ -369,6 +370,7 @@ def _calibrate(
             progress,
         )
         fit = replace(fit, region_comparison=regions)
+    fit = replace(fit, earlier_diagnosis=diagnose(fit, progress))
     if progress:
         progress("accuracy and verdict", 1, 1)
     return fit

@@ -279,10 +279,14 @@ def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) ->
     index = _subsample(len(positions))
     positions, unit = positions[index], file.units.get("x", "")
     modelled, spread = chain.poses(file.data.q[index])[:, :3, 3], median_radius(positions)
-    if spread > _MAX_SPREAD_RATIO * (reach + MAX_TOOL_OFFSET):
+    if spread > (limit := _MAX_SPREAD_RATIO * (reach + MAX_TOOL_OFFSET)):
+        widths = np.median(np.abs(positions - np.median(positions, 0)), 0)
+        large = [axis for axis, width in zip("xyz", widths, strict=True) if width > limit / np.sqrt(3)]
+        along = f" along {' and '.join(large)}" if 0 < len(large) < 3 else ""
         return [
-            f"the positions spread {_format_as_written(spread, unit)} around their centre, but the robot "
-            f"reaches {reach:.2g} m; if they are millimetres, write x[mm],y[mm],z[mm]"
+            f"the positions spread {_format_as_written(spread, unit)} around their centre{along}, but the "
+            f"robot reaches {reach:.2g} m; if they are millimetres, write "
+            f"{','.join(f'{axis}[mm]' for axis in large or 'xyz')}"
         ]
     modelled_spread = median_radius(modelled)
     if not 0 < spread < modelled_spread / _MIN_SCALE:

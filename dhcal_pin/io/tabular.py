@@ -111,8 +111,8 @@ def require_usable_names(names: Sequence[str], source: str) -> None:
         if not is_plain or name != _without_formula(name):
             raise FileFormatError(
                 f"{source}: joint name {quote(name)}: a name that heads a column must be printable, "
-                f"without {' '.join(sorted(_RESERVED_CHARACTERS))}, and not start with one of "
-                f"{' '.join(_FORMULA_STARTS)}; rename the joint"
+                f"without spaces at its ends, without any of {' '.join(sorted(_RESERVED_CHARACTERS))}, "
+                f"and not start with one of {' '.join(_FORMULA_STARTS)}; rename the joint"
             )
 
 

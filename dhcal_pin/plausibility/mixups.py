@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._typing import Progress, no_progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious
@@ -40,7 +41,12 @@ _MAX_ITEMS = 6
 _N_SAMPLES, _N_ROWS, _MIN_SAMPLES_PER_ITEM = 50, 200, 8
 
 
-def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
+def diagnose_mixups(
+    chain: Chain,
+    data: Sequence[Measurement],
+    sets: str = MANUFACTURED,
+    progress: Progress | None = None,
+) -> Diagnosis:
     """Look for a mistake in measurements that explains why they do not fit the robot.
 
     The robot may have errors of one of the parameter sets of `evidence`.
@@ -52,11 +58,12 @@ def diagnose_mixups(chain: Chain, data: Sequence[Measurement], sets: str = MANUF
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    diagnosis, trial = _find_single(chain, items, sets)
+    report = progress or no_progress
+    diagnosis, trial = _find_single(chain, items, sets, report)
     if trial is None:
         return diagnosis
     if len(items) > 1 and not trial.single.hypotheses:
-        separate = [(item, _find_one_or_two(chain, item, sets)) for item in items]
+        separate = [(item, _find_one_or_two(chain, item, sets, report)) for item in items]
         for item, one in separate:
             if one.hypotheses:
                 return replace(one, source=item.source)
@@ -84,7 +91,9 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
-def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[Diagnosis, Trial | None]:
+def _find_single(
+    chain: Chain, data: Sequence[Measurement], sets: str, progress: Progress
+) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
     if not has_enough_rows(samples):
@@ -94,12 +103,12 @@ def _find_single(chain: Chain, data: Sequence[Measurement], sets: str) -> tuple[
         return Diagnosis(before), None
     from .trials import try_hypotheses  # lazy import: few measurements are suspicious
 
-    return try_hypotheses(chain, samples, neighbourhood, sets, before)
+    return try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
 
 
-def _find_one_or_two(chain: Chain, item: Measurement, sets: str) -> Diagnosis:
+def _find_one_or_two(chain: Chain, item: Measurement, sets: str, progress: Progress) -> Diagnosis:
     """Look for one mistake or two in one measurement."""
-    diagnosis, trial = _find_single(chain, [item], sets)
+    diagnosis, trial = _find_single(chain, [item], sets, progress)
     return trial.find_pair() if trial else diagnosis
 
 

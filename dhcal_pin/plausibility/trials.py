@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._typing import Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import Diagnosis, is_suspicious, leaves_residuals
@@ -33,6 +34,8 @@ _MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
 _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
+# Phases of the progress.
+SINGLES, PAIRS = "looking for mistakes in the measurements", "looking for pairs of mistakes"
 
 
 # Hypothesis, and samples after its change; None if it does not apply to them.
@@ -57,24 +60,32 @@ class Trial(NamedTuple):
     misfit: float  # Misfit of the nominal robot
     candidates: Sequence[_Candidate]
     single: Diagnosis  # Decisive hypotheses, with which the robot needs large errors, if any
+    progress: Progress
 
     def find_pair(self) -> Diagnosis:
         """Look for two mistakes in measurements with positions, by which pairs are compared."""
         is_plausible = self.misfit <= _LARGEST_MISFITS[self.sets] and not leaves_residuals(self.before)
         if not self.misfit or (is_plausible and not self.single.hypotheses):
             return self.single
-        pairs = _candidates(self.chain, _changes_of_pairs(self.candidates))
+        pairs = _candidates(self.chain, self._changes_of_pairs())
         near = nsmallest(_N_NEAR_PAIRS, pairs, key=lambda pair: pair.misfit)
         largest, closest = _largest_misfit(self, near), list[_Candidate]()
         for pair in near:
             is_new = not any(_are_equal(pair, other) for other in closest)
             if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
                 closest.append(pair)
-        found = _decisive(self, closest)
+        found = _decisive(self, closest, PAIRS)
         if _is_certain(found):
             return found
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
+
+    def _changes_of_pairs(self) -> Iterator[_Change]:
+        """Yield pairs of mistakes with the samples after both changes."""
+        pairs = list(_pairs(self.candidates))
+        for start in range(0, len(pairs), _N_TOGETHER):
+            self.progress(PAIRS, start // _N_TOGETHER + 1, -(-len(pairs) // _N_TOGETHER))
+            yield from starmap(_then, pairs[start : start + _N_TOGETHER])
 
 
 def try_hypotheses(
@@ -83,19 +94,20 @@ def try_hypotheses(
     neighbourhood: Sequence[Measurement],
     sets: str,
     before: Evidence,
+    progress: Progress,
 ) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in suspicious samples; return what was tried if it is not certain."""
     listed = list_hypotheses(chain, samples)
     candidates = list(_candidates(chain, ((each, _apply(each, samples, neighbourhood)) for each in listed)))
     misfit = float(nominal_misfits(chain, [samples])[0])
-    trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before))
+    trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before), progress)
     largest = _largest_misfit(trial)
-    found = _decisive(trial, [each for each in candidates if each.misfit <= largest])
+    found = _decisive(trial, [each for each in candidates if each.misfit <= largest], SINGLES)
     return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
 
 
-def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
-    """Yield pairs of mistakes with the samples after both changes, in one order if the order does not matter.
+def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:
+    """Yield pairs of mistakes, in one order if the order does not matter.
 
     Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
     are listed if the coordinates as they were read suggest them. Rotations have one notation.
@@ -103,23 +115,27 @@ def _changes_of_pairs(singles: Sequence[_Candidate]) -> Iterator[_Change]:
     shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
     joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
     values = [each for each in singles if not isinstance(each.hypothesis.change, RowShift | JointChange)]
-    yield from starmap(_then, product(shifts, [*joints, *values]))
+    yield from product(shifts, [*joints, *values])
     moved = [change.joints for each in joints if isinstance(change := each.hypothesis.change, JointChange)]
     for i, j in permutations(range(len(joints)), 2):
         if i < j or moved[i] & moved[j]:
-            yield _then(joints[i], joints[j])
-    for joint, value in product(joints, values):
-        # The change of joints is the faster one.
-        yield both(joint.hypothesis, value.hypothesis), joint.hypothesis.apply(value.changed)
+            yield joints[i], joints[j]
+    yield from product(joints, values)
     for first, second in permutations(values, 2):
         changes = first.hypothesis.change, second.hypothesis.change
         if not isinstance(changes[1], AxisScale) and not all(isinstance(c, OtherNotation) for c in changes):
-            yield _then(first, second)
+            yield first, second
 
 
 def _then(first: _Candidate, second: _Candidate) -> _Change:
     """Return the hypothesis that two mistakes were made, with the samples after both changes."""
-    return both(first.hypothesis, second.hypothesis), second.hypothesis.apply(first.changed)
+    last, start = second, first
+    if isinstance(first.hypothesis.change, JointChange) and not isinstance(
+        second.hypothesis.change, JointChange
+    ):
+        # The order does not matter; the change of joints is the faster one.
+        last, start = first, second
+    return both(first.hypothesis, second.hypothesis), last.hypothesis.apply(start.changed)
 
 
 def _candidates(chain: Chain, changes: Iterable[_Change]) -> Iterator[_Candidate]:
@@ -145,10 +161,11 @@ def _are_equal(first: _Candidate, second: _Candidate) -> bool:
     return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
 
 
-def _decisive(trial: Trial, candidates: Sequence[_Candidate]) -> Diagnosis:
+def _decisive(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> Diagnosis:
     """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
     scored = []
-    for hypothesis, changed, _ in candidates:
+    for step, (hypothesis, changed, _) in enumerate(candidates, 1):
+        trial.progress(phase, step, len(candidates))
         after = fit_evidence(trial.chain, changed, trial.sets)
         log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
         scored.append((log, hypothesis, after))

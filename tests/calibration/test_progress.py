@@ -9,6 +9,7 @@ import pytest
 from robots import URDF
 
 from dhcal_pin import Chain, Noise, Position, calibrate, read_dh
+from dhcal_pin.plausibility import mend
 
 
 @pytest.fixture(scope="module")
@@ -16,10 +17,11 @@ def arm():
     return Chain.from_dh(read_dh(URDF / "sim_6dof.dh.toml"))
 
 
-def phases(arm, **options):
+def phases(arm, mistake=None, **options):
     rng = np.random.default_rng(0)
     q = rng.uniform(-2.0, 2.0, (60, 6))
     data = Position.simulate(arm, q, Noise(1e-4, 1e-4), rng)
+    data = mend(arm, data, mistake) if mistake else data
     calls = []
     calibrate(arm, data, progress=lambda *call: calls.append(call), **options)
     assert all(1 <= step <= total for _, step, total in calls)
@@ -42,6 +44,13 @@ def test_left_out_regions(arm):
     found = phases(arm, extend="none", holdout="region")
     assert set(found) == {"fit", "robust weights", "left-out regions"}
     assert found["left-out regions"] >= 5
+
+
+def test_mistakes_that_are_looked_for(arm):
+    found = phases(arm, "sign:joint_3")
+    assert set(found) == {"fit", "robust weights", "looking for mistakes in the measurements"}
+    found = phases(arm, "sign:joint_2+swap:joint_4:joint_5")
+    assert set(found) == {"fit", "robust weights", "looking for pairs of mistakes"}
 
 
 def test_gauss_newton(arm):

@@ -116,6 +116,38 @@ NOTED_FORMS = {
 }
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "validate out.urdf d.xlsx",
+        "recheck out.urdf d.xlsx --sigma 1mm --size 5mm",
+        "plan arm.urdf -n 4 -o p.csv --data d.xlsx --kind position --candidates 100",
+        "view arm.urdf --data d.xlsx --html s.html",
+    ],
+)
+def test_commands_read_the_chosen_sheet_without_its_bad_rows(run, robot_folder, words):
+    from openpyxl import Workbook
+
+    assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", "--extend", "none")[0] == 0
+    workbook = Workbook()
+    long = workbook.create_sheet("Long")
+    for _ in range(50):
+        long.append([1, 2, 3])
+    sheet = workbook.create_sheet("Data")
+    for line in Path("data.csv").read_text().splitlines():
+        cells = line.split(",")
+        sheet.append([float(cell) if cell[-1].isdigit() else cell for cell in cells])
+    sheet.cell(4, 5).value = "lost"
+    workbook.save("d.xlsx")
+    status, _, err = run(*words.split(), "--sheet", "Long")
+    assert (status, "read sheet 'Long', not 'Data'" in err) == (2, True)
+    status, _, err = run(*words.split())
+    assert (status, "d.xlsx:4: column 'y': 'lost' is not" in err) == (2, True)
+    status, _, err = run(*words.split(), "--skip-bad-rows", "--verbose")
+    assert status == 0, err
+    assert "line 4 skipped" in err or words.startswith("plan")
+
+
 # Parameters of the plain file, which are computed once.
 PLAIN = {}
 

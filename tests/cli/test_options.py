@@ -69,8 +69,28 @@ def test_options_may_stand_between_names_of_files(words):
     assert (found.robot, found.tip, found.data) == ("a.urdf", "t", ["1.csv", "2.csv"])
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate a.urdf 1.csv -o o.urdf",
+        "inspect 1.csv --robot a.urdf",
+        "validate a.urdf 1.csv",
+        "recheck a.urdf 1.csv",
+        "plan a.urdf -n 9 -o p.csv --data 1.csv",
+        "view a.urdf --data 1.csv",
+    ],
+)
+def test_options_of_measurement_files_have_the_same_names_everywhere(words):
+    options = "--columns m.toml --sheet Data --servos s.toml --skip-bad-rows"
+    found = build_parser().parse_args([*words.split(), *options.split()])
+    assert (found.data, found.columns, found.sheet) == (["1.csv"], "m.toml", "Data")
+    assert (found.servos, found.skip_bad_rows) == ("s.toml", True)
+
+
 @pytest.mark.parametrize("words", ["export a.urdf b.urdf -o m.h", "validate a.urdf 1.csv --tipp t 2.csv"])
 def test_words_without_a_meaning_are_refused(words, capsys):
     with pytest.raises(SystemExit):
         build_parser().parse_args(words.split())
-    assert "unrecognized arguments" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "unrecognized arguments" in err
+    assert err.endswith(f"; see dhcal {words.split()[0]} --help\n")

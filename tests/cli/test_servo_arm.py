@@ -85,6 +85,9 @@ def test_the_calibrated_arm_is_accurate_on_other_counts(arm, run):
     options = ("--tip", TIP, "--servos", "arm.servos.toml", "--json", "v.json")
     assert run("validate", "arm.urdf", "other.csv", *options)[0] == 0
     assert json.loads(Path("v.json").read_text())["after"]["position_rms_m"] < 4e-3
+    run("recheck", "arm.urdf", "other.csv", *options)
+    assert json.loads(Path("v.json").read_text())["samples"] == 60
+    assert run("view", "arm.urdf", "--data", "other.csv", *options[:4], "--html", "s.html")[0] == 0
     nominal, calibrated = read_robot("so101.urdf", TIP), read_robot("arm.urdf", TIP)
     turned = np.array([name in arm.wrong for name in JOINTS])
     np.testing.assert_array_equal(calibrated.axes, np.where(turned[:, None], -1, 1) * nominal.axes)

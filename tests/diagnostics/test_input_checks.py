@@ -47,6 +47,20 @@ def test_a_wrong_unit_gives_one_warning(warnings_of, ur10, kind, units, expected
     assert len(found) <= (6 if expected.startswith("if the values are degrees") else 1)
 
 
+@pytest.mark.parametrize("wrong", ["z", "x,y"])
+def test_only_the_coordinates_in_millimetres_are_named(warnings_of, ur10, wrong):
+    header, *rows = csv_text_of(ur10, joint_positions(ur10), kind="position", length="m").splitlines()
+    names = [cell.split("[")[0] for cell in header.split(",")]
+    factors = [1000.0 if name in wrong.split(",") else 1.0 for name in names]
+    rows = [
+        ",".join(str(factor * float(cell)) for factor, cell in zip(factors, row.split(","), strict=True))
+        for row in rows
+    ]
+    (found,) = warnings_of(ur10, "\n".join([header, *rows]))
+    expected = ",".join(f"{axis}[mm]" for axis in wrong.split(","))
+    assert found.endswith(f"if they are millimetres, write {expected}")
+
+
 @pytest.mark.parametrize(
     ("declared", "true", "expected"),
     [("rad", "deg", "more than a turn"), ("deg", "rad", "rotation vectors are in rad, but were read as deg")],

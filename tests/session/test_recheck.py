@@ -179,6 +179,11 @@ def test_command(tmp_path: Path, capsys):
     history.write_text("[" * 10**5)
     assert main(args) == 2
     assert f"{history}:1: not JSON" in capsys.readouterr().err
+    history.unlink()
+    joints = ",".join(f"{name}[rad]" for name in fit.chain.joint_names)
+    data.write_text(f"{joints},corner,u[px],v[px]\n0,0,0,0,0,0,1,2,3\n")
+    assert main(args) == 2
+    assert f"{data}: recheck does not use images; expected positions or poses" in capsys.readouterr().err
     (tmp_path / "cal.calibration.toml").unlink()
     assert main(args) == 2
     assert "no sidecar" in capsys.readouterr().err

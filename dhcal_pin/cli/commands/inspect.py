@@ -22,6 +22,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--sheet", **SHEET)
     parser.add_argument("--servos", **SERVOS)
     parser.add_argument("--rig", **RIG)
+    parser.add_argument(
+        "--skip-bad-rows",
+        action="store_true",
+        help="as in other commands: rows that lack a number or a name are always skipped here, and listed",
+    )
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 

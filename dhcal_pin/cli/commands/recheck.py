@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, ROBOT, SHEET, add_urdf_options
+from ..options import COLUMNS, DATA, JSON, ROBOT, SERVOS, SHEET, SKIP_BAD_ROWS, add_urdf_options
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_urdf_options(parser)
     parser.add_argument("--columns", **COLUMNS)
     parser.add_argument("--sheet", **SHEET)
+    parser.add_argument("--servos", **SERVOS)
+    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
@@ -76,8 +78,16 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Check whether a robot is still calibrated, write the answer and show it."""
-    from ...io import existing_sidecar, read_instrument, read_measurement_file, read_robot, robot_name
+    from ...io import (
+        existing_sidecar,
+        read_instrument,
+        read_measurement_file,
+        read_robot,
+        read_servos,
+        robot_name,
+    )
     from ...io.check_history import Check, read_history
+    from ...io.measurement_files.reading import has_image_coordinates
     from ...io.sidecar import read_uncertainty  # lazy import, as the following: they load Pinocchio
     from ...measurements import Noise
     from ...report.provenance import file_digests
@@ -89,7 +99,7 @@ def run(args: Namespace) -> int:
     from ..screens.result_screens import recheck_screen
 
     sidecar = existing_sidecar(args.robot)
-    inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns))]
+    inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
     outputs = chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in outputs], inputs)
     require_endings(outputs)
@@ -103,7 +113,16 @@ def run(args: Namespace) -> int:
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
             "NAME.calibration.toml"
         )
-    files = [read_measurement_file(path, chain, args.columns, sheet=args.sheet) for path in args.data]
+    servos = read_servos(args.servos) if args.servos else None
+    for path in args.data:
+        if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
+            raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
+    files = [
+        read_measurement_file(
+            path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, servos=servos, sheet=args.sheet
+        )
+        for path in args.data
+    ]
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
     data, known = [file.data for file in files], read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
@@ -120,5 +139,6 @@ def run(args: Namespace) -> int:
     contents = file_contents(outputs, Checked(robot_name(args.robot), [*earlier, now]))
     write_outputs(contents, args.json, document)
     shown = [path for name, path in written.items() if name != "json"]
-    console.show(recheck_screen(result, shown), args.verbosity)
+    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
+    console.show(recheck_screen(result, notes, shown), args.verbosity)
     return STATUS[result.verdict]

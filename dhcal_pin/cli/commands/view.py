@@ -10,11 +10,16 @@ from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
+    COLUMNS,
+    DATA,
     FIT_FRAMES,
     JSON,
     POSITIVE_INTEGER,
     RIG,
     ROBOT,
+    SERVOS,
+    SHEET,
+    SKIP_BAD_ROWS,
     add_open_option,
     add_urdf_options,
     read_robot_or_table,
@@ -32,8 +37,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help=ROBOT["help"])
     parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
     parser.add_argument(
-        "--data", metavar="DATA", nargs="+", default=[], help="measurement CSV files to draw and play"
+        "--data", **{**DATA, "help": f"{DATA['help']}; their poses are drawn and played"}, default=[]
     )
+    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--sheet", **SHEET)
+    parser.add_argument("--servos", **SERVOS)
+    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--rig",
         metavar=RIG["metavar"],
@@ -72,13 +81,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
     from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ...io import read_measurements
+    from ...io import read_measurement_file, read_servos
     from ...io.robot import robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block, warnings_block
+    from ..screens.result_screens import files_block, notes_block, warnings_block
     from ..screens.screen import Screen
 
     if args.live and (args.html or args.open or args.json):
@@ -90,12 +99,26 @@ def run(args: Namespace) -> int:
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
     page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
-    inputs = [*robots, *sidecars, *args.data, *([args.rig] if args.rig else [])]
+    settings = filter(None, (args.rig, args.columns, args.servos))
+    inputs = [*robots, *sidecars, *args.data, *settings]
     require_writable_outputs([page, args.json], inputs)
     chains = [read_robot_or_table(path, args) for path in robots]
     sidecar = existing_sidecar(robots[-1])
     rig = _rig(args.rig, sidecar, chains[-1])
-    data = [read_measurements(path, chains[0], rig=rig) for path in args.data]
+    servos = read_servos(args.servos) if args.servos else None
+    files = [
+        read_measurement_file(
+            path,
+            chains[0],
+            args.columns,
+            skip_bad_rows=args.skip_bad_rows,
+            rig=rig,
+            servos=servos,
+            sheet=args.sheet,
+        )
+        for path in args.data
+    ]
+    data = [file.data for file in files]
     known = read_instrument(sidecar) if sidecar else {}
     predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
     warnings = {}
@@ -119,7 +142,8 @@ def run(args: Namespace) -> int:
     )
     findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
-    console.show(Screen([warnings_block(warnings), files_block([page])]), args.verbosity)
+    notes = notes_block([f"{file.source}: {text}" for file in files for text in file.notes])
+    console.show(Screen([notes, warnings_block(warnings), files_block([page])]), args.verbosity)
     if args.open if args.open is not None else not args.html:
         console.open_page(page)
     return 0

@@ -350,7 +350,7 @@ MIN_SHOWN_SHARE = 0.01
 VERDICT_STYLES = {"ok": "green", "changed": "red", "cannot say": "yellow"}
 
 
-def recheck_screen(result: Recheck, files: Iterable[object]) -> Screen:
+def recheck_screen(result: Recheck, notes: Sequence[str], files: Iterable[object]) -> Screen:
     """Describe whether a robot is still calibrated."""
     rows = [
         [
@@ -374,6 +374,7 @@ def recheck_screen(result: Recheck, files: Iterable[object]) -> Screen:
                 n_kept=4,
             ),
             Block([residual]),
+            notes_block(notes),
             files_block(files),
             Block(
                 [f"{result.verdict}: {result.reasons[0]}", *result.reasons[1:]],

@@ -151,6 +151,12 @@ class ColumnMap:
     constants: Mapping[str, str]  # Columns of the project that have one text for the whole file
     layout: TextLayout  # How the file is divided into cells
 
+    @property
+    def source_columns(self) -> list[str | int]:
+        """Columns of the vendor that the map names."""
+        rotation = self.rotation.columns if self.rotation else ()
+        return [*(rule.source_column for rule in self.rules), *rotation]
+
 
 # --- reading a map ---------------------------------------------------------------------------------
 

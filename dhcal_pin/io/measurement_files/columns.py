@@ -6,7 +6,7 @@ columns, and among those the one with the fewest columns in all. A rotation can 
 place of a rotation vector. Image coordinates may have the columns of a pose in place of those of the joints.
 
 A column that names a joint belongs to the joint. Joints cannot have the names of columns that a measurement
-kind needs in any case.
+kind needs in any case, and no names that start with the prefix of the second configuration of a row.
 
 The conditions of the samples may stand beside them: `time[s]`, `temperature[degC]`, `payload[kg]` and the
 direction of the last motion of a joint, `approach_JOINT`. A joint of such a name comes first.
@@ -26,6 +26,7 @@ import numpy as np
 from ...exceptions import FileFormatError, UnknownNameError
 from ...measurements import KINDS
 from ...measurements.base import Measurement
+from ...messages import quote
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
 from ...units import ANGLES, LENGTHS
@@ -113,6 +114,11 @@ def check_joint_names(chain: Chain) -> None:
         raise FileFormatError(
             f"{chain.urdf.source}: joint {clashes[0]!r} has the name of a measurement column; "
             "rename the joint"
+        )
+    if prefixed := [name for name in chain.joint_names if name.startswith(SECOND_PREFIX)]:
+        raise FileFormatError(
+            f"{chain.urdf.source}: joint {quote(prefixed[0])} starts with {SECOND_PREFIX!r}, which heads the "
+            "columns of the second configuration of a row; rename the joint"
         )
 
 

@@ -51,9 +51,7 @@ class _VendorTable:
 
     def missing_columns(self) -> list[str | int]:
         """Return the columns of the map that the file does not have."""
-        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
-        names = [*(rule.source_column for rule in self.column_map.rules), *rotation]
-        return [name for name in names if self.column_index(name) is None]
+        return [name for name in self.column_map.source_columns if self.column_index(name) is None]
 
     def without_bad_rows(self) -> _VendorTable:
         """Return the table without the rows that lack a number."""
@@ -79,21 +77,25 @@ def read_mapped_table(
 
     A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
     """
-    column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet))
-    native = TextLayout(sheet=sheet)
+    named = frozenset(name for name in column_map.source_columns if isinstance(name, str))
+    column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet, names=named))
+    native = TextLayout(sheet=sheet, names=known)
     if _is_native(source, native, known) and not _matches(source, column_map):
         return read_table(source, native)
     vendor = _VendorTable(read_table(source, column_map.layout), column_map)
     table = vendor.table
-    if missing := vendor.missing_columns():
-        raise FileFormatError(
-            f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the file "
-            f"({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
-        )
-    vendor = vendor.without_bad_rows()
-    columns = {column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules}
-    if column_map.rotation:
-        columns |= _rotation_columns(vendor, column_map.rotation)
+    with table.notes_in_errors():
+        if missing := vendor.missing_columns():
+            raise FileFormatError(
+                f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the "
+                f"file ({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
+            )
+        vendor = vendor.without_bad_rows()
+        columns = {
+            column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules
+        }
+        if column_map.rotation:
+            columns |= _rotation_columns(vendor, column_map.rotation)
     for name, text in column_map.constants.items():
         columns[name] = [_fill_placeholders(text, source)] * len(vendor.table.lines)
     table = vendor.table

@@ -109,7 +109,7 @@ def read_measurements(
             error.
         rig: Cameras and boards of image coordinates, on the chain.
         servos: Servos whose counts are in columns `NAME[ticks]`, see `dhcal_pin.io.read_servos`.
-        sheet: Sheet of an Excel workbook; the first one with numbers by default.
+        sheet: Sheet of an Excel workbook; by default the one with the most known columns.
 
     Returns:
         Samples of the kind that the columns select.
@@ -149,12 +149,14 @@ def open_measurement_table(
 ) -> DataTable:
     """Read the table of a measurement file, through a column map and a servo file if they are given."""
     if columns is None:
-        return with_joint_values(read_table(source, TextLayout(sheet=sheet)), chain, servos)
-    from .column_map import read_map  # lazy import, as the following: only for files of other makers
-    from .mapped_table import read_mapped_table
+        table = read_table(source, TextLayout(sheet=sheet, names=known_columns(chain)))
+    else:
+        from .column_map import read_map  # lazy import, as the following: only for files of other makers
+        from .mapped_table import read_mapped_table
 
-    table = read_mapped_table(source, read_map(columns, chain), known_columns(chain), sheet)
-    return with_joint_values(table, chain, servos)
+        table = read_mapped_table(source, read_map(columns, chain), known_columns(chain), sheet)
+    with table.notes_in_errors():
+        return with_joint_values(table, chain, servos)
 
 
 def has_image_coordinates(
@@ -166,11 +168,20 @@ def has_image_coordinates(
 ) -> bool:
     """Return whether a measurement file has image coordinates, whose cameras and boards must be known."""
     table = open_measurement_table(source, chain, columns, servos, sheet)
-    return not needs_column_map(table, chain) and find_kind(value_table(table, chain)).kind == "camera"
+    with table.notes_in_errors():
+        return not needs_column_map(table, chain) and find_kind(value_table(table, chain)).kind == "camera"
 
 
 def parse_measurements(
     table: DataTable, chain: Chain, skip_bad_rows: bool = False, rig: MountedRig | None = None
+) -> MeasurementFile:
+    """Parse the samples of a table; errors say what was not read, such as further sheets."""
+    with table.notes_in_errors():
+        return _parse_table(table, chain, skip_bad_rows, rig)
+
+
+def _parse_table(
+    table: DataTable, chain: Chain, skip_bad_rows: bool, rig: MountedRig | None
 ) -> MeasurementFile:
     """Parse the samples of a table."""
     if needs_column_map(table, chain):

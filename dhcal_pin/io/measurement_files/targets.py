@@ -76,10 +76,13 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     return TargetPoses(table.source, values, near, reading.column_units(table), data.rows, notes, conditions)
 
 
-def read_configurations(path: PathLike, chain: Chain, columns: PathLike | None = None) -> Array:
+def read_configurations(
+    path: PathLike, chain: Chain, columns: PathLike | None = None, sheet: str = ""
+) -> Array:
     """Read the joint positions of a file; measured values beside them are ignored."""
     check_joint_names(chain)
-    table = reading.open_measurement_table(path, chain, columns)
-    table.require_good_rows()
-    check_columns(table, chain)
-    return reading.parse_joint_positions(table, chain)
+    table = reading.open_measurement_table(path, chain, columns, sheet=sheet)
+    with table.notes_in_errors():
+        table.require_good_rows()
+        check_columns(table, chain)
+        return reading.parse_joint_positions(table, chain)

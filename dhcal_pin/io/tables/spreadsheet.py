@@ -1,15 +1,15 @@
 """Tables in Excel workbooks, read with openpyxl (`pip install 'dhcal-pin[excel]'`).
 
-The sheet that the layout names is read, else the first one with a row of several numbers, else the first one
-with content. Its rows are numbered as in Excel. Rows whose only cell starts with `#` are comments, as in a
-text file. Of a formula the value is read that Excel saved with it.
+The sheet that the layout names is read, else the one with the most known columns, and of several ones the one
+with the most rows of several numbers. The rows are numbered as in Excel. Rows whose only cell starts with `#`
+are comments, as in a text file. Of a formula the value is read that Excel saved with it.
 """
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from datetime import date, datetime, time
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -59,9 +59,7 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
         raise UnknownNameError(
             f"{source}: no sheet {layout.sheet!r} with content; choose from {', '.join(map(repr, filled))}"
         )
-    title = layout.sheet or next(
-        (each for each, rows in filled.items() if any(map(_has_numbers, rows))), next(iter(filled))
-    )
+    title = layout.sheet or max(filled, key=lambda each: _likelihood(filled[each], layout.names))
     rows = filled[title]
     others = [other for other in filled if other != title]
     notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
@@ -85,6 +83,13 @@ def _numbered_rows(rows: Iterable[Sequence[Any]]) -> list[tuple[int, list[Any]]]
         (number, ["" if value is None else value for value in row]) for number, row in enumerate(rows, 1)
     )
     return [(number, cells) for number, cells in values if any(cell != "" for cell in cells)]
+
+
+def _likelihood(rows: Sequence[tuple[int, Sequence[Any]]], names: Set[str]) -> tuple[int, int]:
+    """Return what makes a sheet likely: the number of known columns in a header, and of rows of numbers."""
+    texts = ([cell for cell in cells if isinstance(cell, str)] for _, cells in rows)
+    known = (sum(bool(names & {text, text.partition("[")[0].strip()}) for text in row) for row in texts)
+    return max(known) if len(rows) > 1 else 0, sum(map(_has_numbers, rows))
 
 
 def _has_numbers(row: tuple[int, Sequence[Any]]) -> bool:

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..._typing import Array
-from ...exceptions import FileFormatError, UnknownNameError
+from ...exceptions import DhcalError, FileFormatError, UnknownNameError
 from ...messages import quote
 from ...units import MAX_SI_VALUE, UNITS
 from ..tabular import parse_number
@@ -83,6 +83,15 @@ class DataTable:
         numbers = {i: column for i, column in enumerate(values) if isinstance(column, np.ndarray)}
         rows = _ColumnRows(values, len(lines))
         return cls(source, tuple(columns), rows, lines, **{"header_line": 1, "numbers": numbers} | others)
+
+    @contextmanager
+    def notes_in_errors(self) -> Iterator[None]:
+        """Add the notes to the message of an error."""
+        try:
+            yield
+        except DhcalError as error:
+            error.args = ("; ".join([str(error), *self.notes]),)
+            raise
 
     @property
     def header_location(self) -> str:

@@ -16,7 +16,7 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -49,7 +49,8 @@ class TextLayout:
 
     separator: str = ""  # Key of `SEPARATORS`; empty if it is to be detected
     decimal: str = ""  # Decimal sign; empty if it is to be detected
-    sheet: str = ""  # Sheet of a workbook; empty for the first one with numbers
+    sheet: str = ""  # Sheet of a workbook; empty if it is to be detected
+    names: Set[str] = frozenset()  # Names of columns by which a sheet is detected
     skip: int = 0  # Number of lines before the header
     has_header: bool = True  # Whether the first row is a header
     # Start of a comment line; empty if there are none.

@@ -119,11 +119,18 @@ def test_written_poses_keep_their_rotation(tmp_path_factory, rows, axis, angle, 
     assert again.rotation_sigma.tolist() == wrote.rotation_sigma.tolist()
 
 
-def test_a_joint_with_the_name_of_a_measurement_column_is_an_error(tmp_path):
-    gantry = Chain.from_dh(read_dh(write(tmp_path, "g.dh.toml", SCARA.replace('"lift"', '"x"'))))
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("x", "'x' has the name of a measurement column; rename"),
+        ("to:shoulder", "'to:shoulder' starts with 'to:', .* second configuration of a row; rename"),
+    ],
+)
+def test_a_joint_with_the_name_of_a_measurement_column_is_an_error(tmp_path, name, message):
+    gantry = Chain.from_dh(read_dh(write(tmp_path, "g.dh.toml", SCARA.replace('"lift"', f'"{name}"'))))
     for act in (
         lambda: read_measurement_file(write(tmp_path, "a.csv", HEADER + "0,0,1,2,3\n"), gantry),
         lambda: measurement_text(Position(np.zeros((1, 2)), np.zeros((1, 3))), gantry),
     ):
-        with pytest.raises(DhcalError, match="'x' has the name of a measurement column; rename"):
+        with pytest.raises(DhcalError, match=message):
             act()

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from robots import write
+from robots import SCARA, write
 
-from dhcal_pin.exceptions import DhcalError, UnknownNameError
-from dhcal_pin.io import read_toml
+from dhcal_pin.exceptions import DhcalError, FileFormatError, UnknownNameError
+from dhcal_pin.io import read_dh, read_measurements, read_toml
 from dhcal_pin.io.tables import DataTable, TextLayout, format_lines, read_table
 from dhcal_pin.io.tables import table as tables
 from dhcal_pin.io.tabular import csv_text, require_usable_names
+from dhcal_pin.robot import Chain
 
 
 def test_an_unbalanced_quote_affects_its_row_only(tmp_path):
@@ -63,6 +64,23 @@ def test_the_sheet_with_numbers_is_read(tmp_path):
     assert other.values(1).tolist() == [5]
     with pytest.raises(UnknownNameError, match=r"a\.xlsx: no sheet 'data' .*'Info', 'Data', 'Other'"):
         read_table(tmp_path / "a.xlsx", TextLayout(sheet="data"))
+
+
+def test_the_sheet_with_the_most_known_columns_or_rows_is_read_and_errors_name_the_others(tmp_path):
+    workbook = pytest.importorskip("openpyxl").Workbook()
+    workbook.active.title = "Info"
+    workbook.active.append(["Temperature", 21.5, 20.3, 19.1])
+    workbook.active.append(["Remark"])
+    sheet = workbook.create_sheet("Data")
+    for row in (["a", "b", "c"], [1, 2, 3], [4, 5, 6]):
+        sheet.append(row)
+    workbook.save(tmp_path / "a.xlsx")
+    assert read_table(tmp_path / "a.xlsx").headers == ("a", "b", "c")
+    arm = Chain.from_dh(read_dh(write(tmp_path, "scara.dh.toml", SCARA)))
+    chosen = read_table(tmp_path / "a.xlsx", TextLayout(names={"Temperature"}))
+    assert chosen.headers == ("Temperature", "21.5", "20.3", "19.1")
+    with pytest.raises(FileFormatError, match=r"a\.xlsx:1: .*; read sheet 'Info', not 'Data'$"):
+        read_measurements(tmp_path / "a.xlsx", arm, sheet="Info")
 
 
 @pytest.mark.parametrize("units", ["deg,mm,-", "[deg],(mm),", "deg,mm"])
@@ -113,6 +131,11 @@ def test_other_rows_are_not_units(tmp_path, row):
 def test_no_joint_name_heads_a_column_as_a_formula(name):
     with pytest.raises(DhcalError, match=r"arm\.urdf: joint name .*rename the joint"):
         require_usable_names([name], "arm.urdf")
+
+
+def test_spaces_at_the_ends_of_a_joint_name_are_named():
+    with pytest.raises(DhcalError, match="without spaces at its ends"):
+        require_usable_names([" a b"], "arm.urdf")
 
 
 # --- detection -------------------------------------------------------------------------------------
