@@ -204,6 +204,28 @@ def test_euler_angles_are_kept_for_the_rows_that_are_used(read):
     np.testing.assert_allclose(np.rad2deg(data.angles), [[0, 20, -100], [30, 23, -103], [40, 24, -104]])
 
 
+@pytest.mark.parametrize(
+    ("header", "axes"),
+    [
+        ("A1;A2;A3;X;Y;Z;O;A;T", "ZYZ"),
+        ("A1;A2;A3;X [mm];Y [mm];Z [mm];O [deg];A [deg];T [deg]", "ZYZ"),
+        ("A1;A2;A3;X;Y;Z;A;B;C", "ZYX"),
+        # Only beside X, Y and Z, and only these three.
+        ("A1;A2;A3;U;V;W;O;A;T", ""),
+        ("A1;A2;A3;X;Y;Z;O;T;A", ""),
+    ],
+)
+def test_angles_of_makers_are_proposed_by_their_columns(tmp_path, arm, header, axes):
+    row = "10;20;30;400;500;600;70;80;-90"
+    (tmp_path / "theirs.csv").write_text("\n".join([header, *[row] * 3]))
+    with pytest.raises(DhcalError) as error:
+        read_measurements(tmp_path / "theirs.csv", arm)
+    names = json.dumps(header.split(";")[6:])
+    line = f'axes = "{axes}", frame = "intrinsic", columns = {names}, unit = "deg"'
+    assert (line in str(error.value)) == bool(axes)
+    assert ("rotation =" in str(error.value)) == bool(axes)
+
+
 def test_a_second_configuration_is_read_back(read, arm):
     rng = np.random.default_rng(0)
     q, q_to = rng.uniform(-1, 1, (2, 4, 3))
