@@ -406,8 +406,9 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
             f"rows:{side}", f"each row holds the joint values of the row {side}", RowShift(-step)
         )
     if any(isinstance(item, Pose) for item in data):
-        yield from _pose_hypotheses()
+        # The notation of angles is mistaken more often than a frame that turns with it.
         yield from _rotation_hypotheses(data)
+        yield from _pose_hypotheses()
         yield from _turn_hypotheses()
     else:
         # Positions alone are the same in all left-handed frames, up to a rotation of the base.

@@ -167,6 +167,7 @@ def notation_of(name):
     [
         # Another first axis of ZYZ angles turns the frame of the rotations.
         ("ZYZ", "ZXZ", ["axes:y,-x,z"]),
+        ("YZX", "XYZ", ["axes:y,z,x"]),
         # The second angles of both notations have different ranges.
         ("ZYZ", "ZYX", []),
         ("YXZ", "XYX", []),
