@@ -254,11 +254,12 @@ class RotationUnit:
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the numbers in radians."""
-        if not isinstance(item, PoseMeasurement):
+        if not isinstance(item, PoseMeasurement) or len(notations := _notations([item])) != 1:
             return None
-        angles = ANGLES["deg"] * item.angles
-        if np.abs(angles).max(initial=0.0) <= 2 * np.pi and len(notations := _notations([item])) == 1:
-            (notation,) = notations
+        if notation := notations.pop():
+            angles = ANGLES["deg"] * _numbers(item, notation)
+            if np.abs(angles).max(initial=0.0) > 2 * np.pi:
+                return None
             changed = _with_rotations(item, lambda _: angles_to_matrix(angles, notation))
             return changed and changed.with_euler_angles(notation, angles)
         vectors = se3.log3(item.poses[:, :3, :3])
@@ -286,10 +287,7 @@ class OtherNotation:
         """Return the poses with the rotations of the true notation."""
         if not isinstance(item, PoseMeasurement) or not np.isin(item.notations, ("", self.read)).all():
             return None
-        rotations = item.poses[:, :3, :3]
-        computed = se3.log3(rotations) if self.read == _ROTVEC else matrix_to_angles(rotations, self.read)
-        # Only the angles of the file are certain: another triple gives the same rotation as read.
-        numbers = np.where(np.isnan(item.angles), computed, item.angles)
+        numbers = _numbers(item, self.read)
         is_vector = self.true == _ROTVEC
         changed = _with_rotations(
             item, lambda _: se3.exp3(numbers) if is_vector else angles_to_matrix(numbers, self.true)
@@ -297,6 +295,16 @@ class OtherNotation:
         if changed is None or _notations([item]) == {""}:
             return changed
         return changed.with_euler_angles("" if is_vector else self.true, numbers)
+
+
+def _numbers(item: PoseMeasurement, notation: str) -> Array:
+    """Return the numbers (m, 3) of rotations in a notation; angles of the file where they are known.
+
+    Other angles can give the same rotation in this notation, and another one in the true notation.
+    """
+    rotations = item.poses[:, :3, :3]
+    computed = se3.log3(rotations) if notation == _ROTVEC else matrix_to_angles(rotations, notation)
+    return np.where(np.isnan(item.angles), computed, item.angles)
 
 
 def _notations(data: Sequence[Measurement]) -> set[str]:
