@@ -130,7 +130,9 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
     """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
+    from ..io.measurement_files.fitted_rows import fitted_row_digests
     from ..io.robot import urdf_files
+    from ..io.sidecar import Fitted
     from ..report.provenance import file_digests
     from ..robot import urdf_edit
 
@@ -163,7 +165,7 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
         fit.measured_region,
         edit,
         fit.rig,
-        list(file_digests(options["data"]).values()),
+        Fitted(list(file_digests(options["data"]).values()), fitted_row_digests(fit.data)),
     )
     if options["camera_files"]:
         from ..io.camera_files import camera_files  # lazy import: only for cameras

@@ -19,6 +19,7 @@ from .. import se3
 from .._typing import Array, PathLike
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
+from ..measurements.base import Measurement
 from ..measurements.measured_region import MeasuredRegion
 from ..measurements.mounting import MountedRig
 from ..messages import escape_control_characters, quote
@@ -33,11 +34,12 @@ from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
 from .makers.staubli_arm import correct_staubli_arm
 from .makers.ur_kinematics import convert_to_ur_kinematics, read_ur_kinematics
+from .measurement_files.fitted_rows import fitted_row_digests
 from .origins_file import convert_to_origins, joint_origins, without_negligible_moves
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import existing_sidecar, sidecar_path, sidecar_text, with_sidecar
+from .sidecar import Fitted, existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -310,7 +312,7 @@ def urdf_files(
     measured_region: MeasuredRegion | None = None,
     edit: Callable[[bytes], bytes] = lambda data: data,
     rig: MountedRig | None = None,
-    fitted: Sequence[str] = (),
+    fitted: Fitted | None = None,
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
@@ -422,6 +424,11 @@ class CalibratedRobot(Protocol):
         """Cameras and boards with their estimated poses and lenses."""
         ...
 
+    @property
+    def data(self) -> Sequence[Measurement]:
+        """Fitted measurements."""
+        ...
+
 
 def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False) -> None:
     """Write a calibrated URDF and its sidecar.
@@ -458,5 +465,6 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False
             fit.uncertainty,
             fit.measured_region,
             rig=fit.rig,
+            fitted=Fitted(rows=fitted_row_digests(fit.data)),
         )
     write_files(contents)

@@ -64,6 +64,7 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     urdf_sha256 = "..."                # hash of the URDF that this file was written with
     joints_sha256 = "..."              # hash of its joints from the root to the tip
     fitted_sha256 = ["..."]            # hashes of the measurement files that were fitted
+    fitted_rows = "..."                # digests of the fitted rows in base64, see `fitted_rows`
 
     [measured]                         # `measurements.MeasuredRegion`
     joints = ["elbow_joint"]
@@ -89,7 +90,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -165,6 +166,7 @@ _MANIFEST_KEYS = {
     "urdf_sha256": toml.text(),
     "joints_sha256": toml.text(default=""),
     "fitted_sha256": replace(_NAMES, default=()),
+    "fitted_rows": replace(_BASE64, default=""),
 }
 # Keys of the families of joint errors.
 _GAIN, _HARMONICS, _COUPLING = (FAMILIES[name].sidecar_key for name in (GAIN, HARMONICS, COUPLING))
@@ -356,10 +358,18 @@ def _with_additions(chain: Chain, additions: Mapping[str, Array], where: str) ->
     return chain.with_added_origins(additions)
 
 
-def read_fitted_digests(path: PathLike) -> frozenset[str]:
-    """Read the SHA-256 of the measurement files that the calibration of a sidecar fitted."""
+class Fitted(NamedTuple):
+    """What identifies measurements that were fitted."""
+
+    files: Sequence[str] = ()  # SHA-256 of the measurement files
+    rows: bytes = b""  # Digests of the rows, see `fitted_rows`; empty if they are not known
+
+
+def read_fitted(path: PathLike) -> Fitted:
+    """Read what identifies the measurements that the calibration of a sidecar fitted."""
     manifest = read_toml(path, MAX_SIDECAR_BYTES).get("manifest", {})
-    return frozenset(manifest.get("fitted_sha256", ()))
+    rows = _decode(manifest.get("fitted_rows", ""), f"{os.fspath(path)}: [manifest] fitted_rows")
+    return Fitted(manifest.get("fitted_sha256", ()), rows)
 
 
 def read_tool(path: PathLike) -> Array:
@@ -386,11 +396,12 @@ def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str
         )
 
 
-def _manifest_content(data: bytes, tip: str, fitted: Sequence[str]) -> dict[str, Any]:
+def _manifest_content(data: bytes, tip: str, fitted: Fitted) -> dict[str, Any]:
     """Return the table [manifest] for a URDF that is written with the sidecar."""
     urdf = parse_urdf(data, "")
     content = {"urdf_sha256": hashlib.sha256(data).hexdigest(), "joints_sha256": _joints_digest(urdf, tip)}
-    return content | ({"fitted_sha256": list(fitted)} if fitted else {})
+    content |= {"fitted_sha256": list(fitted.files)} if fitted.files else {}
+    return content | ({"fitted_rows": _encode(fitted.rows)} if fitted.rows else {})
 
 
 def _joints_digest(urdf: Urdf, tip: str) -> str:
@@ -677,7 +688,7 @@ def sidecar_text(
     measured_region: MeasuredRegion | None = None,
     rig: MountedRig | None = None,
     additions: Mapping[str, Array] | None = None,
-    fitted: Sequence[str] = (),
+    fitted: Fitted | None = None,
     *,
     required: bool = False,
 ) -> str | None:
@@ -703,7 +714,12 @@ def sidecar_text(
     header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
     header += _MEASURED_HEADER if "measured" in tables else ""
     frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
-    content = {"tip": chain.tip, **frames, "manifest": _manifest_content(urdf, chain.tip, fitted), **tables}
+    content = {
+        "tip": chain.tip,
+        **frames,
+        "manifest": _manifest_content(urdf, chain.tip, fitted or Fitted()),
+        **tables,
+    }
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
     return header + _HARMONIC_LINES.sub(r"    [\1, \2, \3]", _toml_text(content))
 

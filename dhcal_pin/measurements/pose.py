@@ -51,14 +51,22 @@ class PoseMeasurement(Measurement):
         poses: Measured homogeneous matrices, (m, 4, 4).
         sigma: Standard deviations of the position, (m, 3) [m].
         rotation_sigma: Standard deviations of the rotation vector, (m, 3) [rad].
+        notations: Notation of the Euler angles that each rotation was read from, (m,), see `euler_angles`;
+            empty texts for rotations that were not read from Euler angles.
+        angles: These angles, (m, 3) [rad]; NaN if they are not known.
     """
 
     poses: Array
     sigma: Array
     rotation_sigma: Array
+    notations: Array
+    angles: Array
 
     residual_groups: ClassVar = {"position": POSITION, "orientation": ORIENTATION}
-    sample_fields = (*Measurement.sample_fields, "poses", "sigma", "rotation_sigma")
+    sample_fields = (
+        *Measurement.sample_fields,
+        *("poses", "sigma", "rotation_sigma", "notations", "angles"),
+    )
 
     def __init__(
         self, q: Array, poses: ArrayLike, sigma: ArrayLike | None, rotation_sigma: ArrayLike | None
@@ -78,9 +86,24 @@ class PoseMeasurement(Measurement):
             rotation_sigma=validated_sigma(
                 rotation_sigma if is_stated else ANGLE_SIGMA, (m, 3), f"{kind}: rotation_sigma"
             ),
+            notations=np.full(m, "", object),
+            angles=np.full((m, 3), np.nan),
             has_stated_sigma=is_stated,
             instrument_parameters=(),
         )
+
+    def with_euler_angles(self, notation: str, angles: Array) -> Self:
+        """Return the same rotations with the Euler angles that they were read from.
+
+        Args:
+            notation: Axes such as "zyx", with "fixed-" before axes that do not rotate, or "rpy"; empty if the
+                rotations were not read from Euler angles.
+            angles: Angles in the order of the axes, (m, 3) [rad].
+
+        Returns:
+            Copy that knows the angles. Poses stay as they are.
+        """
+        return self.replace(notations=np.full(len(angles), notation, object), angles=angles)
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""

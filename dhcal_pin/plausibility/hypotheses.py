@@ -24,6 +24,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement
+from ..measurements.euler_angles import EULER_NOTATIONS, angles_to_matrix, matrix_to_angles
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
@@ -185,6 +186,16 @@ class AxisChange:
     sources: tuple[int, int, int]  # Column that holds each axis
     signs: tuple[int, int, int]  # 1 or -1 for each axis
 
+    @property
+    def is_right_handed(self) -> bool:
+        """Whether the change is a rotation of the frame."""
+        return bool(np.linalg.det(np.eye(3)[list(self.sources)]) * np.prod(self.signs) > 0)
+
+    @property
+    def is_turn(self) -> bool:
+        """Whether the change is a rotation other than another order of the columns."""
+        return self.is_right_handed and min(self.signs) < 0
+
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements with changed positions."""
         if not isinstance(item, Pose | Position | MultiTargetPosition):
@@ -199,7 +210,7 @@ class MirroredPoses:
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the sign of z changed."""
         mirror = np.diag([1.0, 1.0, -1.0, 1.0])
-        return item.replace(poses=mirror @ item.poses @ mirror) if isinstance(item, Pose) else None
+        return _with_poses(item, mirror @ item.poses @ mirror) if isinstance(item, Pose) else None
 
 
 @dataclass(frozen=True)
@@ -210,6 +221,8 @@ class QuaternionOrder:
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the rotations of the reordered quaternions."""
+        if _notations([item]) != {""}:
+            return None
         # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
         step = 1 if self.order == "xyzw" else -1
         return _with_rotations(
@@ -223,7 +236,7 @@ class InversePose:
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the inverse poses."""
-        return item.replace(poses=se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
+        return _with_poses(item, se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
 
 
 @dataclass(frozen=True)
@@ -237,65 +250,66 @@ class InverseRotation:
 
 @dataclass(frozen=True)
 class RotationUnit:
-    """Rotation vectors in radians that were read as degrees."""
+    """Rotation vectors or Euler angles in radians that were read as degrees."""
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the poses with rotation vectors in radians."""
-        if not isinstance(item, PoseMeasurement):
+        """Return the poses with the numbers in radians."""
+        if not isinstance(item, PoseMeasurement) or len(notations := _notations([item])) != 1:
             return None
+        if notation := notations.pop():
+            angles = ANGLES["deg"] * _numbers(item, notation)
+            if np.abs(angles).max(initial=0.0) > 2 * np.pi:
+                return None
+            changed = _with_rotations(item, lambda _: angles_to_matrix(angles, notation))
+            return changed and changed.with_euler_angles(notation, angles)
         vectors = se3.log3(item.poses[:, :3, :3])
         if np.linalg.norm(vectors, axis=1).max(initial=0.0) > _MAX_SMALL_ROTATION:
             return None
         return _with_rotations(item, lambda _: se3.exp3(ANGLES["deg"] * vectors))
 
 
-# Notations of a rotation by three numbers a, b, c.
-NOTATIONS: dict[str, str] = {
-    "rotvec": "rotation vectors",
-    "xyz": "Euler angles X, Y', Z''",
-    "zyx": "Euler angles Z, Y', X''",
-    "rpy": "roll, pitch and yaw about fixed axes",
-}
+# Key and description of rotation vectors as a notation of a rotation by three numbers.
+_ROTVEC = "rotvec"
+# Notations of a rotation by three numbers.
+_NOTATIONS: dict[str, str] = {_ROTVEC: "rotation vectors", **EULER_NOTATIONS}
+# Notations that are tried both ways if a file does not have Euler angles: others made its rotations of them.
+_USUAL_NOTATIONS = (_ROTVEC, "xyz", "zyx", "rpy", "zyz")
 
 
 @dataclass(frozen=True)
 class OtherNotation:
     """Rotations by three numbers of one notation that were read in another one."""
 
-    read: str  # Keys of `NOTATIONS`
+    read: str  # Keys of `_NOTATIONS`
     true: str
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the rotations of the true notation."""
-        return _with_rotations(
-            item, lambda rotations: _numbers_to_matrix(_matrix_to_numbers(rotations, self.read), self.true)
+        if not isinstance(item, PoseMeasurement) or not np.isin(item.notations, ("", self.read)).all():
+            return None
+        numbers = _numbers(item, self.read)
+        is_vector = self.true == _ROTVEC
+        changed = _with_rotations(
+            item, lambda _: se3.exp3(numbers) if is_vector else angles_to_matrix(numbers, self.true)
         )
+        if changed is None or _notations([item]) == {""}:
+            return changed
+        return changed.with_euler_angles("" if is_vector else self.true, numbers)
 
 
-def _numbers_to_matrix(numbers: Array, notation: str) -> Array:
-    """Convert three numbers of a notation, (m, 3), to rotations (m, 3, 3)."""
-    if notation == "rotvec":
-        return se3.exp3(numbers)
-    x, y, z = (se3.exp3(numbers[:, [i]] * np.eye(3)["xyz".index(axis)]) for i, axis in _columns(notation))
-    return x @ y @ z if notation == "xyz" else z @ y @ x
+def _numbers(item: PoseMeasurement, notation: str) -> Array:
+    """Return the numbers (m, 3) of rotations in a notation; angles of the file where they are known.
+
+    Other angles can give the same rotation in this notation, and another one in the true notation.
+    """
+    rotations = item.poses[:, :3, :3]
+    computed = se3.log3(rotations) if notation == _ROTVEC else matrix_to_angles(rotations, notation)
+    return np.where(np.isnan(item.angles), computed, item.angles)
 
 
-def _matrix_to_numbers(rotations: Array, notation: str) -> Array:
-    """Convert rotations (m, 3, 3) to three numbers of a notation, (m, 3)."""
-    if notation == "rotvec":
-        return se3.log3(rotations)
-    r = np.swapaxes(rotations, 1, 2) if notation == "xyz" else rotations
-    # Angles of r = Rz·Ry·Rx; the transposed matrix has the other order and the other signs.
-    y = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 0, 0], r[:, 1, 0]))
-    angles = {"x": np.arctan2(r[:, 2, 1], r[:, 2, 2]), "y": y, "z": np.arctan2(r[:, 1, 0], r[:, 0, 0])}
-    sign = -1 if notation == "xyz" else 1
-    return sign * np.stack([angles[axis] for axis in ("zyx" if notation == "zyx" else "xyz")], -1)
-
-
-def _columns(notation: str) -> list[tuple[int, str]]:
-    """Return the column of the angle about each axis, in the order x, y, z."""
-    order = "zyx" if notation == "zyx" else "xyz"
-    return [(order.index(axis), axis) for axis in "xyz"]
+def _notations(data: Sequence[Measurement]) -> set[str]:
+    """Return the notations of rotations that were read from Euler angles, and "" for other rotations."""
+    return {text for item in data if isinstance(item, PoseMeasurement) for text in set(item.notations)}
 
 
 def _with_positions(item: Measurement, positions: Array) -> Measurement:
@@ -307,13 +321,18 @@ def _with_positions(item: Measurement, positions: Array) -> Measurement:
     return item.replace(values=positions)
 
 
-def _with_rotations(item: Measurement, change: Callable[[Array], Array]) -> Measurement | None:
+def _with_rotations(item: Measurement, change: Callable[[Array], Array]) -> PoseMeasurement | None:
     """Return poses whose rotations (m, 3, 3) are changed by a function."""
     if not isinstance(item, PoseMeasurement):
         return None
     poses = item.poses.copy()
     poses[:, :3, :3] = change(item.poses[:, :3, :3])
-    return item.replace(poses=poses)
+    return _with_poses(item, poses)
+
+
+def _with_poses(item: PoseMeasurement, poses: Array) -> PoseMeasurement:
+    """Return measurements with other poses (m, 4, 4), whose Euler angles are not known."""
+    return item.replace(poses=poses, angles=np.full_like(item.angles, np.nan))
 
 
 def _matrix_to_quaternion(rotations: Array) -> Array:
@@ -388,14 +407,17 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
     """List the hypotheses about measurements of a robot, the simpler ones first."""
     yield from _joint_hypotheses(chain)
     yield from _order_hypotheses(chain)
-    yield from _unit_hypotheses(chain)
+    yield from _unit_hypotheses(chain, data)
     yield from _axis_unit_hypotheses(data)
     for step, side in ((1, "above"), (-1, "below")):
         yield Hypothesis(
             f"rows:{side}", f"each row holds the joint values of the row {side}", RowShift(-step)
         )
     if any(isinstance(item, Pose) for item in data):
+        # The notation of angles is mistaken more often than a frame that turns with it.
+        yield from _rotation_hypotheses(data)
         yield from _pose_hypotheses()
+        yield from _turn_hypotheses()
     else:
         # Positions alone are the same in all left-handed frames, up to a rotation of the base.
         yield Hypothesis("axes:x,y,-z", "the measuring frame is mirrored", AxisChange((0, 1, 2), (1, 1, -1)))
@@ -477,8 +499,8 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         yield Hypothesis(key, f"the joint columns are {text}", JointChange.of(n, sources=sources))
 
 
-def _unit_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
-    """Yield wrong units of joints, lengths and rotation vectors."""
+def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
+    """Yield wrong units of joints, lengths, and rotation vectors or Euler angles."""
     n, revolute = chain.n_joints, [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
     for members, large, small, factor in (
         (revolute, "deg", "rad", ANGLES["deg"]),
@@ -496,7 +518,8 @@ def _unit_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
     for true, read in permutations(("m", "mm", "in"), 2):
         text = f"measured lengths are in {true}, but were read as {read}"
         yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(LENGTHS[read] / LENGTHS[true]))
-    text = "measured rotation vectors are in rad, but were read as deg"
+    numbers = "Euler angles" if all(_notations(data) or [""]) else "rotation vectors"
+    text = f"measured {numbers} are in rad, but were read as deg"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
 
 
@@ -512,7 +535,7 @@ def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
 
 
 def _pose_hypotheses() -> Iterator[Hypothesis]:
-    """Yield other axes of the positions beside the rotations, and other notations of the rotations."""
+    """Yield other axes of the positions beside the rotations."""
     for i, axis in enumerate("xyz"):
         x, y, z = (-1 if j == i else 1 for j in range(3))
         yield _axis_hypothesis((0, 1, 2), (x, y, z), f"the sign of measured {axis} is wrong")
@@ -526,17 +549,46 @@ def _pose_hypotheses() -> Iterator[Hypothesis]:
         ((2, 0, 1), "measured x, y and z are shifted by one column"),
     ):
         yield _axis_hypothesis(sources, (1, 1, 1), text)
-    for order in QUATERNION_ORDERS:
-        text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
-        yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
-    for read, true in permutations(NOTATIONS, 2):
-        text = f"the rotations are {NOTATIONS[true]}, but were read as {NOTATIONS[read]}"
+
+
+def _rotation_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
+    """Yield other notations of the rotations, from that which they were read in, if it is known."""
+    notations = _notations(data)
+    known = sorted(notations - {""})
+    pairs = [(read, true) for read in known for true in _NOTATIONS if true != read]
+    if "" in notations:
+        for order in QUATERNION_ORDERS:
+            text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
+            yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
+        pairs += permutations(_USUAL_NOTATIONS, 2)
+    for read, true in dict.fromkeys(pairs):
+        verb = "read" if read in known else "taken"
+        text = f"the rotations are {_NOTATIONS[true]}, but were {verb} as {_NOTATIONS[read]}"
         yield Hypothesis(f"rotations:{true}-not-{read}", text, OtherNotation(read, true))
+
+
+def _turn_hypotheses() -> Iterator[Hypothesis]:
+    """Yield frames of the positions that are turned against that of the rotations.
+
+    Such a turn has the same effect as some orders of Euler angles, and as two mistakes about the axes.
+    """
+    for (x, y, z), (i, j, k) in product(permutations(range(3)), product((1, -1), repeat=3)):
+        sources, signs = (x, y, z), (i, j, k)
+        if AxisChange(sources, signs).is_turn:
+            axes = _axes_text(sources, signs, ", ")
+            text = f"the frame of the positions is turned: their {axes} are x, y, z of the rotations"
+            yield _axis_hypothesis(sources, signs, text)
 
 
 def _axis_hypothesis(
     sources: tuple[int, int, int], signs: tuple[int, int, int], description: str
 ) -> Hypothesis:
     """Return a hypothesis about the axes of measured positions; its key lists the true x, y and z."""
-    axes = ("-" * (sign < 0) + "xyz"[source] for source, sign in zip(sources, signs, strict=True))
-    return Hypothesis(f"axes:{','.join(axes)}", description, AxisChange(sources, signs))
+    return Hypothesis(f"axes:{_axes_text(sources, signs, ',')}", description, AxisChange(sources, signs))
+
+
+def _axes_text(sources: Sequence[int], signs: Sequence[int], separator: str) -> str:
+    """Return axes with their signs, such as y,-x,z."""
+    return separator.join(
+        "-" * (sign < 0) + "xyz"[source] for source, sign in zip(sources, signs, strict=True)
+    )

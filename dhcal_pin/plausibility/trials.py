@@ -14,7 +14,17 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
-from .hypotheses import AxisScale, Hypothesis, JointChange, OtherNotation, RowShift, both, list_hypotheses
+from .hypotheses import (
+    AxisChange,
+    AxisScale,
+    Change,
+    Hypothesis,
+    JointChange,
+    OtherNotation,
+    RowShift,
+    both,
+    list_hypotheses,
+)
 from .misfit import MAX_MISFIT, nominal_misfits
 
 # Logarithm of the ratio of evidence above which a hypothesis is decisive. Honest data reach 4.
@@ -110,11 +120,14 @@ def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candida
     """Yield pairs of mistakes, in one order if the order does not matter.
 
     Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
-    are listed if the coordinates as they were read suggest them. Rotations have one notation.
+    are listed if the coordinates as they were read suggest them. Rotations have one notation. Two changes of
+    axes that are a turn of the frame together are a single hypothesis, and a turn beside another mistake is
+    rare.
     """
     shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
     joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
     values = [each for each in singles if not isinstance(each.hypothesis.change, RowShift | JointChange)]
+    values = [each for each in values if not _is_turn(each.hypothesis.change)]
     yield from product(shifts, [*joints, *values])
     moved = [change.joints for each in joints if isinstance(change := each.hypothesis.change, JointChange)]
     for i, j in permutations(range(len(joints)), 2):
@@ -122,9 +135,21 @@ def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candida
             yield joints[i], joints[j]
     yield from product(joints, values)
     for first, second in permutations(values, 2):
-        changes = first.hypothesis.change, second.hypothesis.change
-        if not isinstance(changes[1], AxisScale) and not all(isinstance(c, OtherNotation) for c in changes):
+        if not isinstance(second.hypothesis.change, AxisScale) and not _are_one(first, second):
             yield first, second
+
+
+def _is_turn(change: Change) -> bool:
+    """Return whether a change turns the frame of the positions."""
+    return isinstance(change, AxisChange) and change.is_turn
+
+
+def _are_one(first: _Candidate, second: _Candidate) -> bool:
+    """Return whether two changes of measured values are a single one."""
+    one, other = first.hypothesis.change, second.hypothesis.change
+    if isinstance(one, AxisChange) and isinstance(other, AxisChange):
+        return one.is_right_handed == other.is_right_handed
+    return isinstance(one, OtherNotation) and isinstance(other, OtherNotation)
 
 
 def _then(first: _Candidate, second: _Candidate) -> _Change:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -155,12 +156,54 @@ def test_a_robot_without_a_measured_region_has_none(run, robot_folder):
 def test_a_file_that_was_fitted_is_named(run, robot_folder):
     assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf")[0] in (0, 3)
     assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", "--force")[0] == 0
+    sidecar = Path("out.calibration.toml")
+    sidecar.write_text(re.sub(r"(?s)fitted_rows = (\W{3}).*?\1\n", "", sidecar.read_text()))
+    assert "fitted_rows" not in sidecar.read_text()
     Path("other.csv").write_text(Path("data.csv").read_text() + "\n")
-    warned = {
-        name: any(
-            "was fitted" in text
-            for text in parse_json(run("validate", "out.urdf", name, "--json", "-")[1])["warnings"]
-        )
-        for name in ("data.csv", "other.csv")
+    warned = "was fitted, all of it or a part, by the calibration"
+    assert [len(fitted_warnings(run, name, warned)) for name in ("data.csv", "other.csv")] == [1, 0]
+
+
+def fitted_warnings(run, name, text):
+    """Return the warnings of a validation with a text."""
+    document = json_of(run("validate", "out.urdf", name, "--json", "-"))
+    return [warning for warning in document["warnings"] if text in warning]
+
+
+def test_rows_that_were_fitted_are_counted_in_any_file(run, robot_folder):
+    """A comment, another order of rows and columns, other units and other digits make no difference."""
+    header, *rows = Path("data.csv").read_text().splitlines()
+    status = run("calibrate", "arm.urdf", "data.csv", "--holdout", "0.25", "-o", "out.urdf", "--force")[0]
+    assert status == 0
+    moved = [row.rpartition(",")[0] + ",0.5" for row in rows[:3]]
+    numbers = np.loadtxt("data.csv", delimiter=",", skiprows=1)[:, ::-1]
+    in_metres = [f"{z / 1e3:.9f},{y},{x},{c},{b},{a}" for z, y, x, c, b, a in numbers[::-1]]
+    joints = header.split(",")[:3]
+    texts = {
+        "copy.csv": ["# renamed", header, *rows],
+        "moved.csv": [header, *moved],
+        "units.csv": [",".join(["z[m]", "y[mm]", "x[mm]", *joints[::-1]]), *in_metres],
     }
-    assert warned == {"data.csv": True, "other.csv": False}
+    for name, lines in texts.items():
+        Path(name).write_text("\n".join(lines) + "\n")
+    found = {name: fitted_warnings(run, name, "fitted") for name in ("data.csv", *texts)}
+    assert {name: len(texts) for name, texts in found.items()} == dict.fromkeys(found, 1) | {"moved.csv": 0}
+    for name in ("data.csv", "copy.csv", "units.csv"):
+        assert f"{name}: 15 of 20 rows were fitted by the calibration of this robot" in found[name][0]
+    # A part of the rows.
+    counts = []
+    for row in rows:
+        Path("one.csv").write_text(f"{header}\n{row}\n")
+        counts.append(len(fitted_warnings(run, "one.csv", "1 of 1 row was fitted")))
+    assert sum(counts) == 15
+
+
+def test_digests_that_are_not_base64_are_refused(run, robot_folder):
+    assert run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", "--force")[0] == 0
+    sidecar = Path("out.calibration.toml")
+    sidecar.write_text(
+        re.sub(r"(?s)fitted_rows = (\W{3}).*?\1\n", 'fitted_rows = "?"\n', sidecar.read_text())
+    )
+    status, _, err = run("validate", "out.urdf", "data.csv")
+    assert status == 2
+    assert "[manifest] fitted_rows is not base64 text" in unfolded(err)

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from measurement_files import frames, joint_positions, real_ur10
 from robots import robot_file
+from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
+from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
 from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.robot import Chain
@@ -121,8 +123,6 @@ def with_positions(data, change):
 
 def read_as(true, read):
     """Return the change of rotations whose Euler angles of one order are read in another one."""
-    from scipy.spatial.transform import Rotation
-
     return lambda r: Rotation.from_euler(read, Rotation.from_matrix(r).as_euler(true)).as_matrix()
 
 
@@ -149,6 +149,74 @@ def test_mixed_up_poses_are_named_and_mended(ur10, mixup, key):
     found = diagnose_mixups(ur10, [wrong])
     assert key in [hypothesis.key for hypothesis in found.hypotheses]
     np.testing.assert_allclose(mend(ur10, wrong, key).poses, data.poses, atol=1e-9)
+
+
+def with_angles_read_as(data, true, read):
+    """Return poses whose Euler angles of one notation of SciPy were read from a file in another one."""
+    angles = Rotation.from_matrix(data.rotations()).as_euler(true)
+    wrong = with_rotations(data, lambda _: Rotation.from_euler(read, angles).as_matrix())
+    return wrong.with_euler_angles(notation_of(read), angles)
+
+
+def notation_of(name):
+    return euler_notation(name.lower(), "intrinsic" if name.isupper() else "extrinsic")
+
+
+@pytest.mark.parametrize(
+    ("true", "read", "others"),
+    [
+        # Another first axis of ZYZ angles turns the frame of the rotations.
+        ("ZYZ", "ZXZ", ["axes:y,-x,z"]),
+        ("YZX", "XYZ", ["axes:y,z,x"]),
+        # The second angles of both notations have different ranges.
+        ("ZYZ", "ZYX", []),
+        ("YXZ", "XYX", []),
+        ("xyz", "ZYX", []),
+        ("zyz", "ZYZ", []),
+    ],
+)
+def test_the_notation_of_euler_angles_is_named_as_the_file_was_read(ur10, true, read, others):
+    data = measured(Pose)
+    wrong = with_angles_read_as(data, true, read)
+    key = f"rotations:{notation_of(true)}-not-{notation_of(read)}"
+    found = diagnose_mixups(ur10, [wrong])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == [key, *others]
+    mended = mend(ur10, wrong, key)
+    np.testing.assert_allclose(mended.poses, data.poses, atol=1e-9)
+    assert not diagnose_mixups(ur10, [mended]).is_suspicious
+    keys = [each.key for each in list_hypotheses(ur10, [wrong])]
+    assert not [each for each in keys if each.startswith("quaternions")]
+    others = [each for each in keys if each.startswith("rotations:") and "-not-" in each]
+    assert {each.partition("-not-")[2] for each in others} == {"deg", notation_of(read)}
+
+
+def test_euler_angles_in_radians_that_were_read_as_degrees_are_named(ur10):
+    data = measured(Pose)
+    angles = Rotation.from_matrix(data.rotations()).as_euler("ZYX")
+    small = np.deg2rad(angles)
+    wrong = with_rotations(data, lambda _: Rotation.from_euler("ZYX", small).as_matrix())
+    wrong = wrong.with_euler_angles("zyx", small)
+    found = diagnose_mixups(ur10, [wrong])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["rotations:rad-not-deg"]
+    assert "Euler angles are in rad" in found.sentence
+    np.testing.assert_allclose(mend(ur10, wrong, "rotations:rad-not-deg").poses, data.poses, atol=1e-9)
+
+
+def test_a_turn_of_the_frame_is_one_mistake_and_not_two_about_the_axes(ur10):
+    """Rotations from elsewhere, whose notation is not known."""
+    wrong = with_rotations(measured(Pose), read_as("ZYZ", "ZXZ"))
+    found = diagnose_mixups(ur10, [wrong])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["axes:y,-x,z"]
+    assert found.sentence.startswith(
+        "The frame of the positions is turned: their y, -x, z are x, y, z of the"
+    )
+    assert not diagnose_mixups(ur10, [mend(ur10, wrong, "axes:y,-x,z")]).is_suspicious
+
+
+def test_a_notation_and_a_sign_are_named(ur10):
+    wrong = mend(ur10, with_angles_read_as(measured(Pose), "ZYZ", "ZYX"), "sign:elbow_joint")
+    (found,) = diagnose_mixups(ur10, [wrong]).hypotheses
+    assert found.key == "sign:elbow_joint+rotations:zyz-not-zyx"
 
 
 def test_a_sign_and_the_unit_of_one_coordinate_are_named(ur10):

@@ -26,14 +26,13 @@ if TYPE_CHECKING:
     from ...estimation.uncertainty import Predictor
     from ...io import MeasurementFile
     from ...io.servo_file import ServoFile
+    from ...io.sidecar import Fitted
     from ...measurements import MeasuredRegion, Measurement, MountedRig
     from ...report.validation import Validation
     from ...robot import Chain
 
 # Warning about a file that the calibration fitted.
-FITTED_WARNING = (
-    "was fitted, all of it or a part, by the calibration of this robot; other measurements have larger errors"
-)
+FITTED_WARNING = "by the calibration of this robot; other measurements have larger errors"
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
 
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
@@ -366,10 +365,10 @@ def _input_warnings(
     from ...diagnostics import FRAMES_WARNING, frames_differ  # lazy import, as the following
     from ...diagnostics.input_checks import find_input_warnings
     from ...diagnostics.reachability import find_unreachable_rows
-    from ...io.sidecar import read_fitted_digests
+    from ...io.sidecar import Fitted, read_fitted
     from ...report.provenance import file_digests
 
-    fitted = read_fitted_digests(sidecar) if sidecar else ()
+    fitted = read_fitted(sidecar) if sidecar else Fitted()
     digests = file_digests(args.data)
     warnings = {}
     for file in given.files:
@@ -377,11 +376,22 @@ def _input_warnings(
         warnings[file.source] = [
             *find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
-            *([FITTED_WARNING] if digests.get(file.source) in fitted else []),
+            *_fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
     if not args.fit_frames and frames_differ(judged.chain, given.data, judged.known):
         warnings[args.robot] = [FRAMES_WARNING]
     return warnings
+
+
+def _fitted_warning(item: Measurement, digest: str, fitted: Fitted) -> list[str]:
+    """Return a warning about a file with rows that the calibration fitted."""
+    from ...io.measurement_files.fitted_rows import count_fitted_rows  # lazy import: loads Pinocchio
+
+    if count := count_fitted_rows(item, fitted.rows):
+        n_rows = len(item.rows)
+        rows = f"row{'' if n_rows == 1 else 's'} {'was' if count == 1 else 'were'}"
+        return [f"{count} of {n_rows} {rows} fitted {FITTED_WARNING}"]
+    return [f"was fitted, all of it or a part, {FITTED_WARNING}"] if digest in fitted.files else []
 
 
 def _predictor(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:

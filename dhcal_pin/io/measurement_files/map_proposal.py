@@ -61,7 +61,7 @@ def propose_map(table: DataTable, chain: Chain) -> list[str]:
         )
         lines.append(f"columns = {{{', '.join(entries)}}}")
     if len(position) == 3:
-        lines += _rotation_line(table, [i for i in others if i > position[-1]], columns)
+        lines += _rotation_line(table, position, [i for i in others if i > position[-1]], columns)
     return lines
 
 
@@ -104,18 +104,25 @@ def _is_axis(header: str, axis: str) -> bool:
     return bool(re.search(rf"(?<![a-z]){axis}(?![a-z])", header)) and not re.search(_NOT_MEASURED, header)
 
 
+# Columns of Kawasaki's angles. Beside other columns than X, Y and Z these letters can mean anything.
+_KAWASAKI = ("o", "a", "t")
 # Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes, W, P, R of FANUC.
 _EULER_NOTATIONS: Mapping[tuple[str, ...], tuple[str, str]] = {
     ("a", "b", "c"): ("ZYX", "intrinsic"),
     ("roll", "pitch", "yaw"): ("XYZ", "extrinsic"),
     ("w", "p", "r"): ("XYZ", "extrinsic"),
+    _KAWASAKI: ("ZYZ", "intrinsic"),
 }
 
 
-def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int, Array]) -> list[str]:
+def _rotation_line(
+    table: DataTable, position: Sequence[int], turns: Sequence[int], columns: Mapping[int, Array]
+) -> list[str]:
     """Return the line of the rotation, if columns for one follow the position."""
     if table.has_numbers_as_header:
         candidates = list(turns)
+    elif _first_words(table, (*position, *turns[:3])) == ("x", "y", "z", *_KAWASAKI):
+        candidates = list(turns[:3])
     else:
         candidates = [i for i in turns if re.search(_ROTATION, table.headers[i].lower())]
         candidates = [i for i in candidates if not re.search(_NOT_MEASURED, table.headers[i].lower())]
@@ -130,12 +137,16 @@ def _rotation_line(table: DataTable, turns: Sequence[int], columns: Mapping[int,
     names = _names(table, candidates[:3])
     if unit == "rad":
         return [f'rotation = {{convention = "rotvec", columns = {names}, unit = "rad"}}']
-    headers = tuple(str(re.split(r"[\s\[(]", table.headers[i].strip().lower())[0]) for i in candidates[:3])
-    axes, frame = _EULER_NOTATIONS.get(headers, ("XYZ", "intrinsic"))
+    axes, frame = _EULER_NOTATIONS.get(_first_words(table, candidates[:3]), ("XYZ", "intrinsic"))
     return [
         f'rotation = {{convention = "euler", axes = "{axes}", frame = "{frame}", columns = {names}, '
         f'unit = "deg"}}'
     ]
+
+
+def _first_words(table: DataTable, indices: Sequence[int]) -> tuple[str, ...]:
+    """Return the headers of columns in lower case without units."""
+    return tuple(str(re.split(r"[\s\[(]", table.headers[i].strip().lower())[0]) for i in indices)
 
 
 def header_problem(table: DataTable, chain: Chain) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError
+from ...measurements.euler_angles import EulerAngles, angles_to_matrix, euler_notation
 from ...units import ANGLES, column_header
 from ..tables import DataTable, TextLayout, read_table
 from ..tables.data_frame import is_data_frame
@@ -84,6 +85,7 @@ def read_mapped_table(
         return read_table(source, native)
     vendor = _VendorTable(read_table(source, column_map.layout), column_map)
     table = vendor.table
+    euler_angles = None
     with table.notes_in_errors():
         if missing := vendor.missing_columns():
             raise FileFormatError(
@@ -95,7 +97,8 @@ def read_mapped_table(
             column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules
         }
         if column_map.rotation:
-            columns |= _rotation_columns(vendor, column_map.rotation)
+            euler_angles = _read_euler_angles(vendor, column_map.rotation)
+            columns |= _rotation_columns(vendor, column_map.rotation, euler_angles)
     for name, text in column_map.constants.items():
         columns[name] = [_fill_placeholders(text, source)] * len(vendor.table.lines)
     table = vendor.table
@@ -108,6 +111,7 @@ def read_mapped_table(
         bad_rows=table.bad_rows,
         description=table.description,
         notes=table.notes,
+        euler_angles=euler_angles,
     )
 
 
@@ -146,7 +150,18 @@ def _apply_rule(vendor: _VendorTable, rule: ColumnRule) -> Array | list[str]:
     return values if (rule.scale, rule.offset) == (1.0, 0.0) else rule.scale * values + rule.offset
 
 
-def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, Array | list[str]]:
+def _read_euler_angles(vendor: _VendorTable, notation: Rotation) -> EulerAngles | None:
+    """Read the Euler angles of a file; None if its rotations are of another convention."""
+    if notation.convention != "euler":
+        return None
+    angles = np.stack([vendor.values(name) for name in notation.columns], -1) / ANGLES[notation.unit]
+    lines = np.array(vendor.table.lines)
+    return EulerAngles(euler_notation(notation.axes, notation.frame), lines, angles)
+
+
+def _rotation_columns(
+    vendor: _VendorTable, notation: Rotation, euler: EulerAngles | None
+) -> dict[str, Array | list[str]]:
     """Return the values (m,) of each column of the project that holds the rotation, by header cell."""
     columns = [vendor.values(name) for name in notation.columns]
     if notation.convention in ("rotvec", "quaternion"):
@@ -154,21 +169,12 @@ def _rotation_columns(vendor: _VendorTable, notation: Rotation) -> dict[str, Arr
         return {
             column_header(name, notation.unit): values for name, values in zip(names, columns, strict=True)
         }
-    values = np.stack(columns, -1)
-    if notation.convention == "euler":
-        rotations = euler_to_matrix(values / ANGLES[notation.unit], notation.axes, notation.frame)
+    if euler is not None:
+        rotations = angles_to_matrix(euler.angles, euler.notation)
     else:
-        rotations = _orthonormalized(values.reshape(-1, 3, 3), vendor.table)
+        rotations = _orthonormalized(np.stack(columns, -1).reshape(-1, 3, 3), vendor.table)
     components = np.ascontiguousarray(se3.log3(rotations).T)
     return {column_header(name, "rad"): column for name, column in zip(ROTVEC, components, strict=True)}
-
-
-def euler_to_matrix(angles: Array, axes: str, frame: str) -> Array:
-    """Convert Euler angles to rotation matrices."""
-    first, second, third = (
-        se3.exp3(angles[:, i, None] * np.eye(3)["xyz".index(axis)]) for i, axis in enumerate(axes)
-    )
-    return first @ second @ third if frame == "intrinsic" else third @ second @ first
 
 
 def _orthonormalized(matrices: Array, table: DataTable) -> Array:

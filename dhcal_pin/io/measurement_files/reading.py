@@ -27,7 +27,7 @@ from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, SampleError
 from ...measurements.base import Measurement
 from ...measurements.mounting import MountedRig
-from ...measurements.pose import Pose
+from ...measurements.pose import Pose, PoseMeasurement
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS, Condition
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
@@ -205,6 +205,10 @@ def _parse_table(
         tips = parse_values(measured, Pose)
         data = data.replace(q=solve_tool_poses(table, chain, tips), has_joint_values=False)
         values |= tips
+    elif table.euler_angles is not None and isinstance(data, PoseMeasurement):
+        euler = table.euler_angles
+        used = np.searchsorted(euler.lines, data.rows)
+        data = data.with_euler_angles(euler.notation, euler.angles[used])
     data = with_conditions(data, table, chain)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from ...exceptions import DhcalError, FileFormatError, UnknownNameError
 from ...messages import quote
 from ...units import MAX_SI_VALUE, UNITS
 from ..tabular import parse_number
+
+if TYPE_CHECKING:
+    from ...measurements.euler_angles import EulerAngles
 
 # Largest number of rows of a table; reading them takes about 10 s and 1 GB.
 MAX_ROWS = 1_000_000
@@ -73,6 +76,7 @@ class DataTable:
     description: str = ""  # How the file is written, such as "semicolons, decimal commas"
     notes: tuple[str, ...] = ()  # Sentences on what was not read, such as further sheets
     units: tuple[str, ...] = ()  # Cells of the row of units under the header; empty if there is none
+    euler_angles: EulerAngles | None = None  # Angles that columns of rotation vectors were computed from
 
     @classmethod
     def from_columns(

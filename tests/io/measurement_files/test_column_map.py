@@ -14,7 +14,7 @@ from dhcal_pin import se3
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurement_file, read_measurements
-from dhcal_pin.io.measurement_files.mapped_table import euler_to_matrix
+from dhcal_pin.measurements.euler_angles import angles_to_matrix, euler_notation, matrix_to_angles
 from dhcal_pin.measurements.pose import Pose, RelativePose
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
@@ -47,10 +47,10 @@ def arm():
 
 @pytest.fixture
 def read(tmp_path, arm):
-    def call(text=FILE, how=MAP, name="theirs.csv"):
+    def call(text=FILE, how=MAP, name="theirs.csv", **options):
         (tmp_path / "map.toml").write_text(how)
         (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-        return read_measurement_file(tmp_path / name, arm, tmp_path / "map.toml")
+        return read_measurement_file(tmp_path / name, arm, tmp_path / "map.toml", **options)
 
     return call
 
@@ -145,7 +145,10 @@ def test_euler_conventions_are_those_of_scipy(frame):
     assert len(every) == 12
     for axes in map("".join, every):
         wanted = Rotation.from_euler(axes.upper() if frame == "intrinsic" else axes, angles).as_matrix()
-        np.testing.assert_allclose(euler_to_matrix(angles, axes, frame), wanted, atol=5e-15)
+        notation = euler_notation(axes, frame)
+        np.testing.assert_allclose(angles_to_matrix(angles, notation), wanted, atol=5e-15)
+        found = angles_to_matrix(matrix_to_angles(wanted, notation), notation)
+        np.testing.assert_allclose(found, wanted, atol=5e-15)
 
 
 @pytest.mark.parametrize(
@@ -184,6 +187,43 @@ def test_rotations_in_every_convention(read, how, columns):
     assert isinstance(data, Pose)
     assert data.has_stated_sigma
     np.testing.assert_allclose(data.rotations(), turns.as_matrix(), atol=5e-15)
+    assert np.isfinite(data.angles).all() == ("euler" in how)
+
+
+def test_euler_angles_are_kept_for_the_rows_that_are_used(read):
+    """They say which other notations the rotations may have, see `plausibility`."""
+    rows = [f"0.1,0.2,0.3,1,2,3,{10 * i},{'' if i == 1 else 20 + i},{-100 - i}" for i in range(5)]
+    how = (
+        'joints = {order = ["a", "b", "c"], unit = "rad"}\n[columns]\n'
+        + "".join(f'{axis} = {{from = "{axis}", unit = "m"}}\n' for axis in "xyz")
+        + '[rotation]\nconvention = "euler"\naxes = "ZYZ"\nframe = "extrinsic"\nunit = "deg"\n'
+        + 'columns = ["O", "A", "T"]\n'
+    )
+    data = read("\n".join(["a,b,c,x,y,z,O,A,T", *rows]), how, skip_bad_rows=True).data.take([0, 2, 3])
+    assert list(data.notations) == ["fixed-zyz"] * 3
+    np.testing.assert_allclose(np.rad2deg(data.angles), [[0, 20, -100], [30, 23, -103], [40, 24, -104]])
+
+
+@pytest.mark.parametrize(
+    ("header", "axes"),
+    [
+        ("A1;A2;A3;X;Y;Z;O;A;T", "ZYZ"),
+        ("A1;A2;A3;X [mm];Y [mm];Z [mm];O [deg];A [deg];T [deg]", "ZYZ"),
+        ("A1;A2;A3;X;Y;Z;A;B;C", "ZYX"),
+        # Only beside X, Y and Z, and only these three.
+        ("A1;A2;A3;U;V;W;O;A;T", ""),
+        ("A1;A2;A3;X;Y;Z;O;T;A", ""),
+    ],
+)
+def test_angles_of_makers_are_proposed_by_their_columns(tmp_path, arm, header, axes):
+    row = "10;20;30;400;500;600;70;80;-90"
+    (tmp_path / "theirs.csv").write_text("\n".join([header, *[row] * 3]))
+    with pytest.raises(DhcalError) as error:
+        read_measurements(tmp_path / "theirs.csv", arm)
+    names = json.dumps(header.split(";")[6:])
+    line = f'axes = "{axes}", frame = "intrinsic", columns = {names}, unit = "deg"'
+    assert (line in str(error.value)) == bool(axes)
+    assert ("rotation =" in str(error.value)) == bool(axes)
 
 
 def test_a_second_configuration_is_read_back(read, arm):

@@ -1,0 +1,41 @@
+"""Digests of fitted rows."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+
+import numpy as np
+from robots import robot_file
+
+from dhcal_pin.io.measurement_files.fitted_rows import MAX_ROWS, count_fitted_rows, fitted_row_digests
+from dhcal_pin.measurements import KINDS, Noise, Position
+from dhcal_pin.robot import Chain
+
+
+def test_a_digest_is_that_of_the_documented_numbers():
+    data = Position([[0.1234564, -2.0], [0.0, 1e-9]], [[1.0, -0.25, 3.0000004], [0.0, 0.0, -0.0]], 1e-4)
+    rows = [(123456, -2000000, 1000000, -250000, 3000000), (0,) * 5]
+    expected = sorted(hashlib.blake2b(struct.pack("<5q", *row), digest_size=5).digest() for row in rows)
+    assert fitted_row_digests([data]) == b"".join(expected)
+
+
+def test_rows_of_every_kind_are_recognized_by_their_values():
+    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    rng = np.random.default_rng(0)
+    for kind in KINDS.values():
+        q = rng.uniform(-1, 1, (12 * max(kind.configurations_per_row, 1), 6))
+        data = kind.simulate(chain, q, Noise(1e-4, 1e-4), rng)
+        m = len(data.rows)
+        digests = fitted_row_digests([data.take(np.arange(m) % 3 > 0)])
+        assert count_fitted_rows(data, digests) == np.sum(np.arange(m) % 3 > 0), kind
+        assert count_fitted_rows(data.with_weights(np.full(m, 0.5)), digests) == np.sum(np.arange(m) % 3 > 0)
+        assert count_fitted_rows(kind.simulate(chain, q, Noise(1e-4, 1e-4), rng), digests) == 0, kind
+        assert count_fitted_rows(data, b"") == 0
+
+
+def test_digests_of_too_many_rows_are_not_kept():
+    rng = np.random.default_rng(0)
+    data = Position(rng.uniform(size=(MAX_ROWS, 3)), rng.uniform(size=(MAX_ROWS, 3)))
+    assert len(fitted_row_digests([data])) == 5 * MAX_ROWS
+    assert fitted_row_digests([data, data.take(np.s_[:1])]) == b""
