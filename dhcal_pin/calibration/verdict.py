@@ -19,12 +19,15 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
-from ..formatting import format_below, format_quantity, join_names
+from ..formatting import capitalized, format_below, format_quantity, join_names
+from ..identifiability import explain_unknown_size
+from ..identifiability.null_space import ObservabilityProbe
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
+from ..se3 import rms_length
 from . import cameras
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence
@@ -147,6 +150,7 @@ def judge(fit: Evidence) -> Verdict:
             *_session(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
+            *_unknown_size(fit),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
             *_regional_errors(fit),
@@ -377,6 +381,20 @@ def _plausible_cause(fit: Evidence) -> str:
         f"{tried}Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation "
         "of rotations."
     )
+
+
+def _unknown_size(fit: Evidence) -> list[Finding]:
+    """Advise caution if the measurements contain no length: residuals do not show errors of positions."""
+    unknown = explain_unknown_size(ObservabilityProbe(fit.problem, fit.x)) if fit.errors.has_arm else None
+    if unknown is None:
+        return []
+    statement, advice = unknown
+    std = rms_length(
+        fit.relative.predict(np.concatenate([item.q for item in fit.data])).position_std[:, None]
+    )
+    size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
+    text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
+    return [Finding("caution", f"{text} {capitalized(advice)}.")]
 
 
 def _held_out_errors(fit: Evidence) -> list[Finding]:
