@@ -11,7 +11,7 @@ The limits separate simulated mistakes from honest measurements of robots with e
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -145,7 +145,8 @@ def judge(fit: Evidence) -> Verdict:
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
         # A cause that explains the errors of images explains the correction, too.
         has_cause = bool(fit.hand_eye and fit.hand_eye.causes)
-        findings += [
+        hidden = _hidden_outliers(fit)
+        found = [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_session(fit),
             *_convergence(fit),
@@ -155,9 +156,15 @@ def judge(fit: Evidence) -> Verdict:
             *_unexplained_holdout(fit),
             *_regional_errors(fit),
             *_few_measurements(fit),
-            *(_hidden_outliers(fit) or _few_judged(fit)),
+            *(hidden or _few_judged(fit)),
             *_outliers(fit),
         ]
+        if any(finding.status == "refused" for finding in found):
+            # Outliers to which the fit adapts explain the others.
+            found = [replace(each, status="refused") for each in hidden] + [
+                f for f in found if f not in hidden
+            ]
+        findings += found
     verdict = Verdict.from_findings(findings)
     return Verdict.from_findings([*_other_loss(fit, verdict), *findings])
 
@@ -469,7 +476,8 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     is_image = bool(fit.camera_stages or fit.hand_eye)
     if is_image or not fit.shrinkage_factor:
         return []
-    is_known = all(item.has_stated_sigma for item in fit.data) and not fit.contradicts_sigma
+    is_stated = all(item.has_stated_sigma for item in fit.data)
+    is_known = is_stated and not fit.contradicts_sigma
     limit = MIN_STATED_ROWS_PER_DIRECTION if is_known else MIN_ROWS_PER_DIRECTION
     if fit.rows_per_direction >= limit:
         is_searched = not is_known and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
@@ -485,9 +493,13 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
         ]
     n_configurations = len(np.unique(configuration_groups(fit.data)))
     needed = int(np.ceil(n_configurations * limit / fit.rows_per_direction))
-    text = f"So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} independent"
-    text += f" values for each unknown that they determine, {limit:g} are needed."
-    return [Finding("caution", f"{text} Measure at least {needed} different poses.")]
+    found = "The residuals contradict the stated standard deviations. " * (is_stated and not is_known)
+    text = (
+        f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
+        f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
+        f"{needed} different poses."
+    )
+    return [Finding("caution", text)]
 
 
 def _few_judged(fit: Evidence) -> list[Finding]:

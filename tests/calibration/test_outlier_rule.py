@@ -230,6 +230,20 @@ def test_twenty_samples_of_stated_noise_are_ok(arm, count):
     assert calibrate(simulation.chain, stated(wrong), extend="none").verdict.status == "caution"
 
 
+def test_few_samples_are_the_first_reason_of_a_correction_that_is_too_large():
+    """The fit adapts to two wrong samples of twelve: nothing is wrong with the robot."""
+    simulation = Simulation("ur10", 12, 950)
+    data = simulation.measure(Position)
+    wrong = shifted(data, [2, 9], [[0.0, 0.08, 0.04], [-0.06, 0.0, 0.08]])
+    fit = calibrate(simulation.chain, stated(wrong), extend="none")
+    assert fit.contradicts_sigma
+    assert fit.verdict.status == "refused"
+    first, second = fit.verdict.reasons[:2]
+    assert first.startswith("The residuals contradict the stated standard deviations. So few samples")
+    assert second.startswith("The correction moves")
+    assert "Check the robot" in second
+
+
 def test_a_figure_that_is_not_reliable_is_not_ok():
     """Nine poses with stated noise have enough redundancy, but too few to judge the accuracy."""
     simulation = Simulation("ur10", 9, 901)
