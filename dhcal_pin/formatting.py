@@ -6,6 +6,7 @@ decimals are shown (rounding rule of the Particle Data Group).
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -95,6 +96,15 @@ def format_quantity(value: float, unit: str, std: float, small: bool = False) ->
         return f"{value:.3g} {unit}".removesuffix(" 1")
     factor, name = (SMALL_UNITS if small else UNITS)[unit]
     return f"{format_fixed(factor * value, significant_decimals(factor * std))}{name}"
+
+
+def format_below(value: float, limit: float) -> str:
+    """Format a value below a limit with as few decimals as show that it is below.
+
+    >>> format_below(1.93, 2.7), format_below(2.67, 2.7)
+    ('1.9', '2.67')
+    """
+    return next(text for decimals in itertools.count(1) if float(text := f"{value:.{decimals}f}") < limit)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from dhcal_pin.formatting import Quantity, Table, escape_markdown, format_quantity, html_table, markdown_table
+from dhcal_pin.formatting import (
+    Quantity,
+    Table,
+    escape_markdown,
+    format_below,
+    format_quantity,
+    html_table,
+    markdown_table,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +35,13 @@ from dhcal_pin.formatting import Quantity, Table, escape_markdown, format_quanti
 )
 def test_quantities_are_rounded_to_their_standard_deviation(value, std, text):
     assert format_quantity(value, "m", std) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1.935, "1.9"), (72 / 27, "2.67"), (2.6999, "2.6999"), (2.3, "2.3")]
+)
+def test_values_below_a_limit_are_shown_below_it(value, text):
+    assert format_below(value, 2.7) == text
 
 
 def test_rates_and_pure_numbers():

@@ -317,7 +317,7 @@ class Explainer:
     def _explain_angles(self, group: UnobservableGroup) -> str:
         """Explain why measured angles do not depend on a group; empty if lengths are measured, too."""
         data = self.probe.problem.data
-        if any(each.unit != "rad" for item in data for each in item.residual_groups.values()):
+        if not self.probe.measures_angles_only:
             return ""
         _, motions = self._tool_motions(group)
         turns = np.concatenate(motions[:, 3:], 1)
@@ -472,10 +472,15 @@ def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
     explainer = Explainer(probe, dict(layers), names, plain_errors)
     groups = _merge_groups(group_directions(layers, plain_errors.error_frames))
     sentences = [explainer.sentence(group) for group in groups]
-    if probe.is_scale_unobservable(r) and not any(SCALE_UNKNOWN in text for text in sentences):
+    if probe.is_scale_unobservable and not any(SCALE_UNKNOWN in text for text in sentences):
         text = f"all lengths together: {SCALE_UNKNOWN}, only the priors do; {_size_advice(problem)}"
         sentences.insert(0, text)
     return sentences
+
+
+def explain_unknown_size(probe: ObservabilityProbe) -> tuple[str, str] | None:
+    """State that the size of the robot is not determined, and what to measure; None if it is."""
+    return (SCALE_UNKNOWN, _size_advice(probe.problem)) if probe.is_scale_unobservable else None
 
 
 def _size_advice(problem: Problem) -> str:

@@ -31,6 +31,7 @@ from .. import se3
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.scale_gauge import ScaleGauge
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
 from ..measurements.position import Position
@@ -154,12 +155,26 @@ class ObservabilityProbe:
             return []
         return np.flatnonzero(np.ptp(np.concatenate(q), axis=0) < _MIN_JOINT_RANGE).tolist()
 
-    def is_scale_unobservable(self, r: Array) -> bool:
-        """Decide whether a direction of the null space changes the size of the robot."""
-        if self.problem.scale_gauge is None:
+    @property
+    def measures_angles_only(self) -> bool:
+        """Whether all residuals are angles."""
+        return all(
+            group.unit == "rad" for item in self.problem.data for group in item.residual_groups.values()
+        )
+
+    @cached_property
+    def is_scale_unobservable(self) -> bool:
+        """Whether a direction of the null space changes the size of the robot, as no length is measured."""
+        problem, gauge = self.problem, self.problem.scale_gauge
+        if self.measures_angles_only:
+            q = np.concatenate([item.q for item in problem.data])
+            gauge = ScaleGauge.from_configurations(problem.errors.chain, q)
+        if gauge is None:
             return False
-        n_robot = len(self.problem.errors.parameters)
-        growth = self.problem.scale_gauge.rates(*self.problem.errors.derivative(self.x[:n_robot]))[:, 0]
+        n_robot = len(problem.errors.parameters)
+        growth = gauge.rates(*problem.errors.derivative(self.x[:n_robot]))[:, 0]
+        # Even a small last step rotates the null space, so take the Jacobian at x.
+        r = linearize_and_factor(problem, self.x, small_angle=False).r
         return bool(np.abs(growth @ qr.null_space(r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
 
     def null_space_layers(self, r: Array) -> list[tuple[Cause, Array]]:

@@ -67,6 +67,16 @@ def test_the_cause_of_a_fault_is_named(name, fault, seed, is_on_wrist):
     check_cause(hand_eye(name, fault, seed, is_on_wrist, n_images=20, spread=spread), fault)
 
 
+@pytest.mark.parametrize("sets", [None, "camera,board"])
+def test_the_arm_is_proposed_only_if_it_was_not_estimated(sets):
+    """Eight images are too few to decide whether the arm is wrong."""
+    fit = hand_eye("panda", "offsets", 22, False, sets, n_images=8)
+    check_cause(fit, "offsets")
+    (reason,) = fit.verdict.reasons
+    assert ("Estimate the arm, too, without --parameters." in reason) == (sets is not None)
+    assert ("estimated the arm, too: the images do not decide that." in reason) == (sets is None)
+
+
 def test_rejected_corners_do_not_hide_a_bent_board():
     """The corners at the ends of the board disagree with the majority; they are right."""
     fit = hand_eye("panda", "warped", 11, True, loss="auto", n_images=20)

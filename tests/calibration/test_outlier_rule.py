@@ -14,7 +14,7 @@ from slow_cases import some_slow
 from dhcal_pin import calibrate
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.calibration.summary import headline
-from dhcal_pin.calibration.verdict import MIN_ROWS_PER_DIRECTION, STATUSES
+from dhcal_pin.calibration.verdict import MIN_ROWS_PER_DIRECTION, MIN_STATED_ROWS_PER_DIRECTION, STATUSES
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.robust import LOSSES
 from dhcal_pin.measurements import Pose, Position
@@ -196,6 +196,66 @@ def test_repeated_samples_do_not_show_outliers_but_stated_noise_does():
     assert calibrate(simulation.chain, stated, extend="none").verdict.status == "ok"
     wrong = Position(data.q, shifted(data, [2, 9], [0.0, 2e-3, 0.0]).positions(), 5e-5)
     assert calibrate(simulation.chain, wrong, extend="none").verdict.status == "caution"
+
+
+def stated(data):
+    """Return positions with their standard deviations."""
+    return Position(data.q, data.positions(), 5e-5)
+
+
+@pytest.mark.parametrize(
+    ("arm", "count", "values"),
+    some_slow([("ur10", 8, "1.0"), ("ur10", 12, "1.3"), ("panda", 14, "1.4"), ("panda", 10, "1.0")], {0, 1}),
+)
+def test_stated_noise_shows_outliers_only_with_redundant_samples(arm, count, values):
+    """Residuals show the mean share 1 - rank/rows of an outlier: less than a third is too little."""
+    simulation = Simulation(arm, count, 901)
+    fit = calibrate(simulation.chain, stated(simulation.measure(Position)), extend="none")
+    assert not fit.contradicts_sigma
+    assert 1 - fit.rank / (3 * count) < 1 / 3
+    assert fit.verdict.status == "caution"
+    reason = fit.verdict.reasons[0]
+    assert reason.startswith(f"So few samples do not reveal outliers: {values} independent values")
+    assert "1.5 are needed" in reason
+    needed = int(reason.split(" different poses")[0].rsplit(" ", 1)[1])
+    assert needed == -(-3 * fit.rank // 6)
+
+
+@pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 20), ("panda", 20), ("xarm7", 24)], {0}))
+def test_twenty_samples_of_stated_noise_are_ok(arm, count):
+    simulation = Simulation(arm, count, 901)
+    data = simulation.measure(Position)
+    assert calibrate(simulation.chain, stated(data), extend="none").verdict.status == "ok"
+    wrong = shifted(data, [2, 3, 9, 11], [[1e-2, 0, 0], [0, -1e-2, 0], [0, 0, 1e-2], [-1e-2, 0, 0]])
+    assert calibrate(simulation.chain, stated(wrong), extend="none").verdict.status == "caution"
+
+
+def test_few_samples_are_the_first_reason_of_a_correction_that_is_too_large():
+    """The fit adapts to two wrong samples of twelve: nothing is wrong with the robot."""
+    simulation = Simulation("ur10", 12, 950)
+    data = simulation.measure(Position)
+    wrong = shifted(data, [2, 9], [[0.0, 0.08, 0.04], [-0.06, 0.0, 0.08]])
+    fit = calibrate(simulation.chain, stated(wrong), extend="none")
+    assert fit.contradicts_sigma
+    assert fit.verdict.status == "refused"
+    first, second = fit.verdict.reasons[:2]
+    assert first.startswith("The residuals contradict the stated standard deviations. So few samples")
+    assert second.startswith("The correction moves")
+    assert "Check the robot" in second
+
+
+def test_a_figure_that_is_not_reliable_is_not_ok():
+    """Nine poses with stated noise have enough redundancy, but too few to judge the accuracy."""
+    simulation = Simulation("ur10", 9, 901)
+    data = simulation.measure(Pose)
+    fit = calibrate(simulation.chain, Pose(data.q, data.poses, 5e-5, 1e-4), extend="none")
+    assert fit.rows_per_direction > MIN_STATED_ROWS_PER_DIRECTION
+    assert "So few samples give no reliable figure." in headline(fit.comparisons).text
+    assert fit.verdict.status == "caution"
+    (reason,) = fit.verdict.reasons
+    assert reason == (
+        "The accuracy on 9 cross-validated samples is no reliable figure. Measure at least 10 samples."
+    )
 
 
 def true_errors(simulation, mode, share):

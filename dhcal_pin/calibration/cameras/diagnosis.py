@@ -258,13 +258,14 @@ class HandEyeFit:
     position_std: float  # Largest standard deviation of the position of a camera or a board [m]
     holdout: tuple[Measurement, ...]  # Held-out images, for the order of all images
     unrelated: str  # What shows that the images are not those of the joint values or of the robot
+    is_arm_tried: bool  # Whether the calibration estimated errors of the arm, too
 
     @cached_property
     def diagnosis(self) -> HandEyeDiagnosis | None:
         """Likely cause of the error, on first use; None with few configurations or unrelated images."""
         if self.unrelated:
             return None
-        return diagnose_hand_eye(self.fit, self.position_std, self.holdout)
+        return diagnose_hand_eye(self.fit, self.position_std, self.holdout, self.is_arm_tried)
 
 
 def largest_position_std(names: Sequence[str], covariance: Array) -> float:
@@ -282,17 +283,17 @@ def largest_position_std(names: Sequence[str], covariance: Array) -> float:
 
 
 def diagnose_hand_eye(
-    fit: Fit, position_std: float, holdout: Sequence[Measurement]
+    fit: Fit, position_std: float, holdout: Sequence[Measurement], is_arm_tried: bool
 ) -> HandEyeDiagnosis | None:
     """Find the likely cause of the error that a hand-eye calibration leaves."""
-    inliers = _search(fit, fit.without_rejected().data, holdout)
+    inliers = _search(fit, fit.without_rejected().data, holdout, is_arm_tried)
     if inliers is None:
         return None
     found = inliers
     rejected = np.concatenate([weights <= ZERO_WEIGHT for weights in fit.weights])
     if rejected.mean() > MAX_REJECTED_SHARE:
         # A wrong model makes outliers of right corners. A cause that explains them all is the cause.
-        whole = _search(fit, fit.data, holdout)
+        whole = _search(fit, fit.data, holdout, is_arm_tried)
         if whole is not None and whole.causes and whole.remaining <= MAX_NOISE_RATIO * inliers.base.noise:
             found = whole
     base, noise = found.base, found.noise
@@ -315,7 +316,9 @@ def diagnose_hand_eye(
     )
 
 
-def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement]) -> _Search | None:
+def _search(
+    fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement], is_arm_tried: bool
+) -> _Search | None:
     """Search the causes in some of the samples of a fit; None if they have too few configurations."""
     # The scatter within an image is the noise, whatever is stated.
     data = tuple(item.replace(has_stated_sigma=False) for item in data if len(item.rows))
@@ -330,7 +333,7 @@ def _search(fit: Fit, data: Sequence[Measurement], holdout: Sequence[Measurement
         parts = zip(data, np.split(is_used, ends), strict=True)
         data = tuple(item.take(used) for item, used in parts if used.any())
     sequence = file_sequence([*fit.data, *holdout])
-    hand_eye = HandEyeData(fit.problem.errors, data, fit.problem.known, sequence)
+    hand_eye = HandEyeData(fit.problem.errors, data, fit.problem.known, sequence, is_arm_tried)
     base = _State.of(hand_eye, Causes(), fit.problem.instruments(fit.solution.x))
     fitted = fitted_error(base.fit)
     if base.error.pixels > MAX_LEFT_OUT_RATIO * fitted.pixels:
@@ -623,11 +626,13 @@ def _without_rigid_motion(found: Array, stated: Array) -> Array:
     return a @ rotation.T - b
 
 
-def _arm_text(_: HandEyeData, state: _State) -> tuple[str, str]:
+def _arm_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     """Describe the errors of the arm."""
     errors = state.fit.problem.errors
     x = state.fit.solution.x[: len(errors.parameters)]
-    remedy = "Estimate the arm, too, without --parameters. If it was kept, the images do not decide that."
+    remedy = "Estimate the arm, too, without --parameters."
+    if hand_eye.is_arm_tried:
+        remedy = "The calibration estimated the arm, too: the images do not decide that."
     if state.causes.arm == ARM_SETS[OFFSETS]:
         offsets = {p.name: v for p, v in zip(errors.parameters, x, strict=True) if p.name.endswith("offset")}
         name = max(offsets, key=lambda each: abs(offsets[each]))

@@ -133,7 +133,7 @@ def calibrate_images(
     if unrelated:
         frames = without_arm(fit, fitting.max_iterations) if has_arm else fit
         result = replace(make_result(frames, 1.0, holdout, "lm"), arm_type=fitting.arm_type)
-        return replace(result, hand_eye_fit=HandEyeFit(frames, np.inf, holdout, unrelated))
+        return replace(result, hand_eye_fit=HandEyeFit(frames, np.inf, holdout, unrelated, has_arm))
     points = judge_target_points(fit, fitting.max_iterations)
     if points is not None and points.is_kept:
         fit = fitting.reweight(points.fit)
@@ -157,4 +157,4 @@ def calibrate_images(
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
     unrelated = find_unrelated_images(frames, chain, max_error)
-    return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout, unrelated))
+    return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout, unrelated, has_arm))

@@ -13,7 +13,7 @@ from ...calibration.evaluation import Comparison
 from ...calibration.result import Result
 from ...calibration.verdict import Verdict
 from ...formatting import Quantity, Table
-from ...identifiability import EXPECTED, SCALE_UNKNOWN
+from ...identifiability import EXPECTED
 from ...measurements.base import Measurement
 from ...measurements.groups import ERROR_GROUPS
 from ...measurements.images.names import list_images
@@ -36,8 +36,6 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     # The parameters of a refused robot have no meaning.
     unidentified = [] if is_refused else summary.parameter_notes(fit.unobservable, fit.weakly_observable)
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
-    sizes = [text for text in unidentified if SCALE_UNKNOWN in text][:1]
-    advice = [f"warning: {SCALE_UNKNOWN}; {text.rpartition('; ')[2]}" for text in sizes]
     all_warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
     signs = fit.signs
     turned = [f"{names[job.robot]}: warning: {signs.note}"] if signs and signs.turned else []
@@ -70,7 +68,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(hints, "yellow", noun="hint", rank=2, n_kept=0),
         Block(list(_row_lines(outcome, names)), "yellow", noun="note on rows", rank=3),
         Block([*turned, *moved], "yellow"),
-        Block([*advice, *warnings], "yellow", noun="warning", rank=4),
+        Block(warnings, "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
         Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),
         *verdict_blocks(fit.verdict, job.force),
