@@ -503,13 +503,15 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 
 def _few_judged(fit: Evidence) -> list[Finding]:
-    """Advise caution if the samples that judge the accuracy are too few for a reliable figure."""
+    """Advise caution if all samples together are too few to judge the accuracy.
+
+    Few hold-out samples say nothing against the fit of the others.
+    """
     judged = headline(fit.comparisons).comparison
-    if judged.title == "fitted" or not small_sample_note(judged):
+    if judged.title in ("fitted", "hold-out") or not small_sample_note(judged):
         return []
-    remedy = "Hold out" if judged.title == "hold-out" else "Measure"
     text = f"The accuracy {describe_samples(judged)} is no reliable figure."
-    return [Finding("caution", f"{text} {remedy} at least {MIN_SAMPLES} samples.")]
+    return [Finding("caution", f"{text} Measure at least {MIN_SAMPLES} samples.")]
 
 
 def _outliers(fit: Evidence) -> list[Finding]:
