@@ -44,6 +44,7 @@ class UnreachableRow:
     """Row of a file that is impossible."""
 
     row: int  #: Line in the file; for data from Python the number of the sample, from 1.
+    error: float  #: Distance between the position and the one at the row's joint positions [m].
     reason: str  #: Explanation for users, without a full stop.
 
 
@@ -116,7 +117,7 @@ def find_unreachable_rows(chain: Chain, file: MeasurementFile) -> list[Unreachab
                 )
             elif (solution := solve_position(chain, positions[i], np.median(q, 0))) is not None:
                 reason += f", which the robot reaches with ({_format_joints(chain, solution)})"
-            impossible[rows[i]] = UnreachableRow(rows[i], reason)
+            impossible[rows[i]] = UnreachableRow(rows[i], float(errors[i]), reason)
     return [impossible[row] for row in sorted(impossible)]
 
 

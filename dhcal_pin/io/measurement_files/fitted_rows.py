@@ -4,7 +4,8 @@ The digest of a row is a BLAKE2b hash of 5 bytes of its joint values and measure
 6 decimals in m, rad or px and written as little-endian 64-bit integers. Joint values come first, in the order
 of the chain, then the measured values in the order of the columns of the kind. Standard deviations, texts and
 conditions do not count, nor do joint values that were computed from poses of the tip. Two different rows have
-the same digest with the probability 1e-12.
+the same digest with the probability 1e-12. Known distances between points are no measurements of the robot
+and have no digests.
 """
 
 from __future__ import annotations
@@ -37,12 +38,14 @@ def count_fitted_rows(item: Measurement, digests: bytes) -> int:
 
 def _row_digests(item: Measurement) -> list[bytes]:
     """Return the digest of each row, (m,)."""
+    if not item.configurations_per_row:
+        return []
     values = [
         np.asarray(column)
         for name, column in item.to_columns().items()
         if not name.startswith("sigma_") and item.columns[name] not in ("text", "remark")
     ]
-    joints = np.split(item.configurations(), max(item.configurations_per_row, 1))
+    joints = np.split(item.configurations(), item.configurations_per_row)
     parts = [*(joints if item.has_joint_values else []), *(column[:, None] for column in values)]
     numbers = np.rint(np.concatenate(parts, 1) * 10.0**_DECIMALS).astype("<i8")
     return [hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_SIZE).digest() for row in numbers]
