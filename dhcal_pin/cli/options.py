@@ -21,7 +21,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 from ..messages import message_line
 
 if TYPE_CHECKING:
+    from ..io.measurement_files import MeasurementFile
     from ..io.robot_format import RobotFormat
+    from ..io.servo_file import ServoFile
+    from ..measurements.mounting import MountedRig
     from ..robot.chain import Chain
 
 # File name that stands for standard output.
@@ -188,6 +191,26 @@ def read_robot_or_table(path: str, args: argparse.Namespace) -> Chain:
 
     tip, root = (None, None) if has_dh_table(path) else (args.tip, args.root)
     return read_robot(path, tip, package_dirs=args.package_dir, root=root)
+
+
+def read_data(
+    args: argparse.Namespace, chain: Chain, servos: ServoFile | None, rig: MountedRig | None = None
+) -> list[MeasurementFile]:
+    """Read the measurement files of a command by its options."""
+    from ..io import read_measurement_file  # lazy import: loads Pinocchio
+
+    return [
+        read_measurement_file(
+            path,
+            chain,
+            args.columns,
+            skip_bad_rows=args.skip_bad_rows,
+            rig=rig,
+            servos=servos,
+            sheet=args.sheet,
+        )
+        for path in args.data or []
+    ]
 
 
 def add_open_option(parser: argparse.ArgumentParser, what: str, default: bool | None = False) -> None:

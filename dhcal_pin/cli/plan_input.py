@@ -15,7 +15,7 @@ from .._typing import Array, PathLike
 from ..compensation import LIMITS, compensate
 from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
-from ..io.measurement_files import read_configurations, read_measurement_file, read_targets
+from ..io.measurement_files import read_configurations, read_targets
 from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
 from ..io.servo_file import read_servos
 from ..io.settings import read_priors
@@ -31,7 +31,7 @@ from ..robot.collision import Obstacle, obstacles_from_urdf
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.urdf import read_urdf
 from ..units import ANGLES, LENGTHS, parse_noise
-from .options import split_commas
+from .options import read_data, split_commas
 from .outputs import existing_sidecars
 from .plan_options import (
     DEFAULT_IMAGE_SIGMA,
@@ -61,18 +61,7 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
     candidates, rows = _read_candidates(args, chain)
     rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
     servos = read_servos(args.servos) if args.servos else None
-    data = [
-        read_measurement_file(
-            path,
-            chain,
-            args.columns,
-            skip_bad_rows=args.skip_bad_rows,
-            rig=rig,
-            servos=servos,
-            sheet=args.sheet,
-        ).data
-        for path in args.data or []
-    ]
+    data = [file.data for file in read_data(args, chain, servos, rig)]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
     sidecar = None if args.data or args.priors else existing_sidecar(args.robot)
     images, noise = None, None

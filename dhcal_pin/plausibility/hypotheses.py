@@ -552,7 +552,7 @@ def _pose_hypotheses() -> Iterator[Hypothesis]:
 
 
 def _rotation_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
-    """Yield other notations of the rotations, from that which they were read in, if it is known."""
+    """Yield the other notations that the rotations may have; they start from the notation that was read."""
     notations = _notations(data)
     known = sorted(notations - {""})
     pairs = [(read, true) for read in known for true in _NOTATIONS if true != read]

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, ROBOT, SERVOS, SHEET, SKIP_BAD_ROWS, add_urdf_options
+from ..options import COLUMNS, DATA, JSON, ROBOT, SERVOS, SHEET, SKIP_BAD_ROWS, add_urdf_options, read_data
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -81,7 +81,6 @@ def run(args: Namespace) -> int:
     from ...io import (
         existing_sidecar,
         read_instrument,
-        read_measurement_file,
         read_robot,
         read_servos,
         robot_name,
@@ -117,12 +116,7 @@ def run(args: Namespace) -> int:
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
             raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
-    files = [
-        read_measurement_file(
-            path, chain, args.columns, skip_bad_rows=args.skip_bad_rows, servos=servos, sheet=args.sheet
-        )
-        for path in args.data
-    ]
+    files = read_data(args, chain, servos)
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
     data, known = [file.data for file in files], read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}

@@ -18,6 +18,7 @@ from ..options import (
     SHEET,
     SKIP_BAD_ROWS,
     add_urdf_options,
+    read_data,
 )
 from ..output_table import Output
 
@@ -211,25 +212,14 @@ def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
 
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
-    from ...io import read_instrument, read_measured_region, read_measurement_file, read_robot, read_servos
+    from ...io import read_instrument, read_measured_region, read_robot, read_servos
     from ...measurements.position import require_common_reference_target
 
     chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
     servos = read_servos(args.servos) if args.servos else None
     rig, estimated = _mounted_rig(args, sidecar, chain, servos)
     predictor = _predictor(chain, sidecar, args) if args.map else None
-    files = [
-        read_measurement_file(
-            path,
-            chain,
-            args.columns,
-            skip_bad_rows=args.skip_bad_rows,
-            rig=rig,
-            servos=servos,
-            sheet=args.sheet,
-        )
-        for path in args.data
-    ]
+    files = read_data(args, chain, servos, rig)
     instrument = read_instrument(sidecar) if sidecar else {}
     require_common_reference_target({file.source: file.data for file in files}, instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}

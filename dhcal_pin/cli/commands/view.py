@@ -22,6 +22,7 @@ from ..options import (
     SKIP_BAD_ROWS,
     add_open_option,
     add_urdf_options,
+    read_data,
     read_robot_or_table,
 )
 
@@ -81,7 +82,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
     from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ...io import read_measurement_file, read_servos
+    from ...io import read_servos
     from ...io.robot import robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
@@ -106,18 +107,7 @@ def run(args: Namespace) -> int:
     sidecar = existing_sidecar(robots[-1])
     rig = _rig(args.rig, sidecar, chains[-1])
     servos = read_servos(args.servos) if args.servos else None
-    files = [
-        read_measurement_file(
-            path,
-            chains[0],
-            args.columns,
-            skip_bad_rows=args.skip_bad_rows,
-            rig=rig,
-            servos=servos,
-            sheet=args.sheet,
-        )
-        for path in args.data
-    ]
+    files = read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
     known = read_instrument(sidecar) if sidecar else {}
     predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None

@@ -132,7 +132,7 @@ def read_measurement_file(
 ) -> MeasurementFile:
     """Read a measurement file with its division into fitted and held-out samples.
 
-    Of a file with more than `max_rows` rows, so many are used, drawn at random.
+    A file with more than `max_rows` rows is reduced to that number of rows, which are drawn at random.
     """
     check_joint_names(chain)
     table = open_measurement_table(source, chain, columns, servos, sheet)
