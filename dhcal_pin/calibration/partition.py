@@ -10,7 +10,8 @@ samples depend on each other and therefore always go to the same part:
   distance. A fitted sample would reveal where the held-out one must be.
 
 Random parts measure the error between the measured configurations. A fold of `blocked_folds` holds out one
-end of the measured joint space and so measures the error of an extrapolation.
+end of the measured joint space and so measures the error of an extrapolation. Configurations are numbered in
+the order of their joint values before parts are drawn: the order of the samples has no influence.
 
 Shapes: m samples of all measurements in a row, n joints.
 """
@@ -106,8 +107,9 @@ def _merge_groups(labels: Array, others: Array) -> Array:
 def configuration_groups(data: Sequence[Measurement]) -> Array:
     """Label the samples of measurements, those of the same configuration by the same label.
 
-    A sample with several configurations, such as a relative pose, is compared by all of its joint values. A
-    sample without a configuration, such as a known distance between points, has a label of its own.
+    Labels are numbered in the order of the joint values. A sample with several configurations, such as a
+    relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
+    distance between points, has a label of its own; these are the last, in the order of their names.
     """
     counts = [len(item.rows) for item in data]
     starts = np.cumsum([0, *counts])
@@ -123,7 +125,26 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
         groups = group_by_configuration(np.concatenate(rows))
         is_first = np.diff(np.maximum.accumulate(groups), prepend=-1) > 0
         labels[samples] = samples[np.flatnonzero(is_first)[groups]]
-    return _by_first_appearance(labels)
+    order = _order_of_joint_values(data)
+    labels[order] = _by_first_appearance(labels[order])
+    return labels
+
+
+def _order_of_joint_values(data: Sequence[Measurement]) -> Array:
+    """Return the samples (m,) of measurements in the order of their joint values, or else of their names."""
+    keys = []
+    for item in data:
+        if item.configurations_per_row:
+            names = np.zeros((len(item.rows), 0))
+            q = np.concatenate(np.split(item.configurations(), item.configurations_per_row), axis=1)
+        else:
+            texts = item.text_values().values()
+            names = np.stack([np.unique(text, return_inverse=True)[1] for text in texts], axis=1)
+            q = np.full(item.q.shape, np.inf)
+        keys.append(np.concatenate([q, names], axis=1))
+    width = max(key.shape[1] for key in keys)
+    padded = [np.pad(key, ((0, 0), (0, width - key.shape[1]))) for key in keys]
+    return np.lexsort(np.concatenate(padded).T[::-1])
 
 
 def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
@@ -168,7 +189,7 @@ def split(
     state = np.full(len(labels), -1)
     fitted, held_out = [], []
     for item, label in zip(data, _by_measurement(data, labels), strict=True):
-        order = rng.permutation(len(item.rows))
+        order = np.argsort(label, kind="stable")[rng.permutation(len(item.rows))]
         wanted = round(fraction * len(order)) - np.count_nonzero(state[label] == 1)
         drawn = label[order][state[label[order]] < 0]
         groups, first, size = np.unique(drawn, return_index=True, return_counts=True)

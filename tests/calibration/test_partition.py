@@ -61,10 +61,11 @@ def parts_of(data: Sequence[Measurement], fold: Fold) -> tuple[np.ndarray, np.nd
 
 
 def drawn_split(data: Sequence[Measurement], fraction: float, seed: int):
-    """Split each measurement by rows, whatever their configurations."""
+    """Split each measurement by rows in the order of their joint values, all of which differ."""
     rng = np.random.default_rng(seed)
     for item in data:
-        order = rng.permutation(len(item.rows))
+        order = np.array(sorted(range(len(item.rows)), key=lambda i: tuple(item.q[i])))
+        order = order[rng.permutation(len(order))]
         count = round(fraction * len(order))
         yield item.rows[np.sort(order[count:])], item.rows[np.sort(order[:count])]
 
@@ -119,6 +120,22 @@ def test_folds_keep_configurations_together(seed, n_configurations, sizes, fract
         assert not are_equal(inside, outside).any()
 
 
+@settings(max_examples=100, deadline=None)
+@repeats
+def test_the_order_of_samples_has_no_influence(seed, n_configurations, sizes, fraction):
+    rng = np.random.default_rng(seed)
+    data = repeated(rng, n_configurations, sizes)
+    order = [rng.permutation(len(item.rows)) for item in data]
+    permuted = [item.take(index) for item, index in zip(data, order, strict=True)]
+    for parts in zip(split(data, fraction, seed), split(permuted, fraction, seed), strict=True):
+        expected, found = ([sorted(item.rows) for item in part if len(item.rows)] for part in parts)
+        assert found == expected
+    if len(np.unique(configuration_groups(data))) > 1:
+        for fold, other in zip(k_fold(data, 2, seed), k_fold(permuted, 2, seed), strict=True):
+            for mask, found, index in zip(fold, other, order, strict=True):
+                np.testing.assert_array_equal(found, mask[index])
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 0.3, 0.5, 0.9])
 @pytest.mark.parametrize("seed", range(5))
 def test_different_configurations_are_split_as_rows(seed, fraction):
@@ -137,7 +154,9 @@ def test_different_configurations_are_split_as_rows(seed, fraction):
 def test_different_configurations_are_folded_as_rows(seed):
     rng = np.random.default_rng(seed)
     data = [positions(rng.uniform(-3, 3, (m, N_JOINTS))) for m in (17, 40)]
-    labels = np.random.default_rng(seed).permutation(57) % 10
+    order = sorted(range(57), key=lambda i: tuple(np.concatenate([item.q for item in data])[i]))
+    labels = np.empty(57, int)
+    labels[order] = np.random.default_rng(seed).permutation(57) % 10
     for number, fold in enumerate(k_fold(data, 10, seed)):
         np.testing.assert_array_equal(np.concatenate(fold), labels == number)
 
@@ -165,12 +184,12 @@ def test_a_sample_of_two_configurations_is_compared_by_both():
     poses = np.tile(np.eye(4), (4, 1, 1))
     relative = RelativePose(np.array([a, a, b, a]), np.array([b, c, a, b]), poses)
     single = positions(np.array([a, b]))
-    np.testing.assert_array_equal(configuration_groups([relative, single]), [0, 1, 2, 0, 3, 4])
+    np.testing.assert_array_equal(configuration_groups([relative, single]), [4, 3, 1, 4, 2, 0])
 
 
 def test_known_distances_between_points_have_no_configuration():
     known = PointDistance(3, [("a", "b"), ("b", "c")], [0.1, 0.1])
-    np.testing.assert_array_equal(configuration_groups([known, positions(np.eye(3))]), [0, 1, 2, 3, 4])
+    np.testing.assert_array_equal(configuration_groups([known, positions(np.eye(3))]), [3, 4, 2, 1, 0])
 
 
 def test_split_is_a_partition_by_seed():
