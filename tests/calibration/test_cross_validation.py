@@ -47,7 +47,19 @@ def test_folds_equal_fits_of_the_other_samples():
     counts = [fold["position_samples"] for fold in found.folds]
     whole = np.sqrt(np.average([fold["position_rms_m"] ** 2 for fold in found.folds], weights=counts))
     assert found.accuracy["position_rms_m"] == pytest.approx(whole)
-    assert whole > 1.1 * fit.validate(fit.data)["position_rms_m"]
+
+
+def test_errors_of_left_out_samples_are_larger_by_the_number_of_unknowns():
+    """With p unknowns, the variance is 1 - p/n in n fitted rows, and 1 + p/n in a left-out one."""
+    fit = fitted(Pose)
+    p, n = len(fit.x), 6 * 40
+    ratios = [
+        cross_validate(fit, k_fold(fit.data, 4, seed)).accuracy["position_rms_m"]
+        / fit.validate(fit.data)["position_rms_m"]
+        for seed in range(10)
+    ]
+    expected = np.sqrt((1 + p / (0.75 * n)) / (1 - p / n))
+    assert np.mean(ratios) == pytest.approx(expected, rel=0.03)
 
 
 def test_folds_of_other_data_are_refused():
