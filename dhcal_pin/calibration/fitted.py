@@ -28,12 +28,12 @@ import numpy as np
 import pinocchio as pin
 
 from .._typing import Array
-from ..estimation import qr, robust
+from ..estimation import robust
 from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
 from ..estimation.information import Information, Samples
-from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.problem import Problem, UnfactoredSystem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
@@ -220,19 +220,27 @@ class FittedModel:
         return sum(len(item.rows) for item in self.inliers)
 
     @cached_property
+    def _system_at_x(self) -> TriangularSystem:
+        """Triangular system of the data at x. Even a small last step rotates the null space."""
+        system = self.solution.system
+        if isinstance(system, UnfactoredSystem) and np.array_equal(system.x, self.x):
+            return system
+        return linearize_and_factor(self.problem, self.x, small_angle=False)
+
+    @cached_property
     def rank(self) -> int:
         """Number of observable directions in parameter space, without priors."""
-        return qr.rank(self.solution.system.r)
+        return self.solution.system.rank
 
     @property
     def condition(self) -> float:
         """Ratio of the largest to the smallest singular value of the observable directions."""
-        return qr.condition(self.solution.system.r)
+        return self.solution.system.condition
 
     @property
     def observability_indices(self) -> dict[str, float]:
         """Observability indices O1 to O5; see `identifiability.observability_indices`."""
-        return observability.observability_indices(self.solution.system.r, self.n_inliers)
+        return observability.observability_indices(self.solution.system, self.n_inliers)
 
     @property
     def prior_std(self) -> Array:
@@ -375,9 +383,7 @@ class FittedModel:
             uncertainty = replace(uncertainty, information=self._information(scale, root))
         if self.rank == len(self.x) or not robot:
             return uncertainty
-        # Even a small last step rotates the null space, so take the Jacobian at x.
-        system = linearize_and_factor(self.problem, self.x, small_angle=False)
-        null_space = qr.null_space(system.r)[:robot]
+        null_space = self._system_at_x.null_space[:robot]
         undetermined = Uncertainty.from_errors(
             self.errors, self.x[:robot], self.chain, null_space, null_space[:, :0]
         )
