@@ -263,7 +263,7 @@ class FittedModel:
     def degrees_of_freedom(self) -> float:
         """Number of weighted rows minus the effective number of parameters that the data determine."""
         count = sum(n_rows for _, _, n_rows in self._row_counts)
-        freedom = count - float(np.sum((self.solution.system.r @ self._sqrt_covariance[0]) ** 2))
+        freedom = count - self.solution.system.predicted_variance(self._sqrt_covariance[0])
         return freedom if freedom > MIN_FREEDOM_RATIO * count else 0.0
 
     @cached_property
@@ -299,9 +299,8 @@ class FittedModel:
     @property
     def unit_weight_std(self) -> float:
         """Standard deviation σ0 of the whitened residuals, about 1; NaN without degrees of freedom."""
-        system = self.solution.system
-        cost = system.min_cost + float(np.sum(system.z**2))
-        return float(np.sqrt(cost / self.degrees_of_freedom)) if self.degrees_of_freedom else float("nan")
+        freedom = self.degrees_of_freedom
+        return float(np.sqrt(self.solution.system.cost / freedom)) if freedom else float("nan")
 
     @property
     def contradicts_sigma(self) -> bool:
@@ -337,7 +336,7 @@ class FittedModel:
             root = root * scale
         else:
             # Scale the measured rows only; priors are not measurements.
-            scaled = TriangularSystem(system.rows / max(scale, MIN_SCALE))
+            scaled = system.scaled(1 / max(scale, MIN_SCALE))
             root, unbounded = scaled.sqrt_covariance(self.problem.weights)
         # The variance of correlated residuals counts T times against the priors.
         root = root * np.sqrt(self.problem.temperature)
