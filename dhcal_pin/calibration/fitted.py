@@ -496,9 +496,9 @@ class FittedModel:
         A parameter that no fitted sample depends on, such as a point that only hold-out samples touch, is not
         among them.
         """
-        is_used = np.any(self.solution.system.r != 0, 0)[len(self.errors.parameters) :]
+        is_unused = self.solution.system.is_unobserved[len(self.errors.parameters) :]
         unused = {
-            p.name for p, used in zip(self.problem.instrument_parameters, is_used, strict=True) if not used
+            p.name for p, never in zip(self.problem.instrument_parameters, is_unused, strict=True) if never
         }
         return {name: v for name, v in self.problem.instruments(self.x).items() if name not in unused}
 
