@@ -28,12 +28,12 @@ import numpy as np
 import pinocchio as pin
 
 from .._typing import Array
-from ..estimation import qr, robust
+from ..estimation import robust
 from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
 from ..estimation.information import Information, Samples
-from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.problem import Problem, UnfactoredSystem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
 from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
@@ -220,19 +220,27 @@ class FittedModel:
         return sum(len(item.rows) for item in self.inliers)
 
     @cached_property
+    def _system_at_x(self) -> TriangularSystem:
+        """Triangular system of the data at x. Even a small last step rotates the null space."""
+        system = self.solution.system
+        if isinstance(system, UnfactoredSystem) and np.array_equal(system.x, self.x):
+            return system
+        return linearize_and_factor(self.problem, self.x, small_angle=False)
+
+    @cached_property
     def rank(self) -> int:
         """Number of observable directions in parameter space, without priors."""
-        return qr.rank(self.solution.system.r)
+        return self.solution.system.rank
 
     @property
     def condition(self) -> float:
         """Ratio of the largest to the smallest singular value of the observable directions."""
-        return qr.condition(self.solution.system.r)
+        return self.solution.system.condition
 
     @property
     def observability_indices(self) -> dict[str, float]:
         """Observability indices O1 to O5; see `identifiability.observability_indices`."""
-        return observability.observability_indices(self.solution.system.r, self.n_inliers)
+        return observability.observability_indices(self.solution.system, self.n_inliers)
 
     @property
     def prior_std(self) -> Array:
@@ -255,7 +263,7 @@ class FittedModel:
     def degrees_of_freedom(self) -> float:
         """Number of weighted rows minus the effective number of parameters that the data determine."""
         count = sum(n_rows for _, _, n_rows in self._row_counts)
-        freedom = count - float(np.sum((self.solution.system.r @ self._sqrt_covariance[0]) ** 2))
+        freedom = count - self.solution.system.predicted_variance(self._sqrt_covariance[0])
         return freedom if freedom > MIN_FREEDOM_RATIO * count else 0.0
 
     @cached_property
@@ -291,9 +299,8 @@ class FittedModel:
     @property
     def unit_weight_std(self) -> float:
         """Standard deviation σ0 of the whitened residuals, about 1; NaN without degrees of freedom."""
-        system = self.solution.system
-        cost = system.min_cost + float(np.sum(system.z**2))
-        return float(np.sqrt(cost / self.degrees_of_freedom)) if self.degrees_of_freedom else float("nan")
+        freedom = self.degrees_of_freedom
+        return float(np.sqrt(self.solution.system.cost / freedom)) if freedom else float("nan")
 
     @property
     def contradicts_sigma(self) -> bool:
@@ -329,7 +336,7 @@ class FittedModel:
             root = root * scale
         else:
             # Scale the measured rows only; priors are not measurements.
-            scaled = TriangularSystem(system.rows / max(scale, MIN_SCALE))
+            scaled = system.scaled(1 / max(scale, MIN_SCALE))
             root, unbounded = scaled.sqrt_covariance(self.problem.weights)
         # The variance of correlated residuals counts T times against the priors.
         root = root * np.sqrt(self.problem.temperature)
@@ -375,9 +382,7 @@ class FittedModel:
             uncertainty = replace(uncertainty, information=self._information(scale, root))
         if self.rank == len(self.x) or not robot:
             return uncertainty
-        # Even a small last step rotates the null space, so take the Jacobian at x.
-        system = linearize_and_factor(self.problem, self.x, small_angle=False)
-        null_space = qr.null_space(system.r)[:robot]
+        null_space = self._system_at_x.null_space[:robot]
         undetermined = Uncertainty.from_errors(
             self.errors, self.x[:robot], self.chain, null_space, null_space[:, :0]
         )
@@ -491,9 +496,9 @@ class FittedModel:
         A parameter that no fitted sample depends on, such as a point that only hold-out samples touch, is not
         among them.
         """
-        is_used = np.any(self.solution.system.r != 0, 0)[len(self.errors.parameters) :]
+        is_unused = self.solution.system.is_unobserved[len(self.errors.parameters) :]
         unused = {
-            p.name for p, used in zip(self.problem.instrument_parameters, is_used, strict=True) if not used
+            p.name for p, never in zip(self.problem.instrument_parameters, is_unused, strict=True) if never
         }
         return {name: v for name, v in self.problem.instruments(self.x).items() if name not in unused}
 

@@ -51,7 +51,6 @@ import numpy as np
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.problem import Problem, linearize_and_factor, whitened_residuals
-from ..estimation.qr import rank
 from ..estimation.solver import SolverResult
 from ..estimation.trimmed_squares import MIN_SCALE, LinearizedRows, linearize_rows, search_majorities
 from ..measurements.base import Measurement
@@ -110,7 +109,7 @@ def find_good_samples(
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
-    root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
+    root, n_determined = system.sqrt_covariance(problem.weights)[0], system.rank
     n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
@@ -149,7 +148,7 @@ def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int
     from scipy.special import gammainc  # lazy import: slow
 
     system = linearize_and_factor(problem, x, small_angle=False)
-    root, n_determined = system.sqrt_covariance(problem.weights)[0], rank(system.r)
+    root, n_determined = system.sqrt_covariance(problem.weights)[0], system.rank
     if not 0 < root.shape[1] <= MAX_COORDINATES:
         return None
     rows = linearize_rows(problem, x, root)

@@ -12,7 +12,8 @@ from .. import formatting
 from .._typing import Array
 from ..estimation.bare_geometry import fit_bare_geometry
 from ..estimation.initialization import fit_frames
-from ..estimation.problem import Problem, UnfactoredSystem, uses_normal_equations
+from ..estimation.normal_equations import NormalEquations
+from ..estimation.problem import Problem, UnfactoredSystem
 from ..estimation.solver import remaining_change
 from ..identifiability import explanations
 from ..identifiability.null_space import ObservabilityProbe
@@ -197,9 +198,8 @@ def make_result(
     """Apply the shrinkage factor to the solution of a fit and build the result."""
     problem, errors = fit.problem, fit.problem.errors
     solution = replace(fit.solution, iterations=fit.iterations)
-    if uses_normal_equations(problem):
-        # Rank and null space need the R factor of the rows.
-        solution = replace(solution, system=UnfactoredSystem(problem, solution.x))
+    if isinstance(solution.system, NormalEquations):
+        solution = replace(solution, system=UnfactoredSystem(solution.system, problem, solution.x))
     x = shrinkage_factor * fit.solution.x
     bare = None
     if shrinkage_factor:

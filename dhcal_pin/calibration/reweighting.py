@@ -38,7 +38,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._typing import Array, Progress
-from ..estimation import qr, robust
+from ..estimation import robust
 from ..estimation.priors import PriorGroups, effective_parameters, update_prior_scales
 from ..estimation.problem import Problem
 from ..estimation.robust import SolvedProblem, WeightChange, studentized_residuals
@@ -119,7 +119,7 @@ class ReweightState:
 
 def shared_rank(solved: SolvedProblem, n_rows: Array) -> Array:
     """Share the number of directions of parameter space that the data determine among all rows."""
-    return qr.rank(solved.solution.system.r) * n_rows / n_rows.sum()
+    return solved.solution.system.rank * n_rows / n_rows.sum()
 
 
 def leverages(solved: SolvedProblem, n_rows: Array) -> Array:

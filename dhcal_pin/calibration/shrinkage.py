@@ -46,7 +46,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem
-from ..estimation.qr import RANK_RTOL, TriangularSystem, rank
+from ..estimation.qr import RANK_RTOL, TriangularSystem
 from ..estimation.solver import SolverResult
 
 # Largest accepted probability that the calibrated robot is worse than the nominal one.
@@ -69,7 +69,7 @@ def compute_shrinkage_factor(
     """Compute the largest factor of a solution that is hardly worse than the nominal robot."""
     errors, x = problem.errors, solution.x
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
-    if n_rows > len(x) or n_rows > rank(solution.system.r) or not groups:
+    if n_rows > len(x) or n_rows > solution.system.rank or not groups:
         return 1.0
     robot = np.flatnonzero(errors.is_of_arm)
     if not x[robot].any():

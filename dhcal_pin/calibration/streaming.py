@@ -19,7 +19,6 @@ from typing import TypeVar
 import numpy as np
 
 from .._typing import Array
-from ..estimation import qr
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
 from ..estimation.solver import IterationCallback, SolverResult, minimize
@@ -98,7 +97,7 @@ class StreamResult:
     @property
     def rank(self) -> int:
         """Number of observable directions in parameter space, without priors."""
-        return qr.rank(self.solution.system.r)
+        return self.solution.system.rank
 
     @property
     def unobservable(self) -> list[str]:

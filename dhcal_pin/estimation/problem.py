@@ -427,14 +427,18 @@ def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> Trian
     )
 
 
-class UnfactoredSystem(TriangularSystem):
-    """Triangular system of all data, without priors, that is computed when it is first needed."""
+class UnfactoredSystem(NormalEquations):
+    """Normal equations of all data, with the R factor of the rows, which is computed when it is first needed.
+
+    Rank and null space of the data, without priors, need that R factor.
+    """
 
     problem: Problem  # Problem in p robot errors and s instrument parameters
     x: Array  # Unknowns of shape (p+s,)
 
-    def __init__(self, problem: Problem, x: Array):
-        """Store the problem."""
+    def __init__(self, equations: NormalEquations, problem: Problem, x: Array):
+        """Store the normal equations and the problem."""
+        super().__init__(equations.products)
         vars(self).update(problem=problem, x=x)
 
     @cached_property

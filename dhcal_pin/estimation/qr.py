@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack, svd
@@ -61,25 +62,23 @@ def singular_values(r: Array) -> Array:
 def row_space(r: Array) -> Array:
     """Compute an orthonormal basis of the observable directions in parameter space."""
     _, s, vt = singular_value_decomposition(r)
-    return vt[: int(np.sum(s > RANK_RTOL * s[0]))] if s.size and s[0] > 0 else vt[:0]
+    return vt[: len(_without_zeros(s))]
+
+
+def _without_zeros(s: Array) -> Array:
+    """Return the singular values, largest first, that do not count as zero."""
+    return s[s > RANK_RTOL * s[0]] if s.size else s
 
 
 def rank(r: Array) -> int:
     """Count the observable directions in parameter space."""
-    s = singular_values(r)
-    return int(np.sum(s > RANK_RTOL * s[0])) if s.size else 0
-
-
-def condition(r: Array) -> float:
-    """Compute the condition number within the observable directions."""
-    s = singular_values(r)
-    nonzero = s[s > RANK_RTOL * s[0]] if s.size else s
-    return float(nonzero[0] / nonzero[-1]) if nonzero.size else 0.0
+    return len(_without_zeros(singular_values(r)))
 
 
 def null_space(r: Array) -> Array:
     """Compute an orthonormal basis of the directions that the data do not determine."""
-    return singular_value_decomposition(r)[2][rank(r) :].T
+    _, s, vt = singular_value_decomposition(r)
+    return vt[len(_without_zeros(s)) :].T
 
 
 def sum_of_squares(a: Array) -> float:
@@ -133,6 +132,27 @@ class TriangularSystem:
     def is_unobserved(self) -> Array:
         """Unknowns that no row depends on, (p,)."""
         return np.logical_not(self.r.any(0))
+
+    @cached_property
+    def singular_values(self) -> Array:
+        """Singular values of R, those of the Jacobian, largest first."""
+        return singular_values(self.r)
+
+    @property
+    def rank(self) -> int:
+        """Number of observable directions in parameter space."""
+        return len(_without_zeros(self.singular_values))
+
+    @property
+    def condition(self) -> float:
+        """Ratio of the largest to the smallest singular value of the observable directions."""
+        s = _without_zeros(self.singular_values)
+        return float(s[0] / s[-1]) if s.size else 0.0
+
+    @cached_property
+    def null_space(self) -> Array:
+        """Orthonormal basis of the directions that the data do not determine."""
+        return null_space(self.r)
 
     def scaled(self, factor: float) -> TriangularSystem:
         """Return the system of the rows times a factor."""

@@ -40,7 +40,6 @@ import numpy as np
 
 from .._typing import Array
 from ..measurements.base import Measurement
-from . import qr
 from .normal_equations import NormalEquations
 from .priors import effective_parameters
 from .problem import (
@@ -323,7 +322,7 @@ def studentized_residuals(
     if problem.temperature > 1:
         # The priors decide on many unknowns.
         n_unknowns = effective_parameters(problem, solution)
-    if n_rows <= n_unknowns and n_rows <= qr.rank(solution.system.r):
+    if n_rows <= n_unknowns and n_rows <= solution.system.rank:
         return [np.zeros(len(item.rows)) for item in data]
     chain = problem.chain(solution.x)
     # Residuals of one image are whitened together. Rejected ones must not contribute to the others.

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -253,13 +254,30 @@ class Uncertainty:
         out += by_joint.transpose(2, 1, 0) @ angles
         return out
 
+    @cached_property
+    def _shared_and_own(self) -> tuple[Array, Array]:
+        """Directions (6(k+1)+e, s) that move bodies, and the covariance (e, e) of the coefficients besides.
+
+        An orthogonal transformation of the columns of the square root separates the columns that all bodies
+        have in common, of which there are at most 6(k+1), from those of the coefficients alone.
+        """
+        bodies, coefficients = np.split(self.sqrt_covariance, [len(self.sqrt_covariance) - len(self.entries)])
+        basis, factor = np.linalg.qr(bodies.T)
+        shared = coefficients @ basis
+        own = coefficients - shared @ basis.T
+        return np.concatenate([factor.T, shared]), own @ own.T
+
     def predict(self, q: Array) -> Prediction:
         """Predict tool poses and their covariance."""
         frames = self.chain.forward_kinematics(q)
-        root, undetermined = (
-            self.tool_twists(frames, part) for part in (self.sqrt_covariance, self.unbounded_directions)
-        )
+        shared, own = self._shared_and_own
+        root, undetermined = (self.tool_twists(frames, part) for part in (shared, self.unbounded_directions))
         covariance = root @ np.swapaxes(root, 1, 2) + np.diag(np.repeat(np.square(self.model_std), 3))
+        if len(self.entries):
+            joints, terms = self.chain.transmission_terms(frames, self.entries)
+            motions = self.chain.motions(frames, joints)
+            no_columns = np.zeros((1, *motions.shape[1:]))
+            covariance += StructuredRows.of(no_columns, motions, joints, terms, 0).covariances(own)
         samples, components = np.nonzero(np.sum(undetermined**2, -1) > UNBOUNDED_TOL)
         covariance[samples, components, components] = np.inf
         return Prediction(frames.poses(), covariance)

@@ -399,7 +399,7 @@ class Explainer:
 
 def explain_unobservable(probe: ObservabilityProbe, system: TriangularSystem) -> list[str]:
     """Explain which parameters are not identifiable, why, and what to measure."""
-    if qr.rank(system.r) == len(probe.x):
+    if system.rank == len(probe.x):
         return []
     curve_joints = _curve_joints(probe.problem)
     if (curve_joints < 0).all():
@@ -407,7 +407,7 @@ def explain_unobservable(probe: ObservabilityProbe, system: TriangularSystem) ->
     kept = np.flatnonzero(curve_joints < 0)
     is_explained = qr.rank(system.r[:, kept]) == len(kept)
     sentences = [] if is_explained else _explain_null_space(_with_known_curves(probe, kept))
-    return [*sentences, *_explain_curves(probe, system.r, curve_joints)]
+    return [*sentences, *_explain_curves(probe, system, curve_joints)]
 
 
 def _curve_joints(problem: Problem) -> Array:
@@ -432,26 +432,25 @@ def _with_known_curves(probe: ObservabilityProbe, kept: Array) -> ObservabilityP
     return ObservabilityProbe(reduced_problem, probe.x[kept])
 
 
-def _explain_curves(probe: ObservabilityProbe, r: Array, curve_joints: Array) -> list[str]:
+def _explain_curves(probe: ObservabilityProbe, system: TriangularSystem, curve_joints: Array) -> list[str]:
     """Explain how many combinations of the correction curves are not identifiable, and of which joints."""
     others = curve_joints < 0
 
-    def n_open(factor: Array) -> int:
-        n_all, n_others = len(others) - qr.rank(factor), int(others.sum()) - qr.rank(factor[:, others])
-        return n_all - n_others
+    def n_open(r: Array, n_determined: int) -> int:
+        return len(others) - n_determined - (int(others.sum()) - qr.rank(r[:, others]))
 
-    if not (count := n_open(r)):
+    if not (count := n_open(system.r, system.rank)):
         return []
-    shares = np.sum(qr.null_space(r) ** 2, 1)
+    shares = np.sum(system.null_space**2, 1)
     by_joint = {
         name: round(float(shares[curve_joints == i].sum())) for i, name in enumerate(probe.chain.joint_names)
     }
     listed = ", ".join(f"{name} {share}" for name, share in by_joint.items() if share)
     samples = sum(len(item.rows) for item in probe.problem.data)
-    if qr.rank(r) == probe.n_equations:
+    if system.rank == probe.n_equations:
         reason = f"{probe.n_equations} equations for {len(others)} parameters"
         advice = f"measure at least {-(-count * samples // probe.n_equations)} more poses"
-    elif n_open(probe.full_range) < count:
+    elif n_open(probe.full_range, qr.rank(probe.full_range)) < count:
         reason, advice = "the poses are too similar", "measure poses over the full range of the joints"
     else:
         reason, advice = "the ranges of the joints are too small", "only the priors determine them"
@@ -522,7 +521,7 @@ def explain_weakly_observable(
             "the accuracy of all parameters is unknown, because there are no redundant measurements to "
             "estimate the noise from; state the standard deviations of the instrument or measure more poses"
         ]
-    directions, std_ratios = observability.weakly_observable(system.r, prior_std, noise)
+    directions, std_ratios = observability.weakly_observable(system, prior_std, noise)
     if not len(std_ratios):
         return []
     problem, n_robot = probe.problem, len(probe.problem.errors.parameters)

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._typing import Array
-from ..estimation.qr import rank, row_space, singular_values
+from ..estimation.qr import TriangularSystem, row_space
 
 # A direction is known if its posterior standard deviation is below this fraction of the prior one.
 MAX_KNOWN_STD_RATIO = 0.5
@@ -44,7 +44,7 @@ def observable_fraction(r: Array) -> Array:
     return np.clip(np.sum(row_space(r) ** 2, 0), 0.0, 1.0)
 
 
-def observability_indices(r: Array, samples: int) -> dict[str, float]:
+def observability_indices(system: TriangularSystem, samples: int) -> dict[str, float]:
     """Compute the observability indices O1 to O5 over the observable directions; larger is better.
 
     With the singular values σ₁ ≥ … ≥ σ_L of the whitened Jacobian and m samples:
@@ -55,7 +55,7 @@ def observability_indices(r: Array, samples: int) -> dict[str, float]:
     * O4 = σ_L²/σ₁, the noise amplification index: Nahvi and Hollerbach (1996);
     * O5 = 1/(1/σ₁ + … + 1/σ_L): Sun and Hollerbach (2008).
     """
-    s = singular_values(r)[: rank(r)]
+    s = system.singular_values[: system.rank]
     if not s.size:
         return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
     indices = (
@@ -77,7 +77,7 @@ def correlation(covariance: Array) -> Array:
     return out
 
 
-def weakly_observable(r: Array, prior_std: Array, noise: float) -> tuple[Array, Array]:
+def weakly_observable(system: TriangularSystem, prior_std: Array, noise: float) -> tuple[Array, Array]:
     """Find directions that count in the rank but are hardly better known than before the measurement.
 
     The columns of R are scaled by the prior standard deviations, which makes metres and radians comparable.
@@ -86,8 +86,8 @@ def weakly_observable(r: Array, prior_std: Array, noise: float) -> tuple[Array, 
     `MAX_KNOWN_STD_RATIO` or more are weakly observable. They are one prior standard deviation long, shape (p,
     w), and come with these ratios. Directions in the null space are not included.
     """
-    _, s, vt = np.linalg.svd(r * prior_std)
-    s = s[: rank(r)]
+    _, s, vt = np.linalg.svd(system.r * prior_std)
+    s = s[: system.rank]
     std_ratios = noise / np.hypot(noise, s)
     weak = np.flatnonzero(std_ratios >= MAX_KNOWN_STD_RATIO)
     return prior_std[:, None] * vt[weak].T, std_ratios[weak]

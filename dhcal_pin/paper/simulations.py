@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._typing import Array
-from ..estimation import qr
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import select_parameters
 from ..estimation.problem import Problem, linearize_and_factor
@@ -123,7 +122,7 @@ def simulate(
         residual[seed] = np.abs(data.residual(found.forward_kinematics(data.q), np.array([]))).max()
         if seed == 0:
             first, last = (
-                qr.rank(linearize_and_factor(first_problem, x, small_angle=False).r)
+                linearize_and_factor(first_problem, x, small_angle=False).rank
                 for x in (0 * truth, iterates[-1])
             )
             ranks = first, last

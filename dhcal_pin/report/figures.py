@@ -19,7 +19,6 @@ from .. import plots, se3
 from .._typing import Array
 from ..calibration.evaluation import compute_errors, error_norms
 from ..calibration.presentation.workspace import WorkspacePrediction
-from ..estimation import qr
 from ..formatting import Quantity, capitalized, round_up
 from ..measurements.groups import ERROR_GROUPS, in_order
 from ..plots import SQUARE_PANEL, WIDE_PANEL
@@ -394,7 +393,7 @@ def _arm_points(chain: Chain, context: ReportContext) -> Array:
 
 def observability_figures(context: ReportContext) -> list[FigureGroup]:
     """Draw the singular values of the whitened Jacobian."""
-    values, rank = qr.singular_values(context.fit.solution.system.r), context.fit.rank
+    values, rank = context.fit.solution.system.singular_values, context.fit.rank
     if not (values.size and values[0] > 0):
         return []
     smallest = values[rank - 1] / values[0]

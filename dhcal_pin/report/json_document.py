@@ -17,7 +17,6 @@ from ..calibration.evaluation import Accuracy, Comparison, accuracy
 from ..calibration.presentation.budget import UncertaintyBudget
 from ..calibration.result import Result
 from ..calibration.verdict import Verdict
-from ..estimation import qr
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..session import Session
@@ -62,7 +61,7 @@ def result_to_dict(
         "parameters_total": len(fit.parameters),
         "uncertainty_budget": budget.to_dict() if budget else None,
         "condition": fit.condition,
-        "singular_values": qr.singular_values(fit.solution.system.r).tolist(),
+        "singular_values": fit.solution.system.singular_values.tolist(),
         **_accuracies(fitted, holdout, "after"),
         **generalization_to_dict(fit.generalization if is_calibration else None),
         "urdf_alone": _accuracies(fitted, holdout, "alone")

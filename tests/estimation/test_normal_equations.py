@@ -12,7 +12,7 @@ from slow_cases import some_slow
 import dhcal_pin.estimation.folds as folds
 import dhcal_pin.estimation.problem as problem_module
 from dhcal_pin import Chain, calibrate
-from dhcal_pin.estimation import Problem, TriangularSystem, linearize_and_factor, select_parameters
+from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.folds import factor_partition
 from dhcal_pin.estimation.normal_equations import NormalEquations
 from dhcal_pin.estimation.problem import UnfactoredSystem, normal_equations, uses_normal_equations
@@ -177,7 +177,11 @@ def test_calibration_is_the_same_with_the_r_factor_of_the_rows(monkeypatch, m):
 def test_the_system_of_a_result_is_the_r_factor_of_the_rows():
     """It is computed when it is needed, and in another process, too."""
     problem, x = curved_problem()
-    system = pickle.loads(pickle.dumps(UnfactoredSystem(problem, x)))
-    assert isinstance(system, TriangularSystem)
+    equations = normal_equations(problem, x)
+    system = pickle.loads(pickle.dumps(UnfactoredSystem(equations, problem, x)))
     expected = linearize_and_factor(problem, x, small_angle=False)
     np.testing.assert_array_equal(system.rows, expected.rows)
+    assert system.rank == expected.rank
+    roots = (each.sqrt_covariance(problem.weights)[0] for each in (system, expected))
+    variances = [np.sum(root**2, 1) for root in roots]
+    np.testing.assert_allclose(*variances, rtol=1e-8)

@@ -7,6 +7,7 @@ import pytest
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.qr import TriangularSystem
 from dhcal_pin.identifiability import observability
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain
@@ -23,16 +24,21 @@ def r_factor_with(values, seed=0):
     return np.asarray(np.linalg.qr(u * np.array(values) @ v, mode="r"))
 
 
+def system_of(r):
+    """Build a triangular system without right-hand side."""
+    return TriangularSystem(np.pad(r, (0, 1)))
+
+
 def test_indices_by_hand():
     """σ = 4, 2, 1 from four samples: ∛8/2, 1/4, 1, 1/4, 1/(1/4 + 1/2 + 1)."""
-    found = observability.observability_indices(r_factor_with([4.0, 2.0, 1.0]), 4)
+    found = observability.observability_indices(system_of(r_factor_with([4.0, 2.0, 1.0])), 4)
     assert found == pytest.approx({"O1": 1.0, "O2": 0.25, "O3": 1.0, "O4": 0.25, "O5": 4 / 7})
 
 
 def test_indices_ignore_unobservable_directions():
-    found = observability.observability_indices(r_factor_with([4.0, 1.0, 0.0]), 1)
+    found = observability.observability_indices(system_of(r_factor_with([4.0, 1.0, 0.0])), 1)
     assert found == pytest.approx({"O1": 2.0, "O2": 0.25, "O3": 1.0, "O4": 0.25, "O5": 0.8})
-    assert set(observability.observability_indices(np.zeros((3, 3)), 1).values()) == {0.0}
+    assert set(observability.observability_indices(system_of(np.zeros((3, 3))), 1).values()) == {0.0}
 
 
 def test_second_index_is_the_inverse_condition(sim_6dof):
@@ -65,21 +71,21 @@ def test_correlation_agrees_with_repetitions(sim_3dof):
 
 def test_weak_directions_by_hand():
     """Independent parameters: s·prior/noise = 1 gives a ratio of 1/√2, a value of 10 is known."""
-    triangle = np.diag([1e3, 1e4, 0.0, 200.0])
+    system = system_of(np.diag([1e3, 1e4, 0.0, 200.0]))
     expected = np.array([1e-3, 1e-3, 1e-3, 5e-3])
-    directions, ratios = observability.weakly_observable(triangle, expected, 1.0)
+    directions, ratios = observability.weakly_observable(system, expected, 1.0)
     np.testing.assert_allclose(ratios, [2**-0.5, 2**-0.5])
     np.testing.assert_allclose(np.sort(np.abs(directions).sum(1)), [0, 0, 1e-3, 5e-3], atol=1e-12)
-    assert len(observability.weakly_observable(triangle, expected, 0.1)[1]) == 0
-    assert len(observability.weakly_observable(triangle, expected, 10.0)[1]) == 3
+    assert len(observability.weakly_observable(system, expected, 0.1)[1]) == 0
+    assert len(observability.weakly_observable(system, expected, 10.0)[1]) == 3
 
 
 def test_weak_directions_do_not_depend_on_units():
     """Metres and radians against millimetres and degrees."""
     triangle, expected = r_factor_with([1e4, 1e3, 300.0, 30.0], seed=3), np.array([1e-3, 5e-3, 1e-3, 0.03])
     unit = np.array([1e3, 180 / np.pi, 1e3, 180 / np.pi])
-    _, ratios = observability.weakly_observable(triangle, expected, 1.0)
-    directions, again = observability.weakly_observable(triangle / unit, expected * unit, 1.0)
+    _, ratios = observability.weakly_observable(system_of(triangle), expected, 1.0)
+    directions, again = observability.weakly_observable(system_of(triangle / unit), expected * unit, 1.0)
     np.testing.assert_allclose(ratios, again)
     np.testing.assert_allclose(np.linalg.norm(directions / (expected * unit)[:, None], axis=0), 1.0)
 

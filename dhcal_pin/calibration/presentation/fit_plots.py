@@ -15,7 +15,6 @@ import numpy as np
 
 from ... import plots
 from ..._typing import Array
-from ...estimation import qr
 from ...exceptions import UnknownNameError
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...plots import COLORS, DOT_SIZES, MAX_DOTS, new_axes
@@ -274,7 +273,7 @@ def plot_parameters(fit: Evidence, ax: Axes | None = None, *, count: int = MAX_P
 def plot_singular_values(fit: Evidence, ax: Axes | None = None) -> Axes:
     """Plot the singular values of the whitened Jacobian relative to the largest one."""
     ax = ax or new_axes()[0]
-    plots.plot_singular_values(qr.singular_values(fit.solution.system.r), fit.rank, ax)
+    plots.plot_singular_values(fit.solution.system.singular_values, fit.rank, ax)
     _legend(ax)
     return ax
 

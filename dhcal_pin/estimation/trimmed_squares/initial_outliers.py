@@ -27,7 +27,6 @@ from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..error_model import ErrorModel
 from ..problem import Problem, linearize_and_factor, merge_instrument_parameters, whitened_residuals
-from ..qr import rank
 from ..solver import minimize
 from .search import linearize_rows, search_majorities
 
@@ -147,7 +146,7 @@ def _fit_majority(problem: Problem) -> Array | None:
     previous = np.empty(0)
     for _ in range(MAX_LINEARIZATIONS):
         system = linearize_and_factor(problem, x, small_angle=False)
-        n_determined = rank(system.r)
+        n_determined = system.rank
         if not 0 < 2 * n_determined <= n_rows:
             return None
         rows = linearize_rows(problem, x, system.sqrt_covariance(problem.weights)[0])
