@@ -14,6 +14,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
+from ..estimation.parameters import fold_harmonics
 from ..formatting import SMALL_UNITS, Quantity, Table
 from ..identifiability import label_unobservable
 from ..measurements.groups import ERROR_GROUPS
@@ -53,11 +54,14 @@ def estimate_table(estimates: Sequence[Estimate]) -> Table:
 
 def definition_table(estimates: Sequence[Estimate]) -> Table:
     """Make a table of the frames and directions in which the parameters are defined."""
-    by_frame: dict[str, list[str]] = {}
+    by_frame: dict[str, dict[str, list[str]]] = {}
     for e in estimates:
         if e.frame:
-            by_frame.setdefault(e.frame, []).append(f"{e.name} {e.direction}")
-    rows = [[frame, ", ".join(texts)] for frame, texts in by_frame.items()]
+            by_frame.setdefault(e.frame, {}).setdefault(e.direction, []).append(e.name)
+    rows = [
+        [frame, ", ".join(f"{name} {way}" for way, names in ways.items() for name in fold_harmonics(names))]
+        for frame, ways in by_frame.items()
+    ]
     return Table(["frame", "parameters and their directions"], rows, n_text_columns=2)
 
 

@@ -12,6 +12,8 @@ from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import accuracy, calibrate, k_fold
+from dhcal_pin.calibration.estimates import Estimate
+from dhcal_pin.calibration.summary import definition_table
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.solver import next_iterate
 from dhcal_pin.measurements import Noise, Pose, Position
@@ -286,3 +288,22 @@ def test_intervals_and_predictions_hold_over_1000_robots(name):
     assert 0.93 < totals.inside / totals.count < 0.97
     assert np.sqrt(totals.squares / totals.bound) == pytest.approx(1, abs=0.05)
     assert np.sqrt(totals.squares / totals.claimed) == pytest.approx(1, abs=0.10)
+
+
+def test_the_definitions_name_the_harmonics_of_a_joint_once():
+    values = {"unit": "rad", "nominal": 0.0, "value": 0.0, "std": 1.0, "prior": 1.0, "observability": 1.0}
+    names = {"a.x": "along x", **{f"a.{f}{k}": "position" for k in range(1, 65) for f in ("sin", "cos")}}
+    estimates = [
+        Estimate(
+            name,
+            **values,
+            posterior_to_prior_std=1.0,
+            fixed=False,
+            category="robot",
+            frame="joint a",
+            direction=way,
+        )
+        for name, way in names.items()
+    ]
+    text = "a.x along x, a.sin1 ... cos64 (128 harmonics) position"
+    assert definition_table(estimates).texts == [["joint a", text]]
