@@ -121,6 +121,9 @@ class ObservabilityProbe:
         """Return a measurement with some joints drawn anew; contacts are returned unchanged."""
         if item.is_contact:
             return item
+        if len(joints) == self.chain.n_joints and not item.instrument_parameters:
+            # All samples are alike; more rows would only take time.
+            item = item.take(np.s_[: 1 + _ROWS_PER_UNKNOWN * len(self.x) // item.residual_dim])
         q = item.configurations().copy()
         q[:, joints] = self.draw_configurations(rng, len(q))[:, joints]
         return item.resample(q)
