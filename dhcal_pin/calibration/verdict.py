@@ -491,13 +491,11 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
         return [
             Finding("caution", f"{text} the others, which may be outliers. Measure more poses to see it.")
         ]
-    n_configurations = len(np.unique(configuration_groups(fit.data)))
-    needed = int(np.ceil(n_configurations * limit / fit.rows_per_direction))
     found = "The residuals contradict the stated standard deviations. " * (is_stated and not is_known)
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{needed} different poses."
+        f"{fit.needed_configurations(limit)} different poses."
     )
     return [Finding("caution", text)]
 

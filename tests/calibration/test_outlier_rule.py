@@ -228,7 +228,12 @@ def test_stated_noise_shows_outliers_only_with_redundant_samples(arm, count, val
     assert reason.startswith(f"So few samples do not reveal outliers: {values} independent values")
     assert "1.5 are needed" in reason
     needed = int(reason.split(" different poses")[0].rsplit(" ", 1)[1])
-    assert needed == -(-3 * fit.rank // 6)
+    # Rows of the advised number of poses determine more directions than the present ones.
+    for n_poses, is_enough in ((needed, True), (needed - 1, False)):
+        more = Simulation(arm, n_poses, 902)
+        advised = calibrate(simulation.chain, stated(more.measure(Position)), extend="none")
+        assert advised.rank >= fit.rank
+        assert is_enough == (not any("do not reveal outliers" in text for text in advised.verdict.reasons))
 
 
 @pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 20), ("panda", 20), ("xarm7", 24)], {0}))
