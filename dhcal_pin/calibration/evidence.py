@@ -13,7 +13,6 @@ from .._typing import Array, Progress
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
-from ..identifiability.null_space import ObservabilityProbe
 from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.diagnosis import Diagnosis
@@ -47,6 +46,11 @@ N_FOLDS = 5
 MAX_LEAVE_ONE_OUT = 10
 # More samples are not examined for repeated configurations.
 MAX_EXAMINED = 1000
+
+
+def count_geometric_directions(fit: FittedModel, r: Array) -> int:
+    """Count the directions of the geometry that an R factor of its parameters determines; at least 1."""
+    return max(rank(r[:, [getattr(p, "coefficient_index", None) is None for p in fit.parameters]]), 1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -92,27 +96,14 @@ class Evidence(FittedModel):
         Repeated rows of one configuration show the noise, but no outlier that they share. Joint errors that
         were added to the geometry do not count: outliers were found before.
         """
-        data, problem, directions = self.data, self.problem, self._count_geometric(self.solution.system.r)
+        data, problem = self.data, self.problem
+        directions = count_geometric_directions(self, self.solution.system.r)
         groups = configuration_groups(data)
         if len(np.unique(groups)) < len(groups) and len(groups) <= MAX_EXAMINED:
             system = linearize_and_factor(problem, self.solution.x, small_angle=False)
             root = system.sqrt_covariance(problem.weights)[0]
             return independent_rows(linearize_rows(problem, self.solution.x, root), groups) / directions
         return sum(item.residual_dim * len(item.rows) for item in data) / directions
-
-    def _count_geometric(self, r: Array) -> int:
-        """Count the directions that the geometry determines, from an R factor; at least 1."""
-        return max(rank(r[:, [getattr(p, "coefficient_index", None) is None for p in self.parameters]]), 1)
-
-    def needed_configurations(self, rows_per_direction: float) -> int:
-        """Compute the number of different configurations with so many independent rows for each direction.
-
-        Few rows determine fewer directions than many rows over the whole joint space would.
-        """
-        many = ObservabilityProbe(self.problem, self.x).full_range
-        growth = max(self._count_geometric(many) / self._count_geometric(self.solution.system.r), 1.0)
-        present = len(np.unique(configuration_groups(self.data)))
-        return int(np.ceil(present * growth * rows_per_direction / self.rows_per_direction))
 
     @cached_property
     def hidden_majority(self) -> tuple[int, float] | None:

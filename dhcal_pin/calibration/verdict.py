@@ -30,7 +30,7 @@ from ..robot.chain import BASE_FRAME
 from ..se3 import rms_length
 from . import cameras
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
-from .evidence import Evidence
+from .evidence import Evidence, count_geometric_directions
 from .partition import configuration_groups
 from .summary import describe_samples, headline, small_sample_note
 
@@ -495,9 +495,21 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{fit.needed_configurations(limit)} different poses."
+        f"{_needed_configurations(fit, limit)} different poses."
     )
     return [Finding("caution", text)]
+
+
+def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
+    """Return how many different configurations have so many independent rows for each direction.
+
+    Few rows determine fewer directions than many rows over the whole joint space would.
+    """
+    factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
+    many, present = (count_geometric_directions(fit, r) for r in factors)
+    n_configurations = len(np.unique(configuration_groups(fit.data)))
+    growth = max(many / present, 1.0)
+    return int(np.ceil(n_configurations * growth * rows_per_direction / fit.rows_per_direction))
 
 
 def _few_judged(fit: Evidence) -> list[Finding]:
