@@ -261,13 +261,14 @@ class PositionComponents(PointMeasurement):
 class MultiTargetPosition(PointMeasurement):
     """Positions of several targets (reflectors) on the tool in the measuring frame.
 
-    The first target is the tool point itself. Each other target has three instrument parameters
-    `target_NAME.x, .y, .z`: its position in the tool frame relative to the first target. Two targets make the
-    rotation of the tool observable except about the line through them, three make all of it observable.
+    The first target in alphabetical order is the tool point itself, whatever the order of the samples is.
+    Each other target has three instrument parameters `target_NAME.x, .y, .z`: its position in the tool frame
+    relative to the first target. Two targets make the rotation of the tool observable except about the line
+    through them, three make all of it observable.
 
     Attributes:
         label: Index of each sample's target in `names`, (m,).
-        names: Names of the targets in order of first appearance.
+        names: Names of the targets in alphabetical order.
     """
 
     label: Array
@@ -292,7 +293,9 @@ class MultiTargetPosition(PointMeasurement):
         """
         q = validated_joint_positions(q, "MultiTargetPosition")
         values = validated_array(positions, (len(q), 3), "MultiTargetPosition: positions", "position")
-        names, label = encode_labels(targets, len(q), "MultiTargetPosition: targets")
+        found, label = encode_labels(targets, len(q), "MultiTargetPosition: targets")
+        names = tuple(sorted(found))
+        label = np.array([names.index(name) for name in found], int)[label]
         parameters = tuple(
             InstrumentParameter(f"target_{name}.{axis}", "m", 0.0, OFFSET_PRIOR)
             for name in names[1:]
@@ -389,6 +392,6 @@ def require_common_reference_target(data: Mapping[str, Measurement], known: Cont
         else:
             continue
         raise InvalidArgumentError(
-            f"{path}: the first target is {name!r}, {problem}; expected the same first target everywhere, as "
-            "the others are relative to it: begin every file with a row of that target, or join the files"
+            f"{path}: the first target in alphabetical order is {name!r}, {problem}; expected the same first "
+            "target everywhere, as the others are relative to it: join the files, or rename the targets"
         )
