@@ -201,12 +201,12 @@ class Evidence(FittedModel):
         uncertain parameters, I + A·Aᵀ in standard deviations of the noise. None without hold-out samples, or
         if the uncertainty of the model contains its errors (correlated residuals).
         """
-        known = {parameter.name for parameter in self.problem.instrument_parameters} | set(self.problem.known)
         groups = _mean_squares(self, self.counted)
+        matched = [item.matched_to(self.instruments).mounted(self.chain) for item in self.counted_holdout]
         holdout = [
             item
-            for item in self.counted_holdout
-            if {parameter.name for parameter in item.instrument_parameters} <= known
+            for item in matched
+            if all(p.name in self.instruments and not p.is_local for p in item.instrument_parameters)
             and {(item.kind, name) for name in item.residual_groups} <= set(groups)
         ]
         freedom = self.degrees_of_freedom
@@ -214,9 +214,9 @@ class Evidence(FittedModel):
             return None
         per_freedom = sum(count for _, _, count in self._row_counts) / freedom
         root, unbounded = self._scaled_sqrt_covariance
-        problem, blocks = self.problem.with_data(holdout), []
-        linearization = problem.linearize(self.x)
-        for chunk in problem.chunks:
+        # The unknowns are those of the fitted samples.
+        linearization, blocks = self.problem.linearize(self.x), []
+        for chunk in self.problem.with_data(holdout).chunks:
             rows = linearization.rows(chunk)
             for name, group in chunk.data.residual_groups.items():
                 noise = np.sqrt(per_freedom * groups[chunk.data.kind, name])

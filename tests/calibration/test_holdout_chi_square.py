@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-from sessions import Simulation
+from sessions import Simulation, nominal_arm
 from slow_cases import some_slow
 
-from dhcal_pin import Result, calibrate
-from dhcal_pin.measurements import Measurement, Pose, Position
+from dhcal_pin import Result, calibrate, split
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 
 ARMS = [("ur10", Position), ("panda", Pose)]
+# A plane has unknowns of its own in each measurement, distances between points have no configurations, and
+# images need configurations in which the board is seen.
+OTHERS = ("plane", "point_distance", "camera")
 
 
 def calibrated(
@@ -49,3 +53,23 @@ def test_hold_out_samples_of_a_right_model_raise_no_doubt(arm, kind, is_by_regio
 def test_regions_of_an_arm_with_other_errors_raise_doubt(count):
     fits = [calibrated("ur10", Position, seed, size=1e-3, is_by_region=True) for seed in range(count)]
     assert np.mean([is_doubted(fit) for fit in fits]) >= 0.5
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    some_slow([(kind, seed) for seed in range(3) for kind in KINDS if kind not in OTHERS], [2, 3, 7]),
+)
+def test_unknowns_of_the_instrument_explain_the_hold_out_samples(kind, seed):
+    """A random part of the samples is held out; the chi-square has several hundred degrees of freedom."""
+    arm = nominal_arm("ur10")
+    rng = np.random.default_rng(seed)
+    errors = select_parameters(arm, "minimal")
+    std = np.array([5e-4 if p.unit == "m" else 2e-3 for p in errors.parameters])
+    truth = errors.at(std * rng.standard_normal(len(std)))
+    data = KINDS[kind].simulate(truth, rng.uniform(-2.5, 2.5, (90, 6)), Noise(5e-5, 2e-4), rng)
+    (fitted,), held_out = split(data, 0.25, seed)
+    fit = calibrate(arm, fitted, extend="none", session="off", holdout=held_out)
+    assert fit.holdout_chi_square is not None
+    ratio, p_value = fit.holdout_chi_square
+    assert 0.3 < ratio < 2.0
+    assert p_value > 1e-3
