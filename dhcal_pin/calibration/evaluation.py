@@ -34,6 +34,8 @@ from ..robot.chain import Chain
 
 # With fewer samples the figures come with a note that they are not reliable.
 MIN_SAMPLES = 10
+# The error of a wrong measurement before a calibration is at least this fraction of that after it.
+MIN_RATIO_BEFORE = 0.5
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
@@ -283,13 +285,12 @@ class PairedErrors:
         return cls(*mean_squares, n_components=n_components)
 
     def without_outliers(self) -> PairedErrors:
-        """Leave out configurations that are outliers both before and after: wrong measurements."""
-        is_outlier = np.logical_and(
-            *(
-                robust.standardize_mean_squares(squares, self.n_components) > robust.OUTLIER_THRESHOLD
-                for squares in (self.before, self.after)
-            )
-        )
+        """Leave out wrong measurements: outliers after the calibration whose error was large before, too.
+
+        An error that the calibration causes is far smaller before it.
+        """
+        t = robust.standardize_mean_squares(self.after, self.n_components)
+        is_outlier = (t > robust.OUTLIER_THRESHOLD) & (self.before > MIN_RATIO_BEFORE**2 * self.after)
         return replace(self, before=self.before[~is_outlier], after=self.after[~is_outlier])
 
     @property

@@ -8,16 +8,18 @@ import re
 import numpy as np
 import pytest
 from robots import robot_file
-from sessions import ARMS, Changes, Simulation, write_csv
+from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
 from slow_cases import some_slow
 
-from dhcal_pin import calibrate
+from dhcal_pin import calibrate, split
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.calibration.summary import headline
 from dhcal_pin.calibration.verdict import MIN_ROWS_PER_DIRECTION, MIN_STATED_ROWS_PER_DIRECTION, STATUSES
 from dhcal_pin.cli.main import main
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import LOSSES
-from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.measurements import KINDS, Noise, Pose, Position
+from dhcal_pin.measurements.position import PointMeasurement
 
 # Samples that are 20 mm wrong, and those that are held out.
 WRONG, HELD_OUT = [3, 24, 40, 61, 75], np.arange(80) % 4 == 0
@@ -316,3 +318,23 @@ def test_a_majority_that_agrees_far_better_shows_outliers_to_which_a_fit_adapts(
             assert abs(fit.hidden_majority[0] - 10) <= 2
             assert "samples agree" in fit.verdict.reasons[0]
     assert n_hidden
+
+
+@pytest.mark.parametrize("kind", ["position", "wires"])
+@pytest.mark.parametrize("seed", range(10))
+def test_wrong_hold_out_samples_do_not_keep_the_nominal_robot(kind, seed):
+    """Errors of 10 mm are no outliers beside those of 3 to 5 mm of the nominal robot."""
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(seed)
+    errors = select_parameters(arm, "minimal")
+    std = np.array([1e-3 if p.unit == "m" else 5e-3 for p in errors.parameters])
+    truth = errors.at(std * rng.standard_normal(len(std)))
+    data = KINDS[kind].simulate(truth, rng.uniform(-2.5, 2.5, (80, 6)), Noise(5e-5), rng)
+    assert isinstance(data, PointMeasurement)
+    values, wrong = data.values.copy(), rng.permutation(80)[:7]
+    values[wrong] += 0.01 * rng.standard_normal((7, values.shape[1]))
+    (fitted,), held_out = split(data.replace(values=values), 0.25, seed)
+    fit = calibrate(arm, fitted, extend="none", session="off", holdout=held_out)
+    assert "significantly" not in " ".join(fit.verdict.reasons)
+    assert fit.shrinkage_factor == 1
+    found = {line - 1 for lines in (*fit.outliers, *fit.holdout_outliers) for line in lines.tolist()}
+    assert found <= set(wrong.tolist())
