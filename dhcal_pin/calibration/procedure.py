@@ -161,7 +161,9 @@ def calibrate(
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, method, loss, bounds)
     with_auto = (
-        None if loss == "auto" else partial(recalibrate, data, holdout=holdout, loss="auto", turned=turned)
+        None
+        if method == "lm" and loss == "auto"
+        else partial(recalibrate, data, holdout=holdout, method="lm", loss="auto", turned=turned)
     )
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
@@ -233,7 +235,7 @@ def calibrate(
                 found = without_changes(found)
     data = fit.data
     if method != "lm":
-        return replace(make_result(fit, 1.0, holdout, method), signs=signs)
+        return replace(make_result(fit, 1.0, holdout, method), signs=signs, with_auto=with_auto)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)

@@ -25,6 +25,9 @@ from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
 MIN_SHOWN_SHARE = 0.01
 
+# Option that excludes outliers, by the method of the calibration that kept them.
+AUTO_OPTIONS = {"lm": "--loss auto", "gn": "--method lm"}
+
 # Statistics in words, by the attribute of `ErrorStatistics`.
 STATISTIC_LABELS = {"mean": "mean", "rms": "RMS", "p95": "95th percentile", "max": "maximum"}
 

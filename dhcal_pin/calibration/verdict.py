@@ -32,7 +32,7 @@ from . import cameras
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .partition import configuration_groups
-from .summary import describe_samples, headline, small_sample_note
+from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
 
 Status = Literal["ok", "caution", "refused"]
 # Statuses, the most severe one last.
@@ -58,6 +58,8 @@ MAX_FRAME_ITERATIONS = 20
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # Probability that chance makes a robot appear better that is not.
 MAX_CHANCE = 0.025
+# Outliers spoil a fit if the error without them is smaller by this factor.
+MAX_SPOILED_RATIO = 1.5
 # Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 # Largest error of the zero of a servo that needs no caution [rad].
@@ -170,13 +172,27 @@ def judge(fit: Evidence) -> Verdict:
 
 
 def _other_loss(fit: Evidence, verdict: Verdict) -> list[Finding]:
-    """Return the findings of the loss "auto" if its verdict is more severe: a loss must not hide mistakes."""
-    if fit.with_auto is None or verdict.is_refused:
+    """Return the findings of the loss "auto" if its verdict is more severe, or if outliers spoil the fit.
+
+    A loss must not hide mistakes. The method of the paper only asks if there are outliers.
+    """
+    if fit.with_auto is None or verdict.is_refused or (fit.method != "lm" and not fit.n_outliers):
         return []
-    other = judge(fit.with_auto())
-    if STATUSES.index(other.status) <= STATUSES.index(verdict.status):
+    auto = fit.with_auto()
+    other = judge(auto)
+    option = AUTO_OPTIONS[fit.method]
+    if STATUSES.index(other.status) > STATUSES.index(verdict.status):
+        return [
+            Finding(other.status, f"With {option}: {text}", other.keeps_nominal) for text in other.reasons
+        ]
+    heads = [headline(each.comparisons) for each in (fit, auto)]
+    errors = [head.comparison.after.groups[head.group].rms for head in heads]
+    if not fit.n_outliers or errors[0] < MAX_SPOILED_RATIO * errors[1]:
         return []
-    return [Finding(other.status, f"With --loss auto: {text}", other.keeps_nominal) for text in other.reasons]
+    text = (
+        f"Outliers spoil the fit: {heads[0].after} with them, {heads[1].after} with {option}, which excludes"
+    )
+    return [Finding("caution", f"{text} those far from the other samples.")]
 
 
 def _unmoved_joints(fit: Evidence) -> list[Finding]:

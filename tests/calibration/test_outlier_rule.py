@@ -338,3 +338,19 @@ def test_wrong_hold_out_samples_do_not_keep_the_nominal_robot(kind, seed):
     assert fit.shrinkage_factor == 1
     found = {line - 1 for lines in (*fit.outliers, *fit.holdout_outliers) for line in lines.tolist()}
     assert found <= set(wrong.tolist())
+
+
+@pytest.mark.parametrize(("options", "advice"), [({"method": "gn"}, "lm"), ({"loss": "linear"}, "auto")])
+def test_outliers_that_spoil_a_fit_are_a_caution(options, advice):
+    """The advised option brings the stated error."""
+    simulation, data = with_outliers()
+    fit = calibrate(simulation.chain, data, session="off", **options)
+    assert fit.verdict.status == "caution"
+    reason = fit.verdict.reasons[0]
+    assert reason.startswith("Outliers spoil the fit: ")
+    assert f" {advice}, which excludes those far from the other samples." in reason
+    advised = calibrate(simulation.chain, data, session="off")
+    assert headline(advised.comparisons).after in reason
+    assert simulation.true_error(advised.chain) < 0.5 * simulation.true_error(fit.chain)
+    clean = calibrate(simulation.chain, simulation.measure(Position), session="off", **options)
+    assert "Outliers spoil" not in " ".join(clean.verdict.reasons)

@@ -154,12 +154,13 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
         if excluded := [row for row in rows if row in rejected]:
             yield f"{names[path]}: {_count_outliers(excluded, item)} excluded from the fit"
         if included := [row for row in rows if row not in rejected]:
-            count = _count_outliers(included, item)
+            count, method = _count_outliers(included, item), outcome.fit.method
+            option = summary.AUTO_OPTIONS[method]
             yield (
                 f"{names[path]}: {count} kept in the fit, not far from the other samples: a few do no harm; "
                 "--loss tukey down-weights them"
-                if outcome.settings["loss"] == "auto"
-                else f"{names[path]}: {count} kept in the fit; --loss auto excludes those far from the others"
+                if method == "lm" and outcome.settings["loss"] == "auto"
+                else f"{names[path]}: {count} kept in the fit; {option} excludes those far from the others"
             )
     for path, item in outcome.held_out:
         if rows := [row for row in outcome.held_out_outliers[path] if row in item.rows]:
