@@ -148,7 +148,7 @@ def _order_of_joint_values(data: Sequence[Measurement]) -> Array:
 
 
 def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
-    """Return the different configurations of measurements."""
+    """Return the different configurations in the order of their joint values, and a sample of each."""
     q, samples, start = [np.empty((0, 0))], [np.empty(0, int)], 0
     for item in data:
         if item.configurations_per_row and len(item.rows):
@@ -157,9 +157,11 @@ def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]
         start += len(item.rows)
     if len(q) == 1:
         return q[0], samples[0]
-    rows = np.concatenate(q[1:])
+    rows, of_rows = np.concatenate(q[1:]), np.concatenate(samples)
+    order = np.lexsort(rows.T[::-1])
+    rows, of_rows = rows[order], of_rows[order]
     first = np.unique(group_by_configuration(rows), return_index=True)[1]
-    return rows[first], np.concatenate(samples)[first]
+    return rows[first], of_rows[first]
 
 
 def split(

@@ -73,10 +73,11 @@ def renamed(chain):
 
 
 def stated_errors(result):
-    """Return the RMS errors of fitted samples, of left-out ones and of left-out regions."""
+    """Return the RMS errors of fitted samples, of left-out ones and of left-out regions, and the shares."""
     left_out = result.generalization.cross_validated, result.generalization.region_holdout
     judged = [*result.comparisons, *filter(None, left_out)]
-    return [[group.rms for group in each.after.groups.values()] for each in judged]
+    shares = [result.generalization.covered_share, result.generalization.reached_share]
+    return [*([group.rms for group in each.after.groups.values()] for each in judged), shares]
 
 
 # Contacts without a length leave directions open, whose prior widths are iterated until they change by less
