@@ -15,6 +15,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import fold_harmonics
+from ..estimation.qr import TriangularSystem
 from ..formatting import SMALL_UNITS, Quantity, Table
 from ..identifiability import label_unobservable
 from ..measurements.groups import ERROR_GROUPS
@@ -76,10 +77,9 @@ def parameter_notes(unobservable: Sequence[str], weakly_observable: Sequence[str
     ]
 
 
-def largest_corrections(estimates: Sequence[Estimate], x: Array, prior_std: Array) -> list[Estimate]:
-    """Sort the corrections x of the robot by their size, relative to the errors expected beforehand."""
-    sizes = np.abs(x) / prior_std
-    order = np.argsort(-sizes, kind="stable")
+def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:
+    """Sort the corrections x of the robot by their effect on the measured values."""
+    order = np.argsort(-np.abs(x) * system.column_norms, kind="stable")
     return [estimates[i] for i in order if estimates[i].category == "robot" and estimates[i].change]
 
 

@@ -293,6 +293,7 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
                 "fraction such as 0.3, or region"
             ) from None
         remaining, drawn = partition.split(fit, fraction, job.seed)
+        _require_both_parts(job.holdout, fraction, remaining, drawn)
         split_files = [
             path for path, a, b in zip(job.data, fit, remaining, strict=True) if len(b.rows) < len(a.rows)
         ]
@@ -305,6 +306,22 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
     held_out = [(path, item) for path, item in holdout if len(item.rows)]
     n_rows = {path: len(item.rows) for path, item in by_file.items()}
     return _JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
+
+
+def _require_both_parts(
+    option: str, fraction: float, fitted: Sequence[Measurement], held_out: Sequence[Measurement]
+) -> None:
+    """Raise an error if a fraction leaves nothing to fit, or nothing to judge."""
+    n_fitted, n_held_out = (len(partition.different_configurations(part)[0]) for part in (fitted, held_out))
+    if n_held_out > 1 >= n_fitted:
+        raise InvalidArgumentError(
+            f"--holdout {option}: leaves {n_fitted} of {n_fitted + n_held_out} configurations for the fit; "
+            "expected a smaller fraction"
+        )
+    if fraction and not n_held_out and n_fitted:
+        raise InvalidArgumentError(
+            f"--holdout {option}: holds out none of {n_fitted} configurations; expected a larger fraction"
+        )
 
 
 def _require_cameras(job: Job, data: Sequence[Measurement]) -> None:

@@ -71,6 +71,11 @@ class NormalEquations(TriangularSystem):
         return self._factor**2 * float(self._unscaled[-1, -1])
 
     @property
+    def column_norms(self) -> Array:
+        """Change of the rows per unit of each unknown, (p,)."""
+        return np.sqrt(np.diag(self.products)[:-1])
+
+    @property
     def is_unobserved(self) -> Array:
         """Unknowns that no row depends on, (p,)."""
         return np.diag(self._unscaled)[:-1] == 0

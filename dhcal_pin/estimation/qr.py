@@ -133,6 +133,11 @@ class TriangularSystem:
         """Unknowns that no row depends on, (p,)."""
         return np.logical_not(self.r.any(0))
 
+    @property
+    def column_norms(self) -> Array:
+        """Change of the rows per unit of each unknown, (p,)."""
+        return np.linalg.norm(self.r, axis=0)
+
     @cached_property
     def singular_values(self) -> Array:
         """Singular values of R, those of the Jacobian, largest first."""

@@ -239,12 +239,18 @@ def _workspace_section(context: ReportContext) -> Section | None:
                 for fraction in (0.05, 0.5, 0.95, 1)
             ]
             rows.append([title, *cells, f"{100 * (1 - finite.size / len(std)):.0f} %"])
+    has_model_errors = any(fit.uncertainty.model_std)
+    cause = " and from the errors that the model lacks, which the residuals show" if has_model_errors else ""
     sentences = [
-        "Standard deviation of the tool position that follows from the uncertainty of the parameters, for "
-        "configurations drawn within the joint limits (revolute joints at most half a turn each way). It "
-        "grows with the distance from the measured samples. Unmodelled errors come in addition; the error "
-        "on hold-out or cross-validated samples includes them."
+        "Standard deviation of the tool position that follows from the uncertainty of the parameters"
+        f"{cause}, for configurations drawn within the joint limits (revolute joints at most half a turn "
+        "each way). It grows with the distance from the measured samples."
     ]
+    if not has_model_errors:
+        sentences.append(
+            "Unmodelled errors come in addition; the error on hold-out or cross-validated samples includes "
+            "them."
+        )
     if not is_known.any():
         sentences = [
             "The accuracy cannot be predicted: the measurements do not determine the tool position and no "
@@ -511,7 +517,7 @@ def _certificate_section(context: ReportContext) -> Section:
         "unknown."
     )
     fit = context.fit
-    changed = summary.largest_corrections(fit.estimates, fit.x, fit.prior_std)
+    changed = summary.largest_corrections(fit.estimates, fit.x, fit.solution.system)
     rows = [
         [e.name, e.frame, Quantity(e.change, e.unit, e.std, is_small=True), e.certainty]
         for e in changed[:MAX_CORRECTIONS]

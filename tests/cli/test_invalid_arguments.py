@@ -46,7 +46,8 @@ ARGUMENTS = {
     "holdout of all": ([*CALIBRATE, "--holdout", "1"], ["holdout=1.0", "in [0, 1)"]),
     "holdout below zero": ([*CALIBRATE, "--holdout", "-0.1"], ["holdout=-0.1", "in [0, 1)"]),
     "holdout nan": ([*CALIBRATE, "--holdout", "nan"], ["holdout=nan", "in [0, 1)"]),
-    "nothing left": ([*CALIBRATE, "--holdout", "0.99"], ["every row is held out", "leave some rows"]),
+    "nothing left": ([*CALIBRATE, "--holdout", "0.99"], ["for the fit", "expected a smaller fraction"]),
+    "nothing held out": ([*CALIBRATE, "--holdout", "0.01"], ["holds out none", "expected a larger fraction"]),
     "holdout fitted": ([*CALIBRATE, "--holdout", "./data.csv"], ["data.csv: is given twice", "once"]),
     "data twice": (
         ["calibrate", "arm.urdf", "data.csv", "data.csv", "-o", "out.urdf"],

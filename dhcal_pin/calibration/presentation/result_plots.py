@@ -219,7 +219,7 @@ class ResultPlots:
             f"{count} parameters from {fit.sample_count}; {fit.rank} combinations are identifiable; "
             f"{'converged' if fit.converged else 'NOT converged'} after {fit.iterations} iterations.",
         ]
-        largest = largest_corrections(fit.estimates, fit.x, fit.prior_std)[:5]
+        largest = largest_corrections(fit.estimates, fit.x, fit.solution.system)[:5]
         if largest:
             texts = [
                 f"{e.name} {formatting.format_quantity(e.change, e.unit, e.std, small=True)}" for e in largest

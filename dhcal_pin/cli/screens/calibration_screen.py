@@ -224,7 +224,7 @@ def _accuracy_rows(comparison: Comparison, place: str) -> Iterator[list[str | Qu
 def _correction_block(fit: Result) -> Block:
     """Describe the largest corrections of the robot."""
     is_shown = fit.shrinkage_factor and not fit.verdict.is_refused
-    corrections = summary.largest_corrections(fit.estimates, fit.x, fit.prior_std)[:N_CORRECTIONS]
+    corrections = summary.largest_corrections(fit.estimates, fit.x, fit.solution.system)[:N_CORRECTIONS]
     rows = [
         [e.name, *(Quantity(v, e.unit, e.std, is_small=True) for v in (e.change, e.std))]
         for e in (corrections if is_shown else ())
