@@ -30,10 +30,13 @@ def fit_frames(
 ) -> Result:
     """Fit base and tool to measurements; the rest of the robot is kept.
 
-    All samples take part with their full weight, outliers too, as in a validation.
+    All samples have the same weight unless there are outliers, which would move base and tool.
     """
+    fit = calibrate(chain, data, frames, known=known, loss="linear")
+    if fit.n_outliers:
+        fit = calibrate(chain, data, frames, known=known, loss="tukey")
     # A validation is not judged by another loss.
-    return replace(calibrate(chain, data, frames, known=known, loss="linear"), with_auto=None)
+    return replace(fit, with_auto=None)
 
 
 def frames_differ(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> bool:
@@ -46,4 +49,6 @@ def frames_differ(chain: Chain, data: Sequence[Measurement], known: Mapping[str,
         return False
     step = max(1, -(-n_samples // MAX_SAMPLES))
     fit = fit_frames(chain, [item.take(np.s_[::step]) for item in data], known)
-    return ERROR_RATIO * fit.comparisons[-1].after.groups[group].rms < error.rms
+    # Outliers are in neither figure.
+    given = accuracy(chain, fit.counted, known).groups[group]
+    return ERROR_RATIO * fit.comparisons[-1].after.groups[group].rms < given.rms

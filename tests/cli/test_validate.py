@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -207,3 +208,41 @@ def test_digests_that_are_not_base64_are_refused(run, robot_folder):
     status, _, err = run("validate", "out.urdf", "data.csv")
     assert status == 2
     assert "[manifest] fitted_rows is not base64 text" in unfolded(err)
+
+
+def test_all_columns_count_the_same_samples_and_outliers_are_named(run, robot_folder):
+    """Six of 60 positions are 20 mm wrong: the fitted base and tool are nearly those of the others."""
+    simulate = [
+        "simulate",
+        "example:ur5",
+        "--tip",
+        "tool0",
+        "-n",
+        "60",
+        "--errors",
+        "0.5mm,0.1deg",
+        "--kind",
+        "position",
+    ]
+    assert run(*simulate, "--sigma", "0.05mm", "--seed", "31", "-o", "clean.csv")[0] == 0
+    assert run("calibrate", "example:ur5", "clean.csv", "--tip", "tool0", "-o", "arm.urdf")[0] == 0
+    lines = Path("clean.csv").read_text().splitlines()
+    wrong = range(10, 60, 9)
+    for i in wrong:
+        cells = lines[i].split(",")
+        cells[6] = repr(float(cells[6]) + 0.02)
+        lines[i] = ",".join(cells)
+    Path("wrong.csv").write_text("\n".join(lines) + "\n")
+    listed = ", ".join(str(i + 1) for i in wrong)
+    validate = ["validate", "arm.urdf", "wrong.csv", "--tip", "tool0", "--json", "v.json"]
+    for options in ([], ["--nominal", "example:ur5"], ["--fit-frames"]):
+        status, _, err = run(*validate, *options)
+        assert status == 0
+        text = " ".join(err.split())
+        assert f"Samples far from the others: 6 (lines in wrong.csv: {listed})" in text
+        (rest,) = re.findall(r"RMS position error without them: ([\d.]+) mm", text)
+        assert 0.06 < float(rest) < 0.1
+        document = json.loads(Path("v.json").read_text())
+        # √(6/60)·20 mm
+        assert document["after"]["position_rms_m"] == pytest.approx(6.3e-3, rel=0.03)
+        assert "frames (base, tool) differ" not in text

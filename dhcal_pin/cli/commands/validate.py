@@ -176,6 +176,7 @@ def run(args: Namespace) -> int:
         judged.reference,
         [
             *judged.remarks,
+            *_outlier_remarks(judged, data),
             *(extrapolation.sentences if extrapolation else ()),
             *_rig_remarks(args, given, sidecar),
         ],
@@ -238,12 +239,12 @@ def _judge(args: Namespace, given: Given) -> Judged:
     name = "fitted to these images" if _unstated_entries(given.rig) else "base and tool as given"
     accuracies, alone = {name: before}, before
     if chain.error_families:
-        alone = fit_frames(chain.urdf_alone, data, known).comparisons[-1].after
+        alone = _accuracy_on_all(fit_frames(chain.urdf_alone, data, known), data, known)
         accuracies = {"URDF alone, base and tool fitted": alone, name: before}
     judged = Judged(chain, known, None, before, accuracies, alone)
     if args.fit_frames:
         fit = fit_frames(chain, data, known)
-        after = fit.comparisons[-1].after
+        after = _accuracy_on_all(fit, data, known)
         accuracies = accuracies | {"base and tool fitted": after}
         alone = alone if chain.error_families else after
         judged = Judged(fit.chain, known | fit.instruments, fit, before, accuracies, alone)
@@ -252,6 +253,13 @@ def _judge(args: Namespace, given: Given) -> Judged:
     nominal, reference, remarks = _nominal_accuracy(judged.chain, data, judged.known, args)
     accuracies = {"nominal": nominal, "calibrated": list(judged.accuracies.values())[-1]}
     return judged._replace(before=nominal, accuracies=accuracies, reference=reference, remarks=remarks)
+
+
+def _accuracy_on_all(fit: Result, data: Sequence[Measurement], known: Mapping[str, float]) -> Accuracy:
+    """Return the accuracy on all samples, outliers too, with the fitted base and tool."""
+    from ...calibration import accuracy  # lazy import: loads Pinocchio
+
+    return accuracy(fit.chain, data, {**known, **fit.instruments})
 
 
 def _document(report: Validation, judged: Judged) -> dict[str, Any]:
@@ -263,7 +271,29 @@ def _document(report: Validation, judged: Judged) -> dict[str, Any]:
     else:
         document = validation_to_dict(report.chain, report.data, report.inputs, report.known)
     before, alone = main_statistics(judged.before), main_statistics(judged.alone)
-    return document | {"before": before, "urdf_alone": {"before": before, "after": alone}}
+    after = main_statistics(list(judged.accuracies.values())[-1])
+    return document | {"before": before, "after": after, "urdf_alone": {"before": before, "after": alone}}
+
+
+def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
+    """Name the samples that are far from the others, and state the accuracy without them."""
+    from ...calibration import Accuracy  # lazy import, as the following: they load Pinocchio
+    from ...calibration.evaluation import compute_errors, find_inliers, take_errors
+    from ...calibration.summary import statistic
+    from ...measurements.groups import ERROR_GROUPS
+    from ..screens.screen import list_first
+
+    errors = compute_errors(judged.chain, data, judged.known)
+    masks = find_inliers(errors)
+    rows = [(item.source, item.rows[~mask].tolist()) for item, mask in zip(data, masks, strict=True)]
+    texts = [f"{source}: {list_first(lines)}" for source, lines in rows if lines]
+    if not texts:
+        return []
+    group, rest = next(iter(Accuracy.from_errors(take_errors(errors, masks)).groups.items()))
+    return [
+        f"Samples far from the others: {sum(len(lines) for _, lines in rows)} (lines in {'; '.join(texts)}). "
+        f"RMS {ERROR_GROUPS[group].label} without them: {statistic(rest)}."
+    ]
 
 
 def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str]:
@@ -345,7 +375,7 @@ def _nominal_accuracy(
         return accuracy(nominal, data, known), (nominal, known), []
     fit = fit_frames(nominal, data, known, ",".join(others))
     note = f"nominal: {' and '.join(others)} fitted to these measurements"
-    return fit.comparisons[-1].after, (fit.chain, {**known, **fit.instruments}), [note]
+    return _accuracy_on_all(fit, data, known), (fit.chain, {**known, **fit.instruments}), [note]
 
 
 def _input_warnings(
