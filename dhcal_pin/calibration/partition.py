@@ -125,8 +125,9 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
         groups = group_by_configuration(np.concatenate(rows))
         is_first = np.diff(np.maximum.accumulate(groups), prepend=-1) > 0
         labels[samples] = samples[np.flatnonzero(is_first)[groups]]
-    order = _order_of_joint_values(data)
-    labels[order] = _by_first_appearance(labels[order])
+    if len(labels):
+        order = _order_of_joint_values(data)
+        labels[order] = _by_first_appearance(labels[order])
     return labels
 
 

@@ -188,6 +188,7 @@ def test_a_sample_of_two_configurations_is_compared_by_both():
 
 
 def test_known_distances_between_points_have_no_configuration():
+    assert configuration_groups([]).shape == (0,)
     known = PointDistance(3, [("a", "b"), ("b", "c")], [0.1, 0.1])
     np.testing.assert_array_equal(configuration_groups([known, positions(np.eye(3))]), [3, 4, 2, 1, 0])
 
