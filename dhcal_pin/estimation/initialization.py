@@ -84,9 +84,11 @@ def align(source: Array, target: Array) -> tuple[Array, Array]:
 
 
 def subsample(item: Measurement) -> Measurement:
-    """Take at most 100 samples or whole images, drawn at random as their order may be systematic."""
+    """Take at most 100 samples or whole images, drawn at random from the order of their joint values."""
     labels = item.sample_groups if item.n_images else np.arange(len(item.rows))
-    drawn = np.random.default_rng(0).permutation(int(labels.max(initial=-1)) + 1)[:_MAX_SAMPLES]
+    order = np.lexsort(item.q.T[::-1])
+    names, first = np.unique(labels[order], return_index=True)
+    drawn = names[np.argsort(first)][np.random.default_rng(0).permutation(len(names))[:_MAX_SAMPLES]]
     return item.take(np.flatnonzero(np.isin(labels, drawn)))
 
 

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -14,7 +15,7 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.io import measurement_text, read_measurements
-from dhcal_pin.measurements import KINDS, Noise
+from dhcal_pin.measurements import KINDS, Noise, Pose
 from dhcal_pin.robot import Chain, parse_urdf
 
 FACTORS = {"m": ("mm", 1e3), "rad": ("deg", 180 / np.pi)}
@@ -142,3 +143,17 @@ def test_the_robot_is_the_same(kind, change, sim_6dof, tmp_path):
     for name, values in errors[0].items():
         norms = [np.sort(np.linalg.norm(each, axis=1)) for each in (values, errors[1][name])]
         np.testing.assert_allclose(*norms, rtol=0, atol=TOLERANCES.get((kind, change), 1e-9))
+
+
+@pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 150), ("panda", 400)], [0]))
+def test_more_samples_than_the_start_needs_may_have_any_order(arm, count):
+    """The start takes 100 of the samples: errors before and standard deviations depend on it."""
+    sim = Simulation(arm, count, 5)
+    data = sim.measure(Pose)
+    permuted = data.take(np.random.default_rng(1).permutation(count))
+    first, second = (
+        calibrate(sim.chain, item, "minimal,base,tool", session="unordered") for item in (data, permuted)
+    )
+    np.testing.assert_allclose(second.std, first.std, rtol=1e-6)
+    before = [fit.comparisons[0].before["position_max_m"] for fit in (first, second)]
+    assert before[0] == pytest.approx(before[1], rel=1e-7)
