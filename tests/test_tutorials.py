@@ -120,9 +120,9 @@ def check_02_16(n: Any) -> None:
 
 
 def check_02_20(n: Any) -> None:
-    # Joint origins that moved by less than rounding are not rewritten.
-    assert n.gap < 1e-8
-    assert np.allclose(n.again.poses(n.data.q), n.fit.chain.poses(n.data.q), atol=1e-9)
+    # Joint origins that moved by at most 1e-8 m and rad are not rewritten; the arm reaches 1.3 m.
+    assert n.gap < 2e-8
+    assert np.allclose(n.again.poses(n.data.q), n.fit.chain.poses(n.data.q), rtol=0, atol=2e-8)
 
 
 def check_02_22(n: Any) -> None:
