@@ -517,9 +517,9 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 
 def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
-    """Return how many different configurations have so many independent rows for each direction.
+    """Return the number of different configurations that gives this number of independent rows per direction.
 
-    Few rows determine fewer directions than many rows over the whole joint space would.
+    The present rows may be too few to determine all directions that many rows would determine.
     """
     factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)
