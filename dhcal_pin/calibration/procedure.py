@@ -40,7 +40,7 @@ from ..estimation.problem import (
     Problem,
     merge_instrument_parameters,
 )
-from ..estimation.solver import METHODS, minimize
+from ..estimation.solver import METHODS, SolverResult, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.arguments import as_measurements, require_chain
@@ -210,7 +210,7 @@ def calibrate(
     solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
     first = plausibility.first_errors(chain, data) if LOW_COST in robot_sets else {}
     start = partial(
-        _first_fit, errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
+        _first_fit, errors=errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
     )
     if of_images and not of_images.changes.is_empty:
         of_images, fit, holdout = cameras.fit_with_changes(of_images, data, holdout, start)
@@ -226,7 +226,7 @@ def calibrate(
         found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
         if not found.changes.is_empty:
             changed = found.applied(data, holdout)
-            refit = start(changed[0])
+            refit = start(changed[0], errors=_with_held_axes(errors, fit.solution))
             if found.has_two_robots or confirm_changes(
                 found, fit, refit, lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0]
             ):
@@ -266,8 +266,8 @@ class _SolverOptions:
 
 
 def _first_fit(
-    errors: ErrorModel,
     data: tuple[Measurement, ...],
+    errors: ErrorModel,
     first: Mapping[str, float],
     priors: Priors,
     known: Mapping[str, float],
@@ -292,6 +292,17 @@ def _first_fit(
         problem = replace(problem, bounds=_bounds(problem, bounds))
     start = np.concatenate([_start(errors, first), problem.instrument_start(distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
+
+
+def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
+    """Hold what no row shows of base and tool, such as the rotation of a tool of which a point is measured.
+
+    Changes of the tool act in its axes. These axes would turn until the changes fit better by chance.
+    """
+    system, n = solution.system, len(errors.parameters)
+    is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
+    held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
+    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held))
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:
