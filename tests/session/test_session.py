@@ -337,6 +337,20 @@ def test_a_large_step_of_a_point_does_not_turn_the_tool():
     assert is_named(session_of(fit), changes, simulation)
 
 
+def test_a_small_step_of_a_point_does_not_turn_the_tool_in_the_calibration():
+    """The rotation would follow the noise of a step of 0.3 mm by radians, in more than 100 iterations."""
+    simulation = Simulation("panda", 60, 1)
+    fit = calibrate(
+        simulation.chain, simulation.measure(Position, EVENTS["tool 0.3 mm at 0.1"]), extend="none"
+    )
+    turned = [e.value - e.nominal for e in fit.estimates if e.name in ("tool.rx", "tool.ry", "tool.rz")]
+    np.testing.assert_array_equal(turned, np.zeros(3))
+    assert fit.converged and fit.verdict.status == "caution"
+    # A pose shows the rotation beside the same step.
+    poses = calibrate(simulation.chain, simulation.measure(Pose, EVENTS["tool 0.3 mm at 0.1"]), extend="none")
+    assert not any(e.fixed for e in poses.estimates)
+
+
 def test_an_event_is_found_beside_outliers():
     simulation = Simulation("ur10", 100, 5)
     changes = Changes("base", 2e-3, 0.1 * DEGREE, n_outliers=10)
