@@ -482,7 +482,7 @@ class FittedModel:
     @property
     def observable_fraction(self) -> Array:
         """Fraction of each parameter that lies in the observable directions, (p,), 0 to 1."""
-        return observability.observable_fraction(self.solution.system.r)
+        return observability.observable_fraction(self.solution.system)
 
     @property
     def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:

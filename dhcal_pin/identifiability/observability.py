@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._typing import Array
-from ..estimation.qr import TriangularSystem, row_space
+from ..estimation.qr import TriangularSystem, null_space
 
 # A direction is known if its posterior standard deviation is below this fraction of the prior one.
 MAX_KNOWN_STD_RATIO = 0.5
@@ -34,14 +34,14 @@ MAX_KNOWN_STD_RATIO = 0.5
 _MIN_PROJECTOR_ENTRY = 1e-6
 
 
-def observable_fraction(r: Array) -> Array:
+def observable_fraction(system: TriangularSystem) -> Array:
     """Compute how much of each parameter lies in the observable subspace.
 
     The fraction is the diagonal of the projector P: 1 for an identifiable parameter, 0 for one without effect
     on the measurements, and between them for a parameter that is identifiable only in combination with
     others.
     """
-    return np.clip(np.sum(row_space(r) ** 2, 0), 0.0, 1.0)
+    return np.clip(1 - np.sum(system.null_space**2, 1), 0.0, 1.0)
 
 
 def observability_indices(system: TriangularSystem, samples: int) -> dict[str, float]:
@@ -109,8 +109,8 @@ def connected_components(adjacency: Array) -> list[tuple[int, ...]]:
 
 def unobservable_groups(r: Array) -> list[tuple[tuple[int, ...], int]]:
     """Group the parameters that are identifiable only in combination."""
-    basis = row_space(r)
-    projector = np.eye(r.shape[1]) - basis.T @ basis
+    basis = null_space(r)
+    projector = basis @ basis.T
     return [
         (members, round(float(np.trace(projector[np.ix_(members, members)]))))
         for members in connected_components(np.abs(projector) > _MIN_PROJECTOR_ENTRY)

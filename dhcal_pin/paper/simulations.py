@@ -94,7 +94,7 @@ def simulate(
     system = linearize_and_factor(
         Problem(actual_errors, (_measure(actual, kind, probes),), weights), 0 * truth, small_angle=False
     )
-    is_unobservable = observability.observable_fraction(system.r) < 1 - _UNOBSERVABLE_TOL
+    is_unobservable = observability.observable_fraction(system) < 1 - _UNOBSERVABLE_TOL
     angle, length, test = np.zeros((3, seeds, steps + 1))
     residual = np.zeros(seeds)
     ranks = (0, 0)
