@@ -13,6 +13,7 @@ from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, calibrate
+from dhcal_pin.calibration.verdict import MIN_STATED_ROWS_PER_DIRECTION
 from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 from dhcal_pin.measurements.pose import PoseMeasurement
 from dhcal_pin.plausibility.hypotheses import mend
@@ -251,11 +252,14 @@ def check_honest(seeds: range, max_caution_share: float) -> None:
     results = [judge_honest(seed) for seed in seeds]
     refused = [(text, fit.verdict.reasons) for text, fit in results if fit.verdict.is_refused]
     assert not refused
-    # Few measurements are a cause for caution.
+    # Few measurements are a cause for caution, and so is an unknown size of the robot.
     cautions = [
         (text, fit.verdict.reasons)
         for text, fit in results
-        if fit.verdict.status == "caution" and not fit.shrinkage_notes
+        if fit.verdict.status == "caution"
+        and not fit.shrinkage_notes
+        and fit.rows_per_direction >= MIN_STATED_ROWS_PER_DIRECTION
+        and any(item.has_length_scale for item in fit.data)
     ]
     assert len(cautions) <= max_caution_share * len(results), cautions
 

@@ -345,7 +345,8 @@ def test_a_small_step_of_a_point_does_not_turn_the_tool_in_the_calibration():
     )
     turned = [e.value - e.nominal for e in fit.estimates if e.name in ("tool.rx", "tool.ry", "tool.rz")]
     np.testing.assert_array_equal(turned, np.zeros(3))
-    assert fit.converged and fit.verdict.status == "caution"
+    assert fit.converged
+    assert fit.verdict.status == "caution"
     # A pose shows the rotation beside the same step.
     poses = calibrate(simulation.chain, simulation.measure(Pose, EVENTS["tool 0.3 mm at 0.1"]), extend="none")
     assert not any(e.fixed for e in poses.estimates)
