@@ -71,6 +71,7 @@ class DampingState:
     damping: float = rules.INITIAL_DAMPING
     scale: Array | float = 0.0  # Column scales D of shape (p,), the largest norms of the columns of R so far
     last_change: float = 0.0  # Norm of the change of the rows by the last step; zero if unknown
+    last_step: Array | None = None  # Last step (p,); None if it does not show a direction of slow steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +122,15 @@ def next_iterate(problem: Problem, solution: SolverResult) -> Array:
     return solution.x + bounded_step(problem, system, solution.x)
 
 
+def _undamped_change(problem: Problem, data: TriangularSystem, x: Array) -> float:
+    """Compute the norm of the change of the whitened rows by an undamped step from x (p,)."""
+    system = data.with_priors(problem.weights, x)
+    return euclidean_norm(system.residual_change(bounded_step(problem, system, x)))
+
+
 def remaining_change(problem: Problem, x: Array) -> float:
     """Compute the norm of the change of the whitened rows by a fresh Gauss-Newton step from x (p,)."""
-    system = linearize_and_factor(problem, x, small_angle=False).with_priors(problem.weights, x)
-    return float(np.linalg.norm(system.r @ bounded_step(problem, system, x)))
+    return _undamped_change(problem, linearize_and_factor(problem, x, small_angle=False), x)
 
 
 def _cost(problem: Problem, system: TriangularSystem, x: Array) -> float:
@@ -191,6 +197,37 @@ def _undamped_steps(problem: Problem, x: Array, cost: float) -> tuple[Array, flo
     return (end, end_cost) if end_cost < cost else (x, cost)
 
 
+def _extrapolated(
+    problem: Problem,
+    undamped: TriangularSystem,
+    x: Array,
+    system: TriangularSystem,
+    steps: tuple[Array, Array],
+) -> tuple[Array, TriangularSystem] | None:
+    """Return a better point on the way to the limit of slow steps, with its system; None if there is none.
+
+    The last two steps led to x, the last one second; the undamped system is that before it.
+    """
+    last_change, change = map(undamped.residual_change, steps)
+    factor = rules.extrapolation_factor(change, last_change)
+    cost = _cost(problem, system, x)
+    roundoff = rules.cost_roundoff(math.sqrt(cost), undamped.roundoff)
+    for share in rules.EXTRAPOLATED_SHARES if factor else ():
+        end = x + share * factor * steps[1]
+        end = end if problem.bounds is None else np.clip(end, *problem.bounds)
+        if has_diverged(end):
+            continue
+        end_system = linear_system(problem, end)
+        reduction = cost - _cost(problem, end_system, end)
+        # Costs that agree within rounding do not show which point is better, but the undamped steps do.
+        if reduction > roundoff or (
+            reduction > -roundoff
+            and _undamped_change(problem, end_system, end) < _undamped_change(problem, system, x)
+        ):
+            return end, end_system
+    return None
+
+
 def levenberg_marquardt(
     problem: Problem,
     x: Array,
@@ -204,6 +241,7 @@ def levenberg_marquardt(
     damping, scale, last_change = state.damping, state.scale, state.last_change
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
     growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
+    last_step = state.last_step
     system = warm_start.system if warm_start else linear_system(problem, x)
     cost = _cost(problem, system, x)
     while iteration < max_iterations and not converged and damping <= rules.MAX_DAMPING:
@@ -215,7 +253,7 @@ def levenberg_marquardt(
             and damping < rules.MAX_CONVERGED_DAMPING
             and _is_stationary(problem, undamped, x, cost, last_change, roundoff, LOOSE_RTOL)
         ):
-            state = DampingState(damping, scale, last_change)
+            state = DampingState(damping, scale, last_change, last_step)
             return SolverResult(x, system, iteration, False, np.array(iterates), state)
         scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
         damping_scale = np.where(scale > 0, scale, 1.0)
@@ -247,6 +285,15 @@ def levenberg_marquardt(
                 trial_cost = problem.cost(x + step)
             gain = rules.gain_ratio(cost, trial_cost, predicted)
             within_roundoff = rules.is_within_roundoff(predicted, trial_cost, residual_norm, roundoff)
+            if within_roundoff and not is_negligible:
+                # Costs do not show whether the step is good, but the length of the next one does.
+                trial_system = trial_system or linear_system(problem, x + step)
+                changes = (
+                    _undamped_change(problem, system, x),
+                    _undamped_change(problem, trial_system, x + step),
+                )
+                if rules.is_growing(*changes, roundoff):
+                    within_roundoff, gain = False, 0.0
             if rules.is_acceptable(cost, trial_cost, gain, within_roundoff):
                 damping = rules.damping_after_acceptance(damping, gain, within_roundoff)
                 growth = rules.INITIAL_GROWTH
@@ -269,7 +316,8 @@ def levenberg_marquardt(
             x, cost = _undamped_steps(problem, x, cost)
             accepted_system = None
         # Unknown if x did not move, or only by undamped steps after a rejection.
-        last_change = change if x is not start and growth == rules.INITIAL_GROWTH else 0.0
+        has_moved = x is not start and growth == rules.INITIAL_GROWTH
+        last_change = change if has_moved else 0.0
         iterates.append(x)
         if progress:
             progress(iteration, cost)
@@ -278,7 +326,13 @@ def levenberg_marquardt(
             system = system.recentered(x - start)
         elif x is not start:
             system = accepted_system or linear_system(problem, x)
-    state = DampingState(damping, scale, last_change)
+            steps = (last_step, step) if last_step is not None and has_moved else None
+            last_step = step if has_moved and last_undamped != iteration else None
+            if steps and (better := _extrapolated(problem, undamped, x, system, steps)):
+                # The next two steps show a direction again.
+                x, system = better
+                cost, last_step, last_change = _cost(problem, system, x), None, 0.0
+    state = DampingState(damping, scale, last_change, last_step)
     return SolverResult(x, system, iteration, converged, np.array(iterates), state)
 
 

@@ -13,14 +13,20 @@ Notation of one iteration, with the triangular system ‖R·δ - z‖² + min_co
 - gain ratio: ρ = (F - F₊) / predicted reduction,
 - roundoff: ε = EPS_MODEL·‖R‖, the rounding error of the model's rows.
 
-Acceptance: F₊ ≤ F and ρ > MIN_GAIN_RATIO, or both costs agree within rounding.
+Acceptance: F₊ ≤ F and ρ > MIN_GAIN_RATIO, or both costs agree within rounding and undamped steps do not grow.
 
 Damping (Nielsen 1999): after an accepted step λ ← λ·max(MIN_DAMPING_FACTOR, 1 - (2ρ - 1)³), after a
 rejected one λ ← λ·ν and ν ← 2·ν.
 
+Extrapolation: where the rows are curved, steps may shrink by the same ratio again and again, along one
+direction. A further step leads to their limit (`extrapolation_factor`), or a part of the way. It is kept if
+the cost falls; where costs agree within rounding, if undamped steps become shorter.
+
 Termination: the step is negligible (`step_is_negligible`) and λ < MAX_CONVERGED_DAMPING.
 
 References:
+    A. C. Aitken, On Bernoulli's numerical solution of algebraic equations, Proc. Royal Society of
+    Edinburgh 46, 1926.
     J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 4 and 10.
     H. B. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05, DTU 1999.
 """
@@ -58,6 +64,12 @@ MAX_DAMPING = 1e16
 MAX_CONVERGED_DAMPING = 1e-3
 # Factor ν on the damping after the first rejected step; it doubles with each further rejection.
 INITIAL_GROWTH = 2.0
+
+# Two steps have the same direction if the cosine between their changes of the rows exceeds this value. They
+# converge slowly if the second one is longer than this fraction of the first one.
+MIN_SAME_DIRECTION, MIN_SLOW_RATIO = 0.99, 0.3
+# Shares of the way to the limit of slow steps that are tried one after the other.
+EXTRAPOLATED_SHARES = 1.0, 0.5, 0.25
 
 # Iterations before the first series of undamped steps, and number of steps in a series.
 UNDAMPED_INTERVAL = 8
@@ -137,6 +149,25 @@ def damping_after_acceptance(damping: _Number, gain: _Number, within_roundoff: A
 def damping_after_rejection(damping: _Number, growth: _Number) -> tuple[_Number, _Number]:
     """Compute the damping and its growth factor that follow a rejected step."""
     return damping * growth, growth * 2
+
+
+def is_growing(change: float, next_change: float, roundoff: float) -> bool:
+    """Decide whether undamped steps grow by more than rounding: the damping is too small for curved rows."""
+    return next_change > max(change, ROUNDOFF_FACTOR * roundoff)
+
+
+def extrapolation_factor(change: Array, last_change: Array) -> float:
+    """Compute the further multiple of the last step that leads to the limit of slowly shrinking steps.
+
+    Steps δ, ρ·δ, ρ²·δ, … end after a further ρ/(1 - ρ) of the last one (Aitken). The changes of the rows (p,)
+    by the last two steps give ρ, which is negative if the steps alternate. The factor is 0 if the directions
+    of the steps differ or convergence is fast.
+    """
+    product, square = float(change @ last_change), float(last_change @ last_change)
+    same_direction = MIN_SAME_DIRECTION * float(np.sqrt(square * (change @ change)))
+    ratio = product / square if square else 0.0
+    is_slow = abs(product) > same_direction and MIN_SLOW_RATIO < abs(ratio) < 1
+    return ratio / (1 - ratio) if is_slow else 0.0
 
 
 def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:

@@ -115,10 +115,11 @@ def test_nominal_robots_and_numbers_of_samples_may_differ():
 def test_rank_and_standard_deviations_agree_with_calibrate(sim_6dof, sim_6dof_actual):
     rng = np.random.default_rng(0)
     errors = select_parameters(sim_6dof, "dh")
-    data = [[Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (20, 6)), NOISE, rng)] for _ in range(3)]
+    data = [[Position.simulate(sim_6dof_actual, rng.uniform(-3, 3, (30, 6)), NOISE, rng)] for _ in range(3)]
     found = solve_batch(BatchProblem.from_models([errors] * 3, data, np.zeros(24)))
     for i, items in enumerate(data):
         fit = calibrate(sim_6dof, items, "dh", priors="none")
+        assert fit.converged
         assert found.rank[i] == fit.rank == 23
         np.testing.assert_allclose(found.std[i], fit.std, rtol=1e-5)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import joint_sample, measured_arm
+from robots import joint_sample, measured_arm, robot_file
+from scipy.optimize import least_squares
 
 from dhcal_pin.estimation import (
     METHODS,
@@ -18,6 +19,7 @@ from dhcal_pin.estimation import solver_rules as rules
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
 from dhcal_pin.measurements import Noise, Position, SphereContact
+from dhcal_pin.robot import Chain
 
 
 def case(sim_6dof, sim_6dof_actual, sets="dh", m=20):
@@ -54,6 +56,53 @@ def test_a_loose_solution_is_not_a_step_that_damping_shortened(seed):
     start = np.zeros(len(problem.weights))
     full, loose = (levenberg_marquardt(problem, start, 100, loose=loose) for loose in (False, True))
     assert problem.cost(loose.x) <= 1.0001 * problem.cost(full.x)
+
+
+def test_steps_with_curved_rows_converge():
+    """A robot without unknown base and tool poses does not explain the residuals, whose curvature remains.
+
+    Undamped steps grow or hardly shrink there. The trust region method of SciPy ends at the same cost.
+    """
+    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    placement, errors = select_parameters(chain, "placement"), select_parameters(chain, "minimal")
+    n_iterations = []
+    for seed in range(6):
+        rng = np.random.default_rng([71, seed])
+        size = np.where([p.unit == "m" for p in placement.parameters], 1e-3, 3e-3)
+        truth = placement.at(size * rng.normal(size=len(size)))
+        data = Position.simulate(truth, rng.uniform(-3, 3, (60, 6)), Noise(5e-5), rng)
+        problem = Problem(errors, (data,), 1 / errors.priors)
+        found = levenberg_marquardt(problem, np.zeros(len(problem.weights)), 100)
+        assert found.converged
+        n_iterations.append(found.iterations)
+
+        def rows(x, problem=problem):
+            return np.append(problem.residuals(x, problem.data)[0].ravel(), problem.weights * x)
+
+        expected = least_squares(rows, np.zeros(len(problem.weights)), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert problem.cost(found.x) == pytest.approx(2 * expected.cost, rel=1e-9)
+    assert max(n_iterations) < 40
+
+
+@pytest.mark.parametrize("ratio", [-0.9, 0.5, 0.95])
+def test_the_limit_of_slow_steps_is_that_of_their_geometric_series(ratio):
+    step = np.array([3.0, -1.0])
+    rest = sum(ratio**k * step for k in range(1, 1000))
+    np.testing.assert_allclose(rules.extrapolation_factor(step, step / ratio) * step, rest, rtol=1e-9)
+
+
+def test_fast_steps_and_turning_steps_are_not_extrapolated():
+    step = np.array([3.0, -1.0])
+    assert rules.extrapolation_factor(0.1 * step, step) == 0
+    assert rules.extrapolation_factor(1.1 * step, step) == 0
+    assert rules.extrapolation_factor(np.array([2.5, 0.0]), step) == 0
+    assert rules.extrapolation_factor(step, np.zeros(2)) == 0
+
+
+def test_undamped_steps_grow_only_above_rounding():
+    assert rules.is_growing(1e-5, 2e-5, 1e-9)
+    assert not rules.is_growing(2e-5, 1e-5, 1e-9)
+    assert not rules.is_growing(1e-9, 2e-9, 1e-9)
 
 
 @pytest.mark.parametrize("method", METHODS)
