@@ -226,9 +226,13 @@ def calibrate(
         found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
         if not found.changes.is_empty:
             changed = found.applied(data, holdout)
-            refit = start(changed[0], errors=_with_held_axes(errors, fit.solution))
+            held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
+            refit = start(changed[0], errors=held)
             if found.has_two_robots or confirm_changes(
-                found, fit, refit, lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0]
+                found,
+                fit,
+                reweighted(refit, AUTO),
+                lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0],
             ):
                 fit, holdout = refit, changed[1]
             else:

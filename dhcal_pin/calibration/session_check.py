@@ -84,6 +84,7 @@ def residuals_of(fit: Fit) -> Sequence[Array]:
 
 
 def without_changes(session: Session) -> Session:
-    """Return a session in which nothing changed."""
+    """Return a session in which nothing changed, and whose lag is not corrected."""
     kept = tuple(cause for cause in session.causes if cause.block.is_constant)
-    return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=())
+    lag = replace(session.lag, is_corrected=False) if session.lag else None
+    return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=(), lag=lag)

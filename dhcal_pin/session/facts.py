@@ -15,7 +15,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .causes import Block, Cause, Drift, FreeDrift, Step
 from .linear_model import growing_links
-from .robot_changes import RobotChanges, apply_changes
+from .robot_changes import JointPaths, RobotChanges, apply_changes
 from .timeline import Place, Timeline
 
 # A motion is stated as an angle if that moves the tool by more than this multiple of its translation.
@@ -153,11 +153,13 @@ class Lag:
         value: Time by which the joint values are too early, in `unit`.
         std: Standard deviation of the value.
         unit: "row" or "s".
+        is_corrected: Whether the samples are fitted with the joint values of the right time.
     """
 
     value: float
     std: float
     unit: str
+    is_corrected: bool = True
 
     @property
     def finding(self) -> str:
@@ -170,7 +172,8 @@ class Lag:
     @property
     def consequence(self) -> str:
         """What to do."""
-        return f"Record both at the same time, or add --mend lag:{self.value:.4g}."
+        corrected = "The calibration corrected this. " * self.is_corrected
+        return f"{corrected}Record both at the same time, or add --mend lag:{self.value:.4g}."
 
 
 @dataclass(frozen=True)
@@ -239,7 +242,8 @@ class Session:
     ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
         """Return fitted and held-out measurements with the changes as conditions of their samples."""
         timeline = replace(self.timeline, data=(*data, *holdout))
-        return apply_changes(self.changes, self.chain, timeline, None)
+        paths = JointPaths(timeline) if self.changes.lag else None
+        return apply_changes(self.changes, self.chain, timeline, paths)
 
     def described(self) -> Session:
         """Return the session with events and drifts that describe its causes."""

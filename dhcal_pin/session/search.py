@@ -23,6 +23,7 @@ Shapes: N samples in the order of measurement, K cells of consecutive samples, k
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -593,6 +594,22 @@ class _Search:
         return 0.5 * (costs[0] - costs[1] - float(width.min())) - float(prior)
 
     # ------------------------------------------------------------------------------------------- after it
+    def with_lag_alone(self) -> _Search | None:
+        """Return a search with a lag as the only cause; None if there is no lag."""
+        lag = [cause for cause in self.causes if cause.block.kind == "lag"]
+        if not lag:
+            return None
+        alone = copy.copy(self)
+        alone.causes = lag
+        alone._drop_others()
+        alone._settle()
+        return alone
+
+    def corrected_timeline(self) -> Timeline:
+        """Return the timeline with the joint positions at the times of the measured values."""
+        fitted, held_out = apply_changes(self.changes, self.chain, self.timeline, self.paths)
+        return replace(self.timeline, data=(*fitted, *held_out))
+
     def place_steps(self) -> None:
         """Move steps between two fitted samples to where the held-out samples between them fit best."""
         timeline, layout = self.timeline, self.layout
@@ -730,11 +747,14 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     # A search that ends in a wrong minimum says nothing.
     if search.log_noise(search.solve(search.linearize(), search.causes)) > min(noises):
         return nothing
+    alone = search.with_lag_alone() if len(search.causes) > 1 else None
+    if alone and not _is_suspicious(problem, alone.x, alone.corrected_timeline(), is_ordered):
+        search = alone
     other_robot = search.other_robot() if search.causes else None
     search.place_steps()
     causes = tuple(search.causes)
     return Session(
-        search.changes.without_lag,
+        search.changes,
         timeline,
         chain,
         is_ordered,

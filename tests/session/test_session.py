@@ -401,13 +401,28 @@ def test_a_lag_is_found_and_mended():
     lag = session_of(fit).lag
     assert lag is not None
     assert lag.value == pytest.approx(0.4, abs=0.01)
-    assert fit.verdict.status != "ok"
+    assert fit.verdict.status == "caution"
+    assert lag.is_corrected
+    clean = Simulation("ur10", 200, 4, is_path=True)
+    expected = calibrate(clean.chain, clean.measure(Position), extend="none")
+    assert simulation.true_error(fit.chain) <= 1.5 * clean.true_error(expected.chain)
     key = lag.consequence.rsplit(" ", 1)[1].rstrip(".")
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
     assert session_of(mended).lag is None
-    clean = Simulation("ur10", 200, 4, is_path=True)
-    expected = calibrate(clean.chain, clean.measure(Position), extend="none")
     assert simulation.true_error(mended.chain) <= 1.5 * clean.true_error(expected.chain)
+
+
+@pytest.mark.parametrize(
+    ("lag", "seed"), some_slow(list(product([0.02, 0.1, -0.3, 1.6], range(3))), {0, 4, 11})
+)
+def test_no_joint_errors_or_steps_are_fitted_to_a_lag(lag, seed):
+    simulation, clean = (Simulation("ur10", 300, seed, is_path=True) for _ in range(2))
+    fit = calibrate(simulation.chain, simulation.measure(Position, Changes(lag=lag)))
+    assert [found.value for found in session_of(fit).found] == pytest.approx([lag], abs=0.005)
+    assert fit.extension is not None
+    assert not fit.extension.families
+    expected = calibrate(clean.chain, clean.measure(Position), extend="none", session="off")
+    assert simulation.true_error(fit.chain) <= 2 * clean.true_error(expected.chain)
 
 
 @pytest.mark.parametrize("scales", [(1.0, 1.0, 1.003), (1.015, 1.015, 1.015)])
