@@ -106,6 +106,11 @@ class FittedModel:
         return self.bare.chain if self.bare else self.chain
 
     @property
+    def robot(self) -> Chain:
+        """The calibrated robot, `chain`."""
+        return self.chain
+
+    @property
     def model(self) -> pin.Model:
         """Pinocchio model of the calibrated URDF."""
         return self.chain.urdf_alone.model

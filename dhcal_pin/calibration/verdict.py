@@ -395,6 +395,8 @@ def _plausible_cause(fit: Evidence) -> str:
             )
         if fit.errors.is_of_arm.sum() < len(select_parameters(fit.errors.chain, "minimal").parameters):
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
+        if fit.rank < len(fit.x) and not fit.problem.weights.any():
+            return "Nothing holds the parameters that the measurements do not determine: --priors default."
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
     if fit.input_warnings:

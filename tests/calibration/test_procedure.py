@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import random_joints, random_table
+from robots import random_joints, random_table, robot_file
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
@@ -157,3 +157,17 @@ def test_small_damped_step_does_not_end_the_iteration(seed, prismatic, theta, d,
     fit = calibrate(arm, Pose(q[:40], truth.poses(q[:40])), "dh,base,tool", priors="none")
     assert fit.converged
     assert np.abs(fit.chain.poses(q[40:]) - truth.poses(q[40:])).max() < 1e-9
+
+
+@pytest.mark.parametrize("options", [{"priors": "none"}, {"method": "gn"}])
+def test_missing_priors_are_named_where_they_are_needed(options):
+    """A point on the axis of the last joint does not show the turns of that axis."""
+    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors, rng = select_parameters(chain, "minimal"), np.random.default_rng(5)
+    size = np.where([p.unit == "m" for p in errors.parameters], 1e-3, 3e-3)
+    truth = errors.at(size * rng.normal(size=len(size)))
+    data = Position.simulate(truth, rng.uniform(-3, 3, (60, 6)), Noise(5e-5), rng)
+    without = calibrate(chain, data, "minimal,base,tool", **options)
+    assert without.verdict.is_refused
+    assert without.verdict.reasons[0].endswith("--priors default.")
+    assert calibrate(chain, data, "minimal,base,tool", **options | {"priors": "default"}).verdict.status == "ok"
