@@ -343,8 +343,18 @@ def _hand_eye_error(fit: Evidence) -> list[Finding]:
 
 
 def _hand_eye_images(fit: Evidence) -> list[Finding]:
-    """Advise caution if the images of a hand-eye calibration are too similar, or some do not fit."""
-    return [Finding("caution", text) for text in (fit.hand_eye.image_sentences if fit.hand_eye else [])]
+    """Advise caution if images of a hand-eye calibration are too few or too similar, or some do not fit."""
+    if fit.hand_eye:
+        return [Finding("caution", text) for text in fit.hand_eye.image_sentences]
+    count = len(np.unique(configuration_groups(fit.data)))
+    has_only_images = bool(fit.camera_stages) and all(item.kind == "camera" for item in fit.data)
+    if not has_only_images or count >= cameras.MIN_CONFIGURATIONS:
+        return []
+    text = (
+        f"{count} different configurations are too few to judge cameras, boards and arm by left-out images. "
+        f"Take images at {cameras.MIN_CONFIGURATIONS} or more."
+    )
+    return [Finding("caution", text)]
 
 
 def _describe(size: CorrectionSize) -> str:

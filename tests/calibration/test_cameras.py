@@ -57,6 +57,18 @@ def test_an_arm_that_is_wrong_by_millimetres_is_corrected(arm):
     assert not any("do not show that the arm is wrong" in text for text in fit.input_warnings)
 
 
+@pytest.mark.parametrize("count", [3, 4])
+def test_few_images_of_a_wrong_arm_are_a_cause_for_caution(arm, count):
+    rng = np.random.default_rng(1)
+    errors = dh.select_parameters(arm, "placement")
+    size = np.where([p.unit == "m" for p in errors.parameters], 1e-3, 5e-3)
+    truth = errors.at(size * rng.normal(size=len(errors.parameters)))
+    fit = dh.calibrate(arm, images_of(truth, count, rng))
+    assert fit.verdict.status == "caution"
+    assert any(f"{count} different configurations are too few" in text for text in fit.verdict.reasons)
+    assert not any("noise of the corners explains them" in text for text in fit.input_warnings)
+
+
 def test_an_arm_with_errors_of_another_kind_is_kept(arm):
     """Periodic joint errors in a narrow region: errors of links would fit, and would be wrong elsewhere."""
     rng = np.random.default_rng(1)

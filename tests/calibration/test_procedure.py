@@ -170,4 +170,6 @@ def test_missing_priors_are_named_where_they_are_needed(options):
     without = calibrate(chain, data, "minimal,base,tool", **options)
     assert without.verdict.is_refused
     assert without.verdict.reasons[0].endswith("--priors default.")
-    assert calibrate(chain, data, "minimal,base,tool", **options | {"priors": "default"}).verdict.status == "ok"
+    assert (
+        calibrate(chain, data, "minimal,base,tool", **options | {"priors": "default"}).verdict.status == "ok"
+    )

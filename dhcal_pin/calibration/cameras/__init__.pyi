@@ -7,6 +7,7 @@ from .axis_order import exchange_axes as exchange_axes
 from .axis_order import reorder as reorder
 from .board_size import BoardSize as BoardSize
 from .board_size import find_board_size as find_board_size
+from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import largest_position_std as largest_position_std

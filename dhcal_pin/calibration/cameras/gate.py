@@ -105,7 +105,7 @@ class Gate:
         if self.is_open:
             return f"The arm is demonstrably wrong: {effect} {format_ratio(self.ratio)}."
         start = "The nominal arm is kept, as the images do not show that the arm is wrong:"
-        if self.is_right:
+        if self.is_right and self.n_configurations >= N_CLUSTERS:
             return f"{start} the noise of the corners explains them with the nominal arm."
         if np.isnan(self.ratio):
             return (
