@@ -16,6 +16,7 @@ from ..compensation import LIMITS, compensate
 from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import read_configurations, read_targets
+from ..io.measurement_files.targets import TARGETS
 from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
 from ..io.servo_file import read_servos
 from ..io.settings import read_priors
@@ -201,7 +202,7 @@ def _require_few(source: str, count: int) -> None:
 
 def read_task(path: PathLike, chain: Chain) -> Array:
     """Read the configurations where the accuracy matters."""
-    table = read_table(path)
+    table = read_table(path, TARGETS)
     _require_few(os.fspath(path), len(table.lines))
     if any(name in table.columns for name in chain.joint_names):
         return read_configurations(path, chain)

@@ -95,6 +95,7 @@ class CalibrationOutcome:
 
     fit: Result
     make_document: Callable[[], dict[str, Any]]  # Function that collects the result as a JSON document
+    robot: str  # Path of the robot; with a bundle, the names of all inputs are those in the bundle
     settings: Mapping[str, str]  # Choices as text, by name
     files: dict[str, str]  # Paths of the files written, by what they are
     n_rows: dict[str, int]  # Number of rows that were read, by measurement file
@@ -488,6 +489,7 @@ def _write_job(
     outcome = CalibrationOutcome(
         fit=fit,
         make_document=partial(_job_document, fit, data, (outliers, held_out), listed, source),
+        robot=job.robot,
         settings=source.settings,
         files=files,
         n_rows=data.n_rows,

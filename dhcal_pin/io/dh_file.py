@@ -40,7 +40,7 @@ from ..units import ANGLES, LENGTHS
 from . import toml_table as toml
 from .robot_format import ConvertedRobot, RobotSource
 from .sidecar import existing_sidecar
-from .tables import Column, DataTable, read_table
+from .tables import Column, DataTable, TextLayout, read_table
 from .tabular import parse_number, require_usable_names
 from .toml_table import Key, TomlTable
 
@@ -49,6 +49,8 @@ _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": 
 _REQUIRED = ("theta", "d", "a", "alpha")
 _LIMITS = {"lower": -math.inf, "upper": math.inf}
 _JOINT_TYPES = ("revolute", "prismatic")
+# Header of a CSV file, as an example in messages.
+_CSV_HEADER = "joint,type,theta[deg],d[mm],a[mm],alpha[deg]"
 # Largest entry of a table [m or rad]; a larger one has the wrong unit.
 _MAX_ENTRY = 1e4
 # Largest number of joints.
@@ -129,7 +131,7 @@ def _read_dh_toml(path: PathLike) -> DHTable:
 
 
 def _read_dh_csv(path: PathLike) -> DHTable:
-    table = read_table(path)
+    table = read_table(path, TextLayout(header_example=_CSV_HEADER))
     table.require_good_rows()
     notes = _notes(table)
     convention = notes.get("convention")
@@ -146,10 +148,7 @@ def _read_dh_csv(path: PathLike) -> DHTable:
             )
     for name in ("joint", "type", *_REQUIRED):
         if name not in table.columns:
-            raise FileFormatError(
-                f"{table.header_location}: column {name!r} is missing; "
-                "write joint,type,theta[deg],d[mm],a[mm],alpha[deg]"
-            )
+            raise FileFormatError(f"{table.header_location}: column {name!r} is missing; write {_CSV_HEADER}")
     columns: dict[str, list[Any]] = {
         "name": table.text(table.columns["joint"]),
         "type": table.text(table.columns["type"]),

@@ -172,7 +172,8 @@ class ListKey(Key):
         if values is None:
             return None
         if self.size not in (None, len(values)):
-            raise FileFormatError(f"{table.where}: {key} has {len(values)} entries; expected {self.size}")
+            count = f"{len(values)} {'entry' if len(values) == 1 else 'entries'}"
+            raise FileFormatError(f"{table.where}: {key} has {count}; expected {self.size}")
         for value in values:
             if not self.entry.accepts(value):
                 raise FileFormatError(

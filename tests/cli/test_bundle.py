@@ -57,6 +57,14 @@ def test_a_bundle_repeats_the_calibration_with_equal_bytes(first, tmp_path, monk
     assert set(json.loads((tmp_path / "r.json").read_text())["inputs"]) == {"sim_6dof.dh.toml", "laser.csv"}
 
 
+def test_a_warning_about_a_robot_elsewhere_is_shown_with_a_bundle(first, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["calibrate", "--from", str(first / "arm.dhcal.zip"), "-o", "out.urdf", "--bundle", "b.dhcal.zip"]
+    assert main([*words, "--curves", "c.csv"]) == 0
+    text = " ".join(capsys.readouterr().err.split())
+    assert "sim_6dof.dh.toml: warning: the table of --curves has no rows" in text
+
+
 def test_inspect_says_what_a_bundle_holds(first, capsys):
     assert main(["inspect", str(first / "arm.dhcal.zip"), "--json", "-"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -171,6 +171,12 @@ def test_outputs_do_not_overwrite_inputs(assert_refused):
     assert_refused(["link.urdf: is an input"], "calibrate", "arm.urdf", "data.csv", "-o", "link.urdf")
 
 
+def test_an_empty_file_of_targets_is_answered_with_the_header_of_targets(assert_refused):
+    Path("empty.csv").write_text("")
+    words = ["empty.csv: is empty", "a header such as x[mm],y[mm],z[mm]"]
+    assert_refused(words, "compensate", "arm.urdf", "arm.urdf", "empty.csv", "-o", "c.csv")
+
+
 @pytest.mark.parametrize("command", ["calibrate", "validate", "check"])
 def test_invalid_robot_is_one_line_in_every_command(assert_refused, command):
     Path("bad.dh.toml").write_text(Path("arm.dh.toml").read_text().replace('convention = "standard"', ""))

@@ -191,6 +191,12 @@ def test_invalid_csv_files_raise_an_error_that_names_the_problem(tmp_path, edit,
         assert word in str(caught.value)
 
 
+@pytest.mark.parametrize("rows", ["", "1,2,3\n4,5,6\n"])
+def test_a_csv_file_without_a_header_is_answered_with_that_of_a_dh_table(tmp_path, rows):
+    with pytest.raises(DhcalError, match=r"such as joint,type,theta\[deg\],d\[mm\],a\[mm\],alpha\[deg\]"):
+        read_dh(write(tmp_path, "arm.dh.csv", "# convention: standard\n" + rows))
+
+
 def test_csv_files_need_all_required_columns(tmp_path):
     lines = SCARA_CSV.splitlines()
     for gone, name in ((2, "theta"), (3, "d"), (4, "a"), (5, "alpha"), (0, "joint"), (1, "type")):

@@ -31,14 +31,14 @@ _VERDICT_STYLES = {"ok": "green", "caution": "yellow", "refused": "red"}
 def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     """Describe the result of a calibration."""
     fit = outcome.fit
-    names = short_names([job.robot, *outcome.n_rows])
+    names = short_names([outcome.robot, *outcome.n_rows])
     is_refused = fit.verdict.is_refused
     # The parameters of a refused robot have no meaning.
     unidentified = [] if is_refused else summary.parameter_notes(fit.unobservable, fit.weakly_observable)
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
     all_warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
     signs = fit.signs
-    turned = [f"{names[job.robot]}: warning: {signs.note}"] if signs and signs.turned else []
+    turned = [f"{names[outcome.robot]}: warning: {signs.note}"] if signs and signs.turned else []
     warnings = [text for text in all_warnings if text not in turned]
     moved = [f"warning: {text}" for text in outcome.moved_zeros]
     notes = [
@@ -51,7 +51,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
     by_file = summary.file_table([names[path] for path in outcome.fitted], fit.file_comparisons)
     blocks = [
-        Block(_robot_lines(fit, names[job.robot], outcome.settings["parameters"])),
+        Block(_robot_lines(fit, names[outcome.robot], outcome.settings["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
         Block(by_file if by_file else [], noun="file", rank=6, n_kept=4, has_space=True),

@@ -203,7 +203,7 @@ def _layout(table: TomlTable) -> TextLayout:
 
 
 def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str, str]) -> list[ColumnRule]:
-    size = len(toml.list_of(_COLUMN).read(table, "order"))
+    size = len(toml.list_of(_COLUMN).read(table, "order") if "names" in table else joints)
     values = table.values(joint_keys(size, joints))
     unit, signs, offsets = (values[key] for key in ("unit", "sign", "offset"))
     units = toml.list_of(Key(), size).read(table, "unit") if isinstance(unit, list) else [unit] * size

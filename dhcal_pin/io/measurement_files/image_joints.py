@@ -12,7 +12,7 @@ from typing import NamedTuple
 from ..._typing import PathLike
 from ...exceptions import FileFormatError
 from ...units import UNITS
-from ..tables import read_table
+from ..tables import TextLayout, read_table
 from .columns import is_in_order
 
 IMAGE = "image"
@@ -33,7 +33,7 @@ def read_image_joints(path: PathLike, images: Sequence[str]) -> dict[str, dict[s
 
 def read_joint_table(path: PathLike, images: Sequence[str]) -> ImageJoints:
     """Read the joint values that belong to images, in the order of the table if it is that of measurement."""
-    table = read_table(path)
+    table = read_table(path, TextLayout(header_example=f"{IMAGE},joint_1[deg],…"))
     headers = [header.strip() for header in table.headers]
     if IMAGE not in headers:
         raise FileFormatError(

@@ -13,9 +13,12 @@ from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...robot.chain import Chain
 from ...robot.conditions import Conditions
-from ..tables import read_table
+from ..tables import TextLayout, read_table
 from . import reading
 from .columns import check_columns, check_joint_names, find_kind, value_table
+
+# Layout of files of targets.
+TARGETS = TextLayout(header_example="x[mm],y[mm],z[mm]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +59,7 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
         FileFormatError: The columns are those of another measurement kind.
     """
     check_joint_names(chain)
-    table = read_table(path)
+    table = read_table(path, TARGETS)
     table.require_good_rows()
     ignored = check_columns(table, chain)
     measured = value_table(table, chain)

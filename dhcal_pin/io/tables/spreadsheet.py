@@ -54,7 +54,9 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
         raise FileFormatError(f"{source}: not an Excel workbook: {error}; save it as .xlsx") from error
     filled = {title: rows for title, rows in sheets.items() if rows}
     if not filled:
-        raise FileFormatError(f"{source}: is empty; the first row must be a header such as joint_1[deg]")
+        raise FileFormatError(
+            f"{source}: is empty; the first row must be a header such as {layout.header_example}"
+        )
     if layout.sheet and layout.sheet not in filled:
         raise UnknownNameError(
             f"{source}: no sheet {layout.sheet!r} with content; choose from {', '.join(map(repr, filled))}"
@@ -146,4 +148,5 @@ def _build_table(
         description=description,
         notes=notes,
         units=units[:width],
+        header_example=layout.header_example,
     )

@@ -37,6 +37,8 @@ MAX_ROWS = 1_000_000
 _KNOWN_UNITS = frozenset(unit for units in UNITS.values() for unit in units)
 # Largest number of lines, or of runs of lines, that a message lists.
 MAX_LISTED_RUNS = 100
+# Header of a measurement file, as an example in messages.
+MEASUREMENT_HEADER = "joint_1[deg],…,x[mm],y[mm],z[mm]"
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class DataTable:
     description: str = ""  # How the file is written, such as "semicolons, decimal commas"
     notes: tuple[str, ...] = ()  # Sentences on what was not read, such as further sheets
     units: tuple[str, ...] = ()  # Cells of the row of units under the header; empty if there is none
+    header_example: str = MEASUREMENT_HEADER  # Header that is expected, for messages
     euler_angles: EulerAngles | None = None  # Angles that columns of rotation vectors were computed from
 
     @classmethod
@@ -114,7 +117,7 @@ class DataTable:
         if self.has_numbers_as_header:
             raise FileFormatError(
                 f"{self.header_location}: numbers where the header must be; "
-                "write one such as joint_1[deg],…,x[mm],y[mm],z[mm]"
+                f"write one such as {self.header_example}"
             )
         columns: dict[str, Column] = {}
         for index, cell in enumerate(self.headers):

@@ -26,7 +26,7 @@ import numpy as np
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
-from .table import DataTable, require_few_rows, units_under_header
+from .table import MEASUREMENT_HEADER, DataTable, require_few_rows, units_under_header
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
 BLANK_CHARACTERS = " \t,;"
@@ -56,6 +56,7 @@ class TextLayout:
     # Start of a comment line; empty if there are none.
     comment: str = "#"
     encoding: str = "utf-8"  # Encoding of the file
+    header_example: str = MEASUREMENT_HEADER  # Header that is expected, for messages
 
 
 # Layout of a file of which nothing is known.
@@ -90,7 +91,7 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
             content.append((line_number, line))
     if not content:
         raise FileFormatError(
-            f"{source}: is empty; the first line must be a header such as joint_1[deg],…,x[mm],y[mm],z[mm]"
+            f"{source}: is empty; the first line must be a header such as {layout.header_example}"
         )
     texts = [line for _, line in content]
     separator = layout.separator or _detect_separator(texts[:_N_SEPARATOR_ROWS])
@@ -128,6 +129,7 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
         bad,
         f"{name}, decimal commas" if decimal == "," else name,
         units=units,
+        header_example=layout.header_example,
     )
 
 
