@@ -79,6 +79,22 @@ ARGUMENTS = {
         ["validate", "arm.urdf", "data.csv", "--json", "data.csv"],
         ["data.csv: is an input"],
     ),
+    "plan to a PDF": (
+        ["plan", "arm.urdf", "-n", "9", "-o", "poses.pdf"],
+        ["poses.pdf: unknown ending; write poses as .csv"],
+    ),
+    "plan of ISO 9283 to a PDF": (
+        ["plan", "arm.urdf", "--iso9283", "-o", "poses.pdf"],
+        ["poses.pdf: unknown ending; write poses as .csv"],
+    ),
+    "plan with a scene as text": (
+        ["plan", "arm.urdf", "-n", "9", "-o", "poses.csv", "--html", "scene.txt"],
+        ["scene.txt: unknown ending; write a scene as .html"],
+    ),
+    "view as text": (
+        ["view", "arm.urdf", "--html", "scene.txt"],
+        ["scene.txt: unknown ending; write a scene as .html"],
+    ),
     "check over its robot": (["check", "arm.urdf", "--json", "arm.urdf"], ["arm.urdf: is an input"]),
     "check nothing": (["check", "no.urdf"], ["no.urdf", "No such file"]),
     "no samples": (
