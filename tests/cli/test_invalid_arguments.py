@@ -79,6 +79,20 @@ ARGUMENTS = {
         ["validate", "arm.urdf", "data.csv", "--json", "data.csv"],
         ["data.csv: is an input"],
     ),
+    **{
+        f"{words[0]} a sheet of a CSV file": (
+            [*words, "--sheet", "Foo"],
+            ["--sheet Foo: no input is an Excel file; expected .xlsx"],
+        )
+        for words in (
+            CALIBRATE,
+            ["validate", "arm.urdf", "data.csv"],
+            ["recheck", "arm.urdf", "data.csv"],
+            ["inspect", "data.csv"],
+            ["view", "arm.urdf", "--data", "data.csv", "--html", "scene.html"],
+            ["plan", "arm.urdf", "-n", "9", "-o", "poses.csv", "--data", "data.csv"],
+        )
+    },
     "plan to a PDF": (
         ["plan", "arm.urdf", "-n", "9", "-o", "poses.pdf"],
         ["poses.pdf: unknown ending; write poses as .csv"],

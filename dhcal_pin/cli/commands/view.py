@@ -89,7 +89,7 @@ def run(args: Namespace) -> int:
     from ...io.robot import robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
-    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
+    from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block, notes_block, warnings_block
     from ..screens.screen import Screen
@@ -106,6 +106,7 @@ def run(args: Namespace) -> int:
     settings = filter(None, (args.rig, args.columns, args.servos))
     inputs = [*robots, *sidecars, *args.data, *settings]
     require_writable_outputs([page, args.json], inputs)
+    require_workbook(args.sheet, inputs)
     require_endings(chosen_files(vars(args), OUTPUTS))
     chains = [read_robot_or_table(path, args) for path in robots]
     sidecar = existing_sidecar(robots[-1])
