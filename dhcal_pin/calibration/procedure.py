@@ -25,7 +25,7 @@ import fnmatch
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -159,7 +159,7 @@ def calibrate(
         again = partial(recalibrate, turned=result.signs.turned if result.signs else turned)
         return replace(result, region_comparison=leave_regions_out(result, again, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
-    _check_options(data, method, loss, bounds)
+    _check_options(data, method, loss, bounds, session, max_iterations)
     with_auto = (
         None
         if method == "lm" and loss == "auto"
@@ -392,6 +392,8 @@ def _check_options(
     method: str,
     loss: str,
     bounds: Mapping[str, tuple[float, float]] | None,
+    session: str,
+    max_iterations: int,
 ) -> None:
     """Raise an error if there are no data, an option is unknown, or options contradict each other."""
     if not sum(len(item.rows) for item in data):
@@ -400,6 +402,11 @@ def _check_options(
         raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
     if loss not in robust.LOSSES:
         raise UnknownNameError(f"unknown loss {loss!r}; choose from {', '.join(robust.LOSSES)}")
+    if session not in get_args(SessionOption):
+        choices = ", ".join(get_args(SessionOption))
+        raise UnknownNameError(f"unknown session option {session!r}; choose from {choices}")
+    if max_iterations < 1:
+        raise InvalidArgumentError(f"max_iterations is {max_iterations}; expected at least 1")
     if loss not in ("auto", "linear") and method != "lm":
         raise InvalidArgumentError(
             f"loss {loss!r} requires method 'lm'; method {method!r} weights all samples equally"

@@ -21,7 +21,7 @@ from ..programs import Program, Stop, program_text, require_program_ending
 from ..report.provenance import file_digests, versions
 from ..robot.chain import Chain
 from ..units import parse_noise
-from .output_table import Output, chosen_files, file_contents, paths_by_name
+from .output_table import Output, chosen_files, file_contents, paths_by_name, require_endings
 from .outputs import require_writable_outputs, write_outputs
 from .plan_input import input_paths, parse_length, workspace_constraints
 from .plan_outputs import DEGREE_DECIMALS
@@ -85,7 +85,7 @@ def _program_content(done: IsoPlanned, path: str) -> str:
 
 
 OUTPUTS: dict[str, Output[IsoPlanned]] = {
-    "output": Output(lambda done, path: _poses_text(done)),
+    "output": Output(lambda done, path: _poses_text(done), "poses", (".csv",)),
     "json": Output(None),
     "export": Output(_program_content),
 }
@@ -98,6 +98,7 @@ def run_iso_plan(args: Namespace) -> int:
             raise InvalidArgumentError(f"{option}: not allowed with --iso9283, which states all poses")
     inputs, files = input_paths(args), chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in files], inputs)
+    require_endings(files)
     for path in args.export:
         require_program_ending(path)
     sides = [parse_length(args.cube, "--cube", "a side with a unit, such as 400mm")] if args.cube else SIDES

@@ -11,6 +11,7 @@ from contextlib import suppress
 from .._typing import PathLike
 from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.sidecar import existing_sidecar
+from ..io.tables import WORKBOOK_ENDINGS
 from ..report.json_document import json_text
 from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
@@ -34,6 +35,15 @@ def require_writable_outputs(outputs: Sequence[str | None], inputs: Sequence[str
         if not is_stream(path) and any(is_same_file(path, other) for other in paths[:number]):
             raise InvalidArgumentError(f"{path}: is another output already; choose a different path for each")
         require_writable(path)
+
+
+def require_workbook(sheet: str, inputs: Sequence[str]) -> None:
+    """Require an Excel file among the inputs if a sheet is named."""
+    if sheet and not any(path.lower().endswith(WORKBOOK_ENDINGS) for path in inputs):
+        endings = " or ".join(WORKBOOK_ENDINGS)
+        raise InvalidArgumentError(
+            f"--sheet {sheet}: no input is an Excel file; expected {endings}, or leave out --sheet"
+        )
 
 
 def existing_sidecars(robots: Sequence[str]) -> list[str]:

@@ -143,10 +143,10 @@ def _report_content(done: Planned, path: str) -> str:
 
 
 OUTPUTS: dict[str, Output[Planned]] = {
-    "output": Output(lambda done, path: done.poses_text),
+    "output": Output(lambda done, path: done.poses_text, "poses", (".csv",)),
     "json": Output(None),
     "export": Output(_program_content),
-    "html": Output(lambda done, path: done.scene),
+    "html": Output(lambda done, path: done.scene, "a scene", (".html",), (".htm",)),
     "report": Output(_report_content, "the report of a plan", (".html",), (".htm",)),
 }
 

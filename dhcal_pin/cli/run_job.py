@@ -67,6 +67,7 @@ from .output_table import file_contents, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
     is_same_file,
+    require_workbook,
     require_writable_outputs,
     write_outputs,
 )
@@ -215,6 +216,7 @@ def checked_inputs(job: Job) -> list[str]:
     settings += dict.fromkeys(filter(None, (servos.path, servos.lerobot))) if servos else []
     inputs = [job.robot, *existing_sidecars([job.robot]), *measured, *settings]
     require_servos(job.output, servos)
+    require_workbook(job.sheet, measured)
     require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
     companions = companion_paths(job.output, servos is not None)

@@ -79,6 +79,36 @@ ARGUMENTS = {
         ["validate", "arm.urdf", "data.csv", "--json", "data.csv"],
         ["data.csv: is an input"],
     ),
+    **{
+        f"{words[0]} a sheet of a CSV file": (
+            [*words, "--sheet", "Foo"],
+            ["--sheet Foo: no input is an Excel file; expected .xlsx"],
+        )
+        for words in (
+            CALIBRATE,
+            ["validate", "arm.urdf", "data.csv"],
+            ["recheck", "arm.urdf", "data.csv"],
+            ["inspect", "data.csv"],
+            ["view", "arm.urdf", "--data", "data.csv", "--html", "scene.html"],
+            ["plan", "arm.urdf", "-n", "9", "-o", "poses.csv", "--data", "data.csv"],
+        )
+    },
+    "plan to a PDF": (
+        ["plan", "arm.urdf", "-n", "9", "-o", "poses.pdf"],
+        ["poses.pdf: unknown ending; write poses as .csv"],
+    ),
+    "plan of ISO 9283 to a PDF": (
+        ["plan", "arm.urdf", "--iso9283", "-o", "poses.pdf"],
+        ["poses.pdf: unknown ending; write poses as .csv"],
+    ),
+    "plan with a scene as text": (
+        ["plan", "arm.urdf", "-n", "9", "-o", "poses.csv", "--html", "scene.txt"],
+        ["scene.txt: unknown ending; write a scene as .html"],
+    ),
+    "view as text": (
+        ["view", "arm.urdf", "--html", "scene.txt"],
+        ["scene.txt: unknown ending; write a scene as .html"],
+    ),
     "check over its robot": (["check", "arm.urdf", "--json", "arm.urdf"], ["arm.urdf: is an input"]),
     "check nothing": (["check", "no.urdf"], ["no.urdf", "No such file"]),
     "no samples": (

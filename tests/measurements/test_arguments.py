@@ -58,6 +58,8 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
+        ({"session": "x"}, UnknownNameError, "unknown session option 'x'; choose from auto, unordered, off"),
+        ({"max_iterations": -1}, InvalidArgumentError, "max_iterations is -1; expected at least 1"),
         ({"method": "newton"}, UnknownNameError, "unknown method 'newton'; choose from lm, gn"),
         (
             {"loss": "l1"},

@@ -43,7 +43,7 @@ def run(args: Namespace) -> int:
     from ...io.servo_file import read_servos
     from ...measurements.mounting import mount_rig
     from ...report.provenance import file_digests
-    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import inspection_screen
 
@@ -57,6 +57,7 @@ def run(args: Namespace) -> int:
     settings = [path for path in (args.columns, args.rig, args.servos) if path]
     inputs = [*robots, *existing_sidecars(robots), *args.data, *settings]
     require_writable_outputs([args.json], inputs)
+    require_workbook(args.sheet, inputs)
     chain = (
         read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
         if args.robot

@@ -25,7 +25,7 @@ def run(args: Namespace) -> int:
     from ...report.provenance import file_digests
     from ..arm_types import with_arm_type
     from ..output_table import chosen_files, file_contents, require_endings
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_workbook, require_writable_outputs, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
     from ..plan_outputs import OUTPUTS, Planned, plan_document
     from ..screens import console
@@ -34,6 +34,7 @@ def run(args: Namespace) -> int:
     count, n_repeated = planned_count(args)
     kind, inputs, files = planned_kind(args), input_paths(args), chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in files], inputs)
+    require_workbook(args.sheet, inputs)
     require_endings(files)
     for path in args.export:
         require_program_ending(path)

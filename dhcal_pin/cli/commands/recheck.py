@@ -93,7 +93,7 @@ def run(args: Namespace) -> int:
     from ...session import recheck
     from ...units import parse_noise
     from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_workbook, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import recheck_screen
 
@@ -101,6 +101,7 @@ def run(args: Namespace) -> int:
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
     outputs = chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in outputs], inputs)
+    require_workbook(args.sheet, inputs)
     require_endings(outputs)
     if args.plot and not args.history:
         raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")

@@ -148,13 +148,14 @@ def run(args: Namespace) -> int:
     from ...report.provenance import file_digests
     from ...report.validation import Validation
     from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_workbook, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
     inputs, outputs = _input_paths(args, sidecar), chosen_files(vars(args), OUTPUTS)
     require_writable_outputs([file.path for file in outputs], inputs)
+    require_workbook(args.sheet, inputs)
     require_endings(outputs)
     given = _read_input(args, sidecar)
     judged = _judge(args, given)

@@ -6,7 +6,7 @@ import os
 import tempfile
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
@@ -25,10 +25,13 @@ from ..options import (
     read_data,
     read_robot_or_table,
 )
+from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
     from ...measurements import Measurement, MountedRig
     from ...robot import Chain
+
+OUTPUTS: dict[str, Output[Any]] = {"html": Output(None, "a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
@@ -86,7 +89,7 @@ def run(args: Namespace) -> int:
     from ...io.robot import robot_name
     from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
     from ...visualization import scene
-    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
+    from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_block, notes_block, warnings_block
     from ..screens.screen import Screen
@@ -103,6 +106,8 @@ def run(args: Namespace) -> int:
     settings = filter(None, (args.rig, args.columns, args.servos))
     inputs = [*robots, *sidecars, *args.data, *settings]
     require_writable_outputs([page, args.json], inputs)
+    require_workbook(args.sheet, inputs)
+    require_endings(chosen_files(vars(args), OUTPUTS))
     chains = [read_robot_or_table(path, args) for path in robots]
     sidecar = existing_sidecar(robots[-1])
     rig = _rig(args.rig, sidecar, chains[-1])

@@ -24,8 +24,10 @@ class TableFormat(NamedTuple):
     read: Callable[[PathLike, TextLayout], DataTable]  # Function that reads a file
 
 
+# Endings of files with sheets.
+WORKBOOK_ENDINGS = (".xlsx", ".xlsm")
 FORMATS = (
-    TableFormat((".xlsx", ".xlsm"), read_spreadsheet),
+    TableFormat(WORKBOOK_ENDINGS, read_spreadsheet),
     TableFormat((".parquet", ".pq"), read_parquet),
     TableFormat((), read_text_table),
 )
