@@ -149,7 +149,14 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
 
     Returns:
         Errors of the held-out samples.
+
+    Raises:
+        InvalidArgumentError: The folds are none of these data.
     """
+    if not isinstance(folds, Sequence | None):
+        raise InvalidArgumentError(
+            f"folds has type {type(folds).__name__}; expected folds such as k_fold(fit.data, 5)"
+        )
     if folds is None:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, partial(refit, fit)))

@@ -159,7 +159,7 @@ def calibrate(
         again = partial(recalibrate, turned=result.signs.turned if result.signs else turned)
         return replace(result, region_comparison=leave_regions_out(result, again, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
-    _check_options(data, method, loss, bounds, session, max_iterations)
+    _check_options(data, parameters, method, loss, bounds, session, max_iterations)
     with_auto = (
         None
         if method == "lm" and loss == "auto"
@@ -389,6 +389,7 @@ def _initialize(
 
 def _check_options(
     data: Sequence[Measurement],
+    parameters: str | Iterable[str] | None,
     method: str,
     loss: str,
     bounds: Mapping[str, tuple[float, float]] | None,
@@ -398,6 +399,10 @@ def _check_options(
     """Raise an error if there are no data, an option is unknown, or options contradict each other."""
     if not sum(len(item.rows) for item in data):
         raise InvalidArgumentError("no measurements to fit; expected at least one sample")
+    if not isinstance(parameters, Iterable | None):
+        raise InvalidArgumentError(
+            f"parameters has type {type(parameters).__name__}; expected names of parameter sets"
+        )
     if method not in METHODS:
         raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
     if loss not in robust.LOSSES:

@@ -305,7 +305,7 @@ def run_manifest(args: Namespace) -> int:
         return 130
     n_written = sum(map(_is_written, outcomes))
     console.show(_fleet_screen(entries, outcomes, args), args.verbosity)
-    if n_written < total:
+    if n_written < total or (args.strict and any(outcome.status == REFUSED for outcome in outcomes)):
         return 1
     return DOUBTFUL if args.strict and any(outcome.status != OK for outcome in outcomes) else 0
 

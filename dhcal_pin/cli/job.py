@@ -25,7 +25,7 @@ from .output_table import Output, OutputFile, chosen_files
 
 # Value of --holdout for regions of joint space that are left out in turn.
 REGION = "region"
-# Exit status with --strict of robots that are written with another verdict than "ok".
+# Exit status with --strict of robots that are written with the verdict "caution".
 DOUBTFUL = 4
 # File extension of a bundle, and of a manifest of several jobs.
 BUNDLE_ENDING = ".dhcal.zip"

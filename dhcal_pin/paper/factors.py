@@ -31,6 +31,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
+from ..measurements.validation import validated_joint_positions
 from ..robot.dh import DHTable
 
 # Singular values below this fraction of the largest one count as zero.
@@ -160,13 +161,14 @@ def error_factors(table: DHTable, q: Array) -> Array:
         Δθ_1 … Δθ_n, Δd_1 … Δd_n, Δa_1 … Δa_n, Δα_1 … Δα_n.
 
     Raises:
-        InvalidArgumentError: The table has modified DH parameters, for which the paper gives no factors.
+        InvalidArgumentError: The table has modified DH parameters, for which the paper gives no factors, or
+            q is no array of numbers.
     """
     if table.convention != "standard":
         raise InvalidArgumentError(
             "the paper's error factors need standard DH parameters; convert the table first"
         )
-    u = tail_matrices(table, q)
+    u = tail_matrices(table, validated_joint_positions(q, "error_factors"))
     k1, k2, k3 = link_vectors(table)
     blocks = [thf(u, k1, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
     return np.concatenate([np.swapaxes(block, 1, 2) for block in blocks], -1)

@@ -151,10 +151,15 @@ class Chain:
             Chain with identity base and tool.
 
         Raises:
-            InvalidArgumentError: The source is neither a path nor a `Urdf`.
+            InvalidArgumentError: The source is neither a path nor a `Urdf`, or a link is no text.
         """
         if not isinstance(source, (str, os.PathLike, Urdf)):
             raise InvalidArgumentError(f"source has type {type(source).__name__}; expected a path or a Urdf")
+        for name, link in (("tip", tip), ("root", root)):
+            if not isinstance(link, str | None):
+                raise InvalidArgumentError(
+                    f"{name} has type {type(link).__name__}; expected the name of a link"
+                )
         urdf = source if isinstance(source, Urdf) else read_urdf(source)
         tip = tip if tip is not None else default_tip(urdf)
         first_link = urdf.root if root is None else root

@@ -21,7 +21,8 @@ Exit status
 1      a check disagrees, or a robot of a fleet failed or was refused
 2      the input is wrong: one line on stderr names file, line or column, the problem and what is expected;
        nothing is written
-3      the calibration is refused and no robot is written, unless ``--force`` is given
+3      the calibration is refused and no robot is written; with ``--force`` the robot is written and the
+       status is 0, with ``--force --strict`` it is written and the status is 3
 4      with ``--strict``: the robot is written with the verdict caution
 130    interrupted; the message says which files are written
 =====  ==========================================================================================

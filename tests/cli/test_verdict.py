@@ -22,7 +22,7 @@ UNFINISHED = ("--max-iterations", "1")
 
 
 def test_refused_robot_is_not_written(run, robot_folder, undrawn):
-    status, _, err = run(*CALIBRATE, *OUTPUTS, *UNFINISHED)
+    status, _, err = run(*CALIBRATE, *OUTPUTS, "--residuals", "e.csv", "--bundle", "b.dhcal.zip", *UNFINISHED)
     assert status == 3
     document = parse_json(Path("r.json").read_text())
     assert document["verdict"]["status"] == "refused"
@@ -30,17 +30,18 @@ def test_refused_robot_is_not_written(run, robot_folder, undrawn):
     assert "did not converge" in reason
     assert unfolded(err).endswith(f"verdict: refused (no robot written; --force overrides) {reason}")
     assert {path.name for path in robot_folder.iterdir()} == {
-        *("arm.dh.toml", "arm.urdf", "data.csv", "r.json", "r.html", "r.md")
+        *("arm.dh.toml", "arm.urdf", "data.csv", "r.json", "r.html", "r.md", "e.csv", "b.dhcal.zip")
     }
-    assert set(document["files"]) == {"json", "report", "report_2"}
+    assert set(document["files"]) == {"json", "report", "report_2", "residuals"}
     page, text = Path("r.html").read_text(), Path("r.md").read_text()
     assert page.index("Verdict: refused") < page.index("<h1>")
     assert text.split("\n\n")[1:3] == ["**Verdict: refused**", reason]
 
 
-def test_force_writes_a_refused_robot(run, robot_folder, undrawn):
-    status, _, _ = run(*CALIBRATE, *OUTPUTS, *UNFINISHED, "--force")
-    assert status == 0
+@pytest.mark.parametrize(("words", "expected"), [((), 0), (("--strict",), 3)])
+def test_force_writes_a_refused_robot(run, robot_folder, undrawn, words, expected):
+    status, _, _ = run(*CALIBRATE, *OUTPUTS, *UNFINISHED, "--force", *words)
+    assert status == expected
     document = parse_json(Path("r.json").read_text())
     assert document["verdict"]["status"] == "refused"
     assert all(Path(name).exists() for name in ("out.urdf", "out.calibration.toml", "m.csv"))
@@ -54,14 +55,16 @@ def test_accepted_robot_is_written(run, robot_folder):
     assert Path("out.urdf").exists()
 
 
-@pytest.mark.parametrize("force", [False, True])
-def test_refused_robot_fails_a_fleet(run, robot_folder, force):
+@pytest.mark.parametrize(("force", "words"), [(False, ()), (True, ()), (True, ("--strict",))])
+def test_refused_robot_fails_a_fleet(run, robot_folder, force, words):
     job = '[[job]]\nrobot = "arm.dh.toml"\ndata = "data.csv"\n'
     more = f"max_iterations = 1\nforce = {str(force).lower()}\n"
     text = f'{job}output = "a.urdf"\n{job}output = "b.urdf"\n{more}'
     Path("all.fleet.toml").write_text(text)
-    status, _, err = run("calibrate", "all.fleet.toml", "-o", "s.csv", "--json", "s.json", "--jobs", "1")
-    assert status == (0 if force else 1)
+    status, _, err = run(
+        "calibrate", "all.fleet.toml", "-o", "s.csv", "--json", "s.json", "--jobs", "1", *words
+    )
+    assert status == (0 if force and not words else 1)
     assert "did not converge" in err
     document = parse_json(Path("s.json").read_text())
     assert [one["status"] for one in document["jobs"]] == ["ok", "refused"]

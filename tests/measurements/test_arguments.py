@@ -11,7 +11,9 @@ from robots import paper
 
 from dhcal_pin.calibration import accuracy, calibrate, calibrate_stream, cross_validate, k_fold, split
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
+from dhcal_pin.io import read_measurements
 from dhcal_pin.measurements import Position
+from dhcal_pin.paper import error_factors
 from dhcal_pin.robot import Chain
 
 CHAIN = Chain.from_dh(paper("sim_6dof"))
@@ -47,6 +49,8 @@ DATA = Position(np.random.default_rng(0).uniform(-3, 3, (40, 6)), np.zeros((40, 
         (accuracy, (CHAIN, "laser.csv"), "data: expected measurements"),
         (split, ("laser.csv", 0.3), "data: expected measurements"),
         (k_fold, (CHAIN, 5), "data: expected measurements"),
+        (read_measurements, (5, CHAIN), "source has type int; expected a path or a data frame"),
+        (error_factors, (paper("sim_6dof"), "a"), "error_factors: q of type str is not an array of numbers"),
     ],
 )
 def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], message: str):
@@ -58,6 +62,11 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
 @pytest.mark.parametrize(
     ("kwargs", "error", "message"),
     [
+        (
+            {"parameters": 5},
+            InvalidArgumentError,
+            "parameters has type int; expected names of parameter sets",
+        ),
         ({"session": "x"}, UnknownNameError, "unknown session option 'x'; choose from auto, unordered, off"),
         ({"max_iterations": -1}, InvalidArgumentError, "max_iterations is -1; expected at least 1"),
         ({"method": "newton"}, UnknownNameError, "unknown method 'newton'; choose from lm, gn"),
@@ -96,7 +105,7 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
 )
 def test_wrong_values_are_named(kwargs: dict[str, Any], error: type[Exception], message: str):
     with pytest.raises(error, match=message):
-        calibrate(CHAIN, DATA, "dh", **kwargs)
+        calibrate(CHAIN, DATA, **{"parameters": "dh", **kwargs})
 
 
 def test_one_measurement_needs_no_list(sim_6dof, sim_6dof_actual):
@@ -107,6 +116,8 @@ def test_one_measurement_needs_no_list(sim_6dof, sim_6dof_actual):
     assert fit.comparisons[0].n_samples == 10
     assert fit.validate(held_out) == accuracy(fit.chain, held_out)
     assert len(k_fold(fitted, 5)) == 5
+    with pytest.raises(InvalidArgumentError, match="folds has type int; expected folds such as k_fold"):
+        cross_validate(fit, 1)  # pyright: ignore[reportArgumentType]
     assert cross_validate(fit, k_fold(fitted, 5)).accuracy["position_samples"] == 30
 
 

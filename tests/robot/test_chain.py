@@ -189,6 +189,7 @@ def test_joint_positions_of_another_shape_are_refused(sim_6dof, method):
     ("method", "arguments", "message"),
     [
         ("from_urdf", (5,), "source has type int; expected a path or a Urdf"),
+        ("from_urdf", ("arm.urdf", 5), "tip has type int; expected the name of a link"),
         ("from_dh", ("arm.dh.toml",), "table has type str; expected a DHTable"),
         ("with_payload", (2.0,), "payload has type float; expected a Payload or None"),
         ("with_transmission", (None,), "transmission has type NoneType; expected a Transmission"),

@@ -39,7 +39,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--strict",
         action="store_true",
-        help="exit status 4 for the verdict caution; the files are written",
+        help="exit status 4 for the verdict caution, and 3 for a refused robot with --force; the files are "
+        "written",
     )
 
 
@@ -94,6 +95,6 @@ def _calibrate_robot(args: Namespace) -> int:
         outcome = run_any_job(job, folder, progress, executor)
     console.show(calibration_screen(outcome, job), args.verbosity)
     verdict = outcome.fit.verdict
-    if verdict.is_refused and not job.force:
+    if verdict.is_refused and (args.strict or not job.force):
         return REFUSED
     return DOUBTFUL if args.strict and verdict.status != "ok" else 0

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from ..._typing import PathLike
-from ...exceptions import FileFormatError
+from ...exceptions import FileFormatError, InvalidArgumentError
 from .data_frame import data_frame_table, is_data_frame, read_parquet
 from .spreadsheet import read_spreadsheet
 from .table import DataTable
@@ -45,6 +45,10 @@ def read_table(source: PathLike | Any, layout: TextLayout = DETECTED) -> DataTab
     """Read a table from a file or a data frame."""
     if is_data_frame(source):
         return data_frame_table(source)
+    if not isinstance(source, str | os.PathLike):
+        raise InvalidArgumentError(
+            f"source has type {type(source).__name__}; expected a path or a data frame"
+        )
     name = os.fspath(source).lower()
     for ending, remedy in _UNREADABLE.items():
         if name.endswith(ending):
