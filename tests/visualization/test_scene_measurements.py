@@ -195,7 +195,7 @@ def test_uncertainty_of_a_cell_is_that_of_its_configurations(fit):
     """The mean over all cells, weighted by nothing, is near that of an independent draw."""
     cells = uncertainty_cells(fit)
     lower, upper = np.maximum(fit.chain.lower, -np.pi), np.minimum(fit.chain.upper, np.pi)
-    q = np.random.default_rng(9).uniform(lower, upper, (4000, 6))
+    q = np.random.default_rng(9).uniform(lower, upper, (20000, 6))
     prediction = fit.predict(q)
     base = se3.inverse(fit.chain.base)
     points = prediction.poses[:, :3, 3] @ base[:3, :3].T + base[:3, 3]
