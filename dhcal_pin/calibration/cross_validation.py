@@ -151,7 +151,7 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
         Errors of the held-out samples.
 
     Raises:
-        InvalidArgumentError: The folds are none of these data.
+        InvalidArgumentError: The folds are no sequence.
     """
     if not isinstance(folds, Sequence | None):
         raise InvalidArgumentError(

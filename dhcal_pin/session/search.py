@@ -595,7 +595,10 @@ class _Search:
 
     # ------------------------------------------------------------------------------------------- after it
     def with_lag_alone(self) -> _Search | None:
-        """Return a search with a lag as the only cause; None if there is no lag."""
+        """Return a search with a lag as the only cause; None if there is no lag.
+
+        The last samples of a path are near each other, so that a step imitates small errors of the lag there.
+        """
         lag = [cause for cause in self.causes if cause.block.kind == "lag"]
         if not lag:
             return None
