@@ -173,6 +173,13 @@ class FamilyTrial:
             and self.improvement > FAMILIES[self.family].rule.min_improvement
         )
 
+    @property
+    def verdict(self) -> str:
+        """Whether the family was added, and whether the measurements support it."""
+        if not self.is_selected:
+            return "not selected"
+        return "added" if self.is_supported else "added, not supported"
+
 
 def trial_table(trials: Sequence[FamilyTrial]) -> Table:
     """Make a table of the effect of each family on the cross-validated error."""
@@ -180,7 +187,7 @@ def trial_table(trials: Sequence[FamilyTrial]) -> Table:
     rows = [
         [
             trial.family,
-            "added" if trial.is_selected else "not selected",
+            trial.verdict,
             format_fixed(trial.cv_before, 3),
             format_fixed(trial.cv_after, 3),
             f"{trial.log_bayes_factor:+.1f}",
@@ -218,6 +225,11 @@ class Extension:
         return tuple(trial.family for trial in self.trials if trial.is_selected)
 
     @property
+    def supported(self) -> tuple[str, ...]:
+        """Names of the added families that the measurements support; the others have a physical cause."""
+        return tuple(trial.family for trial in self.trials if trial.is_selected and trial.is_supported)
+
+    @property
     def effective_samples(self) -> float:
         """Number of independent configurations that the measurements count for."""
         return self.n_configurations / self.temperature
@@ -226,7 +238,11 @@ class Extension:
     def sentences(self) -> list[str]:
         """Say what was added, what it improves and how much the samples count."""
         widths = {trial.family: trial.prior_width for trial in self.trials}
-        added = ", ".join(f"{name} (prior width {widths[name]:.2g} of default)" for name in self.families)
+        added = ", ".join(
+            f"{name} ({'' if name in self.supported else 'not supported, '}"
+            f"prior width {widths[name]:.2g} of default)"
+            for name in self.families
+        )
         changes = [
             f"{kind} {_percent(ratio)}"
             for kind, ratio in (("at random", self.random_ratio), ("by region", self.region_ratio))
@@ -244,6 +260,7 @@ class Extension:
         """Return the content for the JSON document."""
         return {
             "families": list(self.families),
+            "supported": list(self.supported),
             "temperature": self.temperature,
             "effective_samples": self.effective_samples,
             "configurations": self.n_configurations,

@@ -16,8 +16,10 @@ from dhcal_pin.calibration.model_selection import (
     families_by_stage,
     family_hint,
     is_restricted,
+    trial_table,
 )
 from dhcal_pin.cli.main import main
+from dhcal_pin.cli.screens.calibration_screen import _robot_lines
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.parameters import EXTENSIONS
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
@@ -121,6 +123,20 @@ def test_simulated_family_is_added(family):
     assert one.cv_after < one.cv_before
     _, more = simulated(f"minimal,base,tool,{family}", 3, m=200)
     assert fit.validate(more)["position_rms_m"] < 0.5 * plain.validate(more)["position_rms_m"]
+
+
+@pytest.mark.parametrize(("family", "other"), [("compliance", "harmonics"), ("harmonics", "compliance")])
+def test_a_family_that_is_added_with_another_is_told_from_a_supported_one(family, other):
+    arm, data = simulated(f"minimal,base,tool,{family}", 3)
+    fit = calibrate(arm, data)
+    assert fit.extension is not None
+    assert fit.extension.families == (family, other)
+    assert fit.extension.supported == (family,)
+    verdicts = {row[0]: row[1] for row in trial_table(fit.extension.trials).rows}
+    assert (verdicts[family], verdicts[other]) == ("added", "added, not supported")
+    assert f"{other} (not supported, prior width" in fit.extension.sentences[0]
+    [_, line] = _robot_lines(fit, "ur10.urdf", "minimal,base,tool")
+    assert line.endswith(f"joint errors added: {family} (and {other}, shrunk by priors)")
 
 
 def with_curves(seed: int, m: int, noise: float = 5e-5) -> tuple[Chain, Chain, Pose]:

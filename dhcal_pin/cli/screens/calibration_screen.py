@@ -97,8 +97,10 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
     first, *_, last = fit.chain.joint_names * 2
     count = fit.chain.n_joints
     joints = f"{count} joints from {first} to {last}" if count > 1 else f"joint {first}"
-    families = fit.extension.families if fit.extension else ()
-    added = f"; joint errors added: {', '.join(families)}" if families else ""
+    supported, families = (fit.extension.supported, fit.extension.families) if fit.extension else ((), ())
+    others = [name for name in families if name not in supported]
+    added = f"; joint errors added: {', '.join(supported)}" if families else ""
+    added += f" (and {', '.join(others)}, shrunk by priors)" if others else ""
     if any(stage.name == "arm" and not stage.is_kept for stage in fit.camera_stages):
         sets, added = ",".join(split_sets(sets)[1]), "; the arm is kept"
     return [
