@@ -81,6 +81,14 @@ class ChainBatch:
         base, origins, tool = (array[number % len(array)] for array in (self.base, self.origins, self.tool))
         return replace(self.model.chain, origins=origins, base=base, tool=tool)
 
+    def error_model(self, number: int) -> ErrorModel:
+        """Build the error model of one of the chains."""
+        twists = self.twists[number % len(self.twists)]
+        parameters = [
+            replace(p, twist=tuple(twist)) for p, twist in zip(self.model.parameters, twists, strict=True)
+        ]
+        return replace(self.model, chain=self.chain(number), parameters=tuple(parameters))
+
     def at(self, x: Array) -> ChainBatch:
         """Build the chains with given errors, shape (b, p)."""
         return self.derivative(x)[0]

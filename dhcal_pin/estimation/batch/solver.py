@@ -6,7 +6,8 @@ positions and measured values may differ.
 
 The solvers are those of module `solver`, with the same rules (`solver_rules`). All arrays have the problem as
 their first axis; each pass of the iteration works on the problems that have not ended. For small problems
-this is about ten times as fast as one by one, as the overhead of Python and NumPy is shared.
+this is about ten times as fast as one by one, as the overhead of Python and NumPy is shared. Problems that
+need more than `MAX_LOCKSTEP` iterations of Levenberg-Marquardt go on one by one, with extrapolated steps.
 
 Shapes: b problems, p unknowns, m samples per problem and measurement, c configurations per sample, n joints.
 """
@@ -27,7 +28,9 @@ from ...measurements.base import Measurement, concatenate
 from ...parallel import SERIAL, TaskExecutor
 from .. import solver_rules as rules
 from ..error_model import ErrorModel
+from ..problem import Problem
 from ..qr import RANK_RTOL
+from ..solver import levenberg_marquardt
 from ..solver_rules import step_is_negligible
 from ..uncertainty import UNBOUNDED_TOL
 from .chains import ChainBatch
@@ -35,6 +38,8 @@ from .qr import TriangularSystemBatch
 
 # Number of problems that are solved together; their arrays fit into the cache of a core.
 BLOCK_SIZE = 250
+# Largest number of iterations in lockstep. Problems that converge take 3 to 10, or many.
+MAX_LOCKSTEP = 15
 # Weight of a padding sample: lost in rounding, and not zero so that one can divide by it.
 _PADDING_WEIGHT = 1e-40
 
@@ -114,6 +119,11 @@ class BatchProblem:
             data=tuple(self._samples_of(item, members) for item in self.data),
             n_padding=self._padding()[:, members],
         )
+
+    def problem(self, number: int) -> Problem:
+        """Build one of the problems."""
+        samples = tuple(self._samples_of(item, np.array([number])) for item in self.data)
+        return Problem(self.chains.error_model(number), samples, self.weights, self.known)
 
     def _samples_of(self, item: Measurement, members: Array) -> Measurement:
         """Select the samples of some problems."""
@@ -286,7 +296,17 @@ def _undamped_steps(batch: BatchProblem, x: Array, cost: Array) -> tuple[Array, 
 
 
 def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
-    """Run `solver.levenberg_marquardt` on all problems in lockstep.
+    """Run `solver.levenberg_marquardt` in lockstep, then on the remaining problems one by one."""
+    x, iterations, converged = _lockstep(batch, x, min(max_iterations, MAX_LOCKSTEP))
+    for i in np.flatnonzero(~converged & (iterations < max_iterations)):
+        found = levenberg_marquardt(batch.problem(i), x[i], max_iterations - int(iterations[i]))
+        x[i], converged[i] = found.x, found.converged
+        iterations[i] += found.iterations
+    return x, iterations, converged
+
+
+def _lockstep(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
+    """Run Levenberg-Marquardt on all problems in lockstep, without extrapolated steps.
 
     In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
     the others retry with more damping. State that outlives a pass has one element per problem of the batch;
