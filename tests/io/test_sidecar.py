@@ -13,7 +13,7 @@ from robots import write
 from dhcal_pin import se3
 from dhcal_pin.estimation import Uncertainty
 from dhcal_pin.estimation.uncertainty import FamilyGain, ModelFit
-from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.io import (
     read_instrument,
     read_measured_region,
@@ -32,6 +32,13 @@ def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
     write_urdf(placed, tmp_path / "out.urdf")
     q = rng.uniform(-1, 1, (20, 2))
     np.testing.assert_allclose(read_robot(tmp_path / "out.urdf").poses(q), placed.poses(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["x.txt", "x", "x.urdf.xacro", "x.dh.toml", "x.json", "urdf"])
+def test_a_robot_is_not_written_under_an_unknown_ending(tmp_path, scara, name):
+    with pytest.raises(InvalidArgumentError, match=r"expected \.urdf or \.xml$"):
+        write_urdf(scara, tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_old_sidecar_is_replaced_with_its_robot(tmp_path, scara):
