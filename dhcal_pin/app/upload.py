@@ -71,7 +71,7 @@ class Upload:
         if not isinstance(data, list) or not isinstance(images, list):
             raise InvalidArgumentError("the form is malformed; load the page again")
         names = [*([robot] if robot else []), *data, *images]
-        if unknown := [name for name in names if name not in files]:
+        if unknown := [name for name in names if not isinstance(name, str) or name not in files]:
             raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
         if sum(len(word.encode()) + 1 for word in (*names, *options)) > _MAX_COMMAND_BYTES:
             raise InvalidArgumentError("names and options are too long; expected at most 100 kB together")
@@ -124,4 +124,8 @@ def _option_words(request: Mapping[str, Any]) -> tuple[str, ...]:
             words += [f"--{name}={v}" for v in value]
         else:
             raise InvalidArgumentError(f"{quote(name)}: unknown option or value; load the page again")
+    for word in words:
+        # No command line holds a NUL character or half of a surrogate pair.
+        if not word.isprintable():
+            raise InvalidArgumentError(f"{quote(word)}: has characters that cannot be printed; remove them")
     return tuple(words)

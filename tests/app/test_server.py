@@ -333,6 +333,24 @@ def test_options_that_no_command_line_can_hold_are_one_line(app, request_changes
     assert post(app, "inspect", body, **headers) == (200, [message])
 
 
+@pytest.mark.parametrize("operation", ["inspect", "calibrate", "board"])
+@pytest.mark.parametrize("text", ["tool0\0", "\ud800", "tool0\nx", "\x1b[31m"])
+def test_characters_that_no_command_line_can_hold_are_one_line(app, operation, text):
+    for field in ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper", "mend"):
+        value = [text] if field == "mend" else text
+        body, headers = form({"a.csv": b""}, {"robot": "a.csv", "data": ["a.csv"], field: value})
+        error = f"{f'--{field}={text}'!r}: has characters that cannot be printed; remove them"
+        assert post(app, operation, body, **headers) == (200, [{"error": error}])
+
+
+@pytest.mark.parametrize("request_changes", [{"robot": ["a.csv"]}, {"data": [["a.csv"]]}, {"images": [{}]}])
+def test_names_of_files_that_are_no_texts_are_one_line(app, request_changes):
+    body, headers = form({"a.csv": b""}, {"data": ["a.csv"]} | request_changes)
+    status, (message,) = post(app, "inspect", body, **headers)
+    assert status == 200
+    assert message["error"].endswith(": the file is missing; add it again")
+
+
 def test_the_next_start_removes_the_folder_of_a_killed_server(tmp_path):
     killed, other = start_app(tmp_path / "app"), start_app(tmp_path / "app")
     folders = set(killed.folder.iterdir())
