@@ -23,7 +23,10 @@ _MAX_NAME_BYTES = 255
 MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
 _TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper")
-_TOO_MANY_FILES = f"more than {MAX_FILES} files; join the rows of several measurement files in one"
+TOO_MANY_FILES = (
+    f"more than {MAX_FILES} files; instead of photographs, add the corners that `dhcal detect` finds in their "
+    "folder; join the rows of several measurement files in one"
+)
 # Files of a request by their use, and what there is without any.
 _FILE_KEYS: Mapping[str, Any] = {"robot": "", "data": [], "images": []}
 # Options without a value.
@@ -53,12 +56,12 @@ class Upload:
             request = json.loads(arguments["request"][0])
         except (ValueError, KeyError, RecursionError, tornado.httputil.HTTPInputError) as error:
             if "too many parts" in str(error):
-                raise InvalidArgumentError(_TOO_MANY_FILES) from error
+                raise InvalidArgumentError(TOO_MANY_FILES) from error
             raise InvalidArgumentError("the form is malformed; load the page again") from error
         if not isinstance(request, dict):
             raise InvalidArgumentError("the form is malformed; load the page again")
         if len(parts.get("file", [])) > MAX_FILES:
-            raise InvalidArgumentError(_TOO_MANY_FILES)
+            raise InvalidArgumentError(TOO_MANY_FILES)
         files: dict[str, bytes] = {}
         for part in parts.get("file", []):
             name = str(part["filename"])
