@@ -320,7 +320,9 @@ def test_too_many_files_are_one_line(app, n_files):
     body, headers = form(dict.fromkeys(names, b""), {"data": names})
     status, (message,) = post(app, "inspect", body, **headers)
     assert status == 200
-    assert message["error"].startswith(f"more than {MAX_FILES} files; instead of photographs, add the corners ")
+    assert message["error"].startswith(
+        f"more than {MAX_FILES} files; instead of photographs, add the corners "
+    )
 
 
 @pytest.mark.parametrize(
