@@ -24,8 +24,8 @@ MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
 _TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper")
 TOO_MANY_FILES = (
-    f"more than {MAX_FILES} files; instead of photographs, add the corners that `dhcal detect` finds in their "
-    "folder; join the rows of several measurement files in one"
+    f"more than {MAX_FILES} files; instead of photographs, add the corners that `dhcal detect` finds in "
+    "their folder; join the rows of several measurement files in one"
 )
 # Files of a request by their use, and what there is without any.
 _FILE_KEYS: Mapping[str, Any] = {"robot": "", "data": [], "images": []}

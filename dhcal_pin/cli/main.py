@@ -130,8 +130,8 @@ def _parser_options(command: Command) -> dict[str, Any]:
 class _NotedInterrupt:
     """Context in which SIGTERM interrupts as SIGINT does, and that notes both.
 
-    Libraries may turn `KeyboardInterrupt` into another exception: NumPy raises `TypeError` if it is interrupted
-    while it compares structured arrays.
+    Libraries may turn `KeyboardInterrupt` into another exception: NumPy raises `TypeError` if it is
+    interrupted while it compares structured arrays.
     """
 
     is_received = False
