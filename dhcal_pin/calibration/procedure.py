@@ -340,7 +340,7 @@ def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
     system, n = solution.system, len(errors.parameters)
     is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
     held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
-    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held))
+    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held), undetermined=tuple(held))
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:

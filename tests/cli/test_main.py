@@ -92,9 +92,7 @@ def test_interrupt_writes_nothing(run, robot_folder, monkeypatch, stop):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-@pytest.mark.parametrize(
-    ("words", "status"), [("completion bash", 0), ("check no.urdf", -signal.SIGINT)]
-)
+@pytest.mark.parametrize(("words", "status"), [("completion bash", 0), ("check no.urdf", -signal.SIGINT)])
 def test_an_interrupt_at_the_end_of_the_process_gives_no_traceback(tmp_path, words, status):
     """A finished command keeps its exit status."""
     script = (
