@@ -308,7 +308,10 @@ class Interruption:
         details = (status, left, said, [path.name for path in self.files()])
         # No file is partial, however the run ended.
         assert all(content in (self.old[name], self.new[name]) for name, content in found.items()), details
-        if number == signal.SIGINT:
+        if number == -status == signal.SIGTERM:
+            # It came after the end of the command.
+            assert left == "new", details
+        elif number in (signal.SIGINT, signal.SIGTERM):
             # The files of an interrupted run are complete, and the message names them.
             assert left != "mixed", details
             assert not [path for path in self.files() if path.name.startswith(".dhcal-")], details

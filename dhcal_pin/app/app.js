@@ -93,7 +93,7 @@ async function addFiles(added, role = null) {
   const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
   const size = added.reduce((sum, file) => sum + file.size, total);
   if (files.size + added.length > MAX_FILES) {
-    showError("file-error", `More than ${MAX_FILES} files; join the rows of several measurement files in one.`);
+    showError("file-error", document.documentElement.dataset.tooMany);
     return;
   }
   if (size > LIMIT) {

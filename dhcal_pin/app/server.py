@@ -28,11 +28,12 @@ import tornado.netutil
 import tornado.web
 
 from ..exceptions import DhcalError, InvalidArgumentError
+from ..formatting import capitalized
 from ..io.shipped_files import shipped_file
 from ..loopback import LOOPBACK, is_same_origin, local_application, new_token
 from ..messages import message_line
 from . import command
-from .upload import MAX_FILES, Upload
+from .upload import MAX_FILES, TOO_MANY_FILES, Upload
 
 # Default limit of all files of a request [bytes].
 DEFAULT_LIMIT = 100 * 10**6
@@ -277,6 +278,7 @@ class _PageHandler(_Handler):
         self.set_header("Content-Type", f"{_TYPES[self._path.suffix]}; charset=utf-8")
         text = self._path.read_text(encoding="utf-8")
         text = text.replace("@LIMIT_BYTES@", str(self._limit)).replace("@MAX_FILES@", str(MAX_FILES))
+        text = text.replace("@TOO_MANY_FILES@", f"{capitalized(TOO_MANY_FILES)}.")
         self.write(text)
 
 

@@ -23,7 +23,10 @@ _MAX_NAME_BYTES = 255
 MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
 _TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper")
-_TOO_MANY_FILES = f"more than {MAX_FILES} files; join the rows of several measurement files in one"
+TOO_MANY_FILES = (
+    f"more than {MAX_FILES} files; instead of photographs, add the corners that `dhcal detect` finds in "
+    "their folder; join the rows of several measurement files in one"
+)
 # Files of a request by their use, and what there is without any.
 _FILE_KEYS: Mapping[str, Any] = {"robot": "", "data": [], "images": []}
 # Options without a value.
@@ -53,12 +56,12 @@ class Upload:
             request = json.loads(arguments["request"][0])
         except (ValueError, KeyError, RecursionError, tornado.httputil.HTTPInputError) as error:
             if "too many parts" in str(error):
-                raise InvalidArgumentError(_TOO_MANY_FILES) from error
+                raise InvalidArgumentError(TOO_MANY_FILES) from error
             raise InvalidArgumentError("the form is malformed; load the page again") from error
         if not isinstance(request, dict):
             raise InvalidArgumentError("the form is malformed; load the page again")
         if len(parts.get("file", [])) > MAX_FILES:
-            raise InvalidArgumentError(_TOO_MANY_FILES)
+            raise InvalidArgumentError(TOO_MANY_FILES)
         files: dict[str, bytes] = {}
         for part in parts.get("file", []):
             name = str(part["filename"])
@@ -71,7 +74,7 @@ class Upload:
         if not isinstance(data, list) or not isinstance(images, list):
             raise InvalidArgumentError("the form is malformed; load the page again")
         names = [*([robot] if robot else []), *data, *images]
-        if unknown := [name for name in names if name not in files]:
+        if unknown := [name for name in names if not isinstance(name, str) or name not in files]:
             raise InvalidArgumentError(f"{quote(unknown[0])}: the file is missing; add it again")
         if sum(len(word.encode()) + 1 for word in (*names, *options)) > _MAX_COMMAND_BYTES:
             raise InvalidArgumentError("names and options are too long; expected at most 100 kB together")
@@ -124,4 +127,8 @@ def _option_words(request: Mapping[str, Any]) -> tuple[str, ...]:
             words += [f"--{name}={v}" for v in value]
         else:
             raise InvalidArgumentError(f"{quote(name)}: unknown option or value; load the page again")
+    for word in words:
+        # No command line holds a NUL character or half of a surrogate pair.
+        if not word.isprintable():
+            raise InvalidArgumentError(f"{quote(word)}: has characters that cannot be printed; remove them")
     return tuple(words)

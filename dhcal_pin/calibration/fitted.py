@@ -373,24 +373,34 @@ class FittedModel:
         robot = len(self.errors.parameters)
         # Predictions agree with the errors of left-out regions, see `model_selection`.
         scale = self.extension.prediction_scale if self.extension else 1.0
+        # What the fit held, because no measurement shows it, is uncertain, too.
+        held = self.errors.undetermined
+        errors = self.errors.with_parameters(held) if held else self.errors
+        is_held = np.array([p in held for p in errors.parameters], bool)
+        held_axes = np.eye(len(is_held))[:, is_held]
+
+        def of_all(rows: Array) -> Array:
+            out = np.zeros((len(is_held), rows.shape[1]))
+            out[~is_held] = rows[:robot]
+            return out
+
+        x = of_all(self.x[:, None])[:, 0]
         uncertainty = Uncertainty.from_errors(
-            self.errors,
-            self.x[:robot],
+            errors,
+            x,
             self.chain,
-            scale * root[:robot],
-            unbounded[:robot],
+            np.concatenate([of_all(scale * root), errors.priors[:, None] * held_axes], 1),
+            of_all(unbounded),
             self.problem.temperature,
             self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
         )
         uncertainty = replace(uncertainty, fit=self._model_fit)
-        if len(self.x) > MAX_COLUMNS:
+        if len(self.x) > MAX_COLUMNS and not held:
             uncertainty = replace(uncertainty, information=self._information(scale, root))
-        if self.rank == len(self.x) or not robot:
+        if (self.rank == len(self.x) and not held) or not robot:
             return uncertainty
-        null_space = self._system_at_x.null_space[:robot]
-        undetermined = Uncertainty.from_errors(
-            self.errors, self.x[:robot], self.chain, null_space, null_space[:, :0]
-        )
+        null_space = np.concatenate([of_all(self._system_at_x.null_space), held_axes], 1)
+        undetermined = Uncertainty.from_errors(errors, x, self.chain, null_space, null_space[:, :0])
         q, _ = different_configurations(self.inliers)
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
 

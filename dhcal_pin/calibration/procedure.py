@@ -43,22 +43,27 @@ from ..estimation.problem import (
 from ..estimation.solver import METHODS, SolverResult, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
+from ..formatting import join_names
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import HAND_BUILT
-from ..robot.chain import Chain
+from ..plausibility.mixups import has_enough_rows
+from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
 from . import cameras, model_selection
 from .cameras import arm_type, default_sets, has_images, held_values, require_joint_values, split_sets
 from .cross_validation import leave_regions_out
+from .evaluation import accuracy, fit_nominal
 from .evidence import diagnose
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import confirm_changes, without_changes
 from .shrinkage import compute_shrinkage_factor
+from .verdict import MAX_FRAME_ITERATIONS, MAX_FRAME_RATIO, MAX_USUAL_ERROR
 
 # Decimals of the reference temperature of a model [°C].
 REFERENCE_DECIMALS = 1
@@ -216,6 +221,8 @@ def calibrate(
         of_images, fit, holdout = cameras.fit_with_changes(of_images, data, holdout, start)
     else:
         fit = start(data)
+    if has_images(data):
+        _require_frames(fit, [*robot_sets, *rig_sets])
     # The confirmation of changes and the calibration itself often need the same fits.
     groups = _prior_groups(fit, priors)
     reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
@@ -250,6 +257,33 @@ def calibrate(
         found = replace(found, scales=(*found.scales, scale))
     result = _calibrate_samples(fit, groups, families, holdout, extended, signs, progress)
     return replace(result, session=found, with_auto=with_auto)
+
+
+def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
+    """Raise an error if measurements beside images fit only if base or tool are estimated, too.
+
+    Images fit nevertheless, and their errors do not show the cause.
+    """
+    errors = fit.problem.errors
+    frames = {"base": BASE_FRAME, "tool": errors.chain.tool_frame_index}
+    estimated = {parameter.error_frame for parameter in errors.parameters}
+    missing = [name for name, frame in frames.items() if frame not in estimated]
+    others = tuple(item for item in fit.data if item.rig is None)
+    if not missing or not has_enough_rows(others):
+        return
+    chain, known, x = errors.chain, fit.problem.known, fit.solution.x
+    fitted = accuracy(fit.problem.chain(x), others, fit.problem.instruments(x))
+    group, found = next(iter(fitted.groups.items()))
+    if found.rms <= MAX_USUAL_ERROR[found.unit] * (workspace_radius(chain) if found.unit == "m" else 1.0):
+        return
+    free = initialize_frames(select_parameters(chain, "base,tool"), others, known, MAX_FRAME_ITERATIONS)
+    nominal, instruments = fit_nominal(free, others, known)
+    if accuracy(nominal, others, instruments).groups[group].rms < MAX_FRAME_RATIO * found.rms:
+        sources = list(dict.fromkeys(item.source or item.kind for item in others))
+        raise InvalidArgumentError(
+            f"{join_names(sources)}: the measurements fit this arm only with another {join_names(missing)}; "
+            f"add {','.join(missing)} to the parameters: {','.join([*sets, *missing])}"
+        )
 
 
 def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:
@@ -306,7 +340,7 @@ def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
     system, n = solution.system, len(errors.parameters)
     is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
     held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
-    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held))
+    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held), undetermined=tuple(held))
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:

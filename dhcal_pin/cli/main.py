@@ -128,30 +128,45 @@ def _parser_options(command: Command) -> dict[str, Any]:
 
 
 class _NotedInterrupt:
-    """Context that notes SIGINT: libraries may turn `KeyboardInterrupt` into another exception.
+    """Context in which SIGTERM interrupts as SIGINT does, and that notes both.
 
-    NumPy raises `TypeError` if it is interrupted while it compares structured arrays.
+    Libraries may turn `KeyboardInterrupt` into another exception: NumPy raises `TypeError` if it is
+    interrupted while it compares structured arrays.
     """
 
     is_received = False
+    # Handlers that are replaced; others are those of a program that runs a command, or ignore the signal.
+    _HANDLERS = ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL))
+
+    def __init__(self, ends_process: bool):
+        self._ends_process = ends_process
 
     def __enter__(self) -> None:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # only the main thread may install a handler
-                signal.signal(signal.SIGINT, self._receive)
+        for number, usual in self._HANDLERS:
+            if signal.getsignal(number) == usual:
+                with suppress(ValueError):  # only the main thread may install a handler
+                    signal.signal(number, self._receive)
 
-    def __exit__(self, *_: object) -> None:
-        if signal.getsignal(signal.SIGINT) == self._receive:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+    def __exit__(self, kind: object, *_: object) -> None:
+        for number, usual in self._HANDLERS:
+            if signal.getsignal(number) == self._receive:
+                if self._ends_process and number == signal.SIGINT:
+                    # Python would print a traceback. A finished command has its exit status.
+                    usual = signal.SIG_IGN if kind is None else signal.SIG_DFL
+                signal.signal(number, usual)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self.is_received = True
+        if number == signal.SIGTERM and "multiprocessing" in sys.modules:
+            # A terminal sends SIGINT to the workers, too.
+            for worker in sys.modules["multiprocessing"].active_children():
+                os.kill(worker.pid, signal.SIGINT)
         signal.default_int_handler(number, frame)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command."""
-    interrupt = _NotedInterrupt()
+    """Run one command; without words those of the command line, after which the process ends."""
+    interrupt = _NotedInterrupt(argv is None)
     try:
         with interrupt:
             if (outputs := _outputs_module()) is not None:

@@ -81,11 +81,13 @@ class ErrorModel:
         chain: Nominal chain.
         parameters: Unknown errors, length p, sorted by error frame; transmission coefficients last.
         fixed: Parameters of the same sets that are held at their nominal values.
+        undetermined: Those of them that no measurement shows.
     """
 
     chain: Chain
     parameters: tuple[ErrorParameter, ...]
     fixed: tuple[ErrorParameter, ...] = ()
+    undetermined: tuple[ErrorParameter, ...] = ()
 
     @cached_property
     def _n_geometric(self) -> int:

@@ -329,7 +329,7 @@ class StructuredRows:
         """Sort the coefficients, which are the columns of [J | r] from a first one on, by their joints."""
         by_joint = np.argsort(joints, kind="stable")
         numbers, starts = np.unique(np.sort(joints), return_index=True)
-        ends = [*starts[1:].tolist(), len(joints)]
+        ends = [*starts.tolist(), len(joints)][1:]
         blocks = tuple(
             (joint, slice(start, end))
             for joint, start, end in zip(numbers.tolist(), starts.tolist(), ends, strict=True)

@@ -322,6 +322,10 @@ def urdf_files(
     parameters, an uncertainty or a measured region. One that exists already is always replaced, because it
     would be read with the new URDF.
     """
+    robot_format = find_format(path)
+    if robot_format is None or robot_format.read_urdf is None:
+        expected = " or ".join(_endings(other for other in FORMATS if other.read_urdf))
+        raise InvalidArgumentError(f"{os.fspath(path)}: unknown file extension; expected {expected}")
     alone = without_negligible_moves(chain.urdf_alone)
     complete = chain if chain.urdf_origins is not None else replace(chain, origins=alone.origins)
     data, urdf = with_written_origins(chain.urdf, joint_origins(alone)[0], path)
@@ -438,11 +442,11 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False
 
     Args:
         fit: Result of a calibration, or a chain alone.
-        path: Path of the URDF to write.
+        path: Path of the file to write, `.urdf`; `.xml` if the nominal robot is an MJCF.
         force: Write the robot even if the verdict on its calibration is "refused".
 
     Raises:
-        InvalidArgumentError: The path is the nominal robot itself.
+        InvalidArgumentError: The path is the nominal robot itself, or its ending is another one.
         RefusedCalibrationError: The verdict is "refused".
     """
     if not (force or isinstance(fit, Chain)) and fit.verdict.is_refused:

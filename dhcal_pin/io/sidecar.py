@@ -118,6 +118,7 @@ from ..robot.transmission import (
     MAX_CURVE_ORDER,
     Payload,
     Transmission,
+    coefficient_indices,
     n_coefficients,
     split_coefficients,
 )
@@ -645,9 +646,18 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
 
 
 def _coefficient_indices(chain: Chain) -> dict[str, int]:
-    """Return the index of each parameter's transmission coefficient."""
+    """Return the index of each transmission coefficient, those of the parameters of the chain first.
+
+    Gravity may have loaded other joints of the nominal robot.
+    """
     parameters = (parameter for name in FAMILIES for parameter in PARAMETER_SETS[name](chain))
-    return {p.name: p.coefficient_index for p in parameters if p.coefficient_index is not None}
+    found = {p.name: p.coefficient_index for p in parameters if p.coefficient_index is not None}
+    parts = coefficient_indices(*chain.mimic_matrix.shape)
+    return found | {
+        f"{(chain.link_names if family.link_term else chain.joint_names)[c.owner]}.{c.name}": c.entry
+        for family in FAMILIES.values()
+        for c in family.coefficients(chain, parts)
+    }
 
 
 def _decode_rows(text: Any, n_rows: int, where: str) -> Array:

@@ -1,11 +1,12 @@
 """Diagnosis of mixed-up data: the hypotheses that explain measurements decisively better than their file.
 
 First, the evidence of the measurements as they were read is computed. If they fit a robot with small errors,
-no hypothesis is tried. Otherwise each hypothesis changes the same samples, and its evidence is computed in
-the same way. A hypothesis is left out if it leaves the nominal robot much farther from the measured poses
-than another one does: undoing a mistake takes its error away and adds none. A hypothesis is decisive if its
-evidence exceeds that of the file by the factor exp(15), and if the robot fits the changed samples as it fits
-ordinary measurements, with errors of ordinary size.
+no hypothesis is tried. The joint errors of the robot may be wrong instead of the measurements: the larger
+evidence of the robot with and without them counts. Otherwise each hypothesis changes the same samples, and
+its evidence is computed in the same way. A hypothesis is left out if it leaves the nominal robot much farther
+from the measured poses than another one does: undoing a mistake takes its error away and adds none. A
+hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits
+the changed samples as it fits ordinary measurements, with errors of ordinary size.
 
 If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
 closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
@@ -99,6 +100,9 @@ def _find_single(
     if not has_enough_rows(samples):
         return Diagnosis(NO_EVIDENCE), None
     before = fit_evidence(chain, samples, sets)
+    if is_suspicious(before) and chain.error_families:
+        # The joint errors of the robot may be wrong instead of the measurements.
+        before = max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
     if not is_suspicious(before):
         return Diagnosis(before), None
     from .trials import try_hypotheses  # lazy import: few measurements are suspicious

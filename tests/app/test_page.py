@@ -129,6 +129,14 @@ def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
         waiting.value.close()
 
 
+def test_too_many_photographs_need_the_corners_in_them(page):
+    page.evaluate(DROP, [[(f"{i}.jpg", "") for i in range(200)]])
+    page.wait_for_selector("#file-error:not([hidden])")
+    assert "instead of photographs, add the corners that `dhcal detect` finds" in page.inner_text(
+        "#file-error"
+    )
+
+
 def test_refusal_shows_the_remedy_and_applies_it(page, example):
     urdf, _ = example_files(example)
     drop_with_tip(page, urdf, ("laser.csv", wrong_sign(example)))

@@ -320,7 +320,9 @@ def test_too_many_files_are_one_line(app, n_files):
     body, headers = form(dict.fromkeys(names, b""), {"data": names})
     status, (message,) = post(app, "inspect", body, **headers)
     assert status == 200
-    assert message["error"].startswith(f"more than {MAX_FILES} files; ")
+    assert message["error"].startswith(
+        f"more than {MAX_FILES} files; instead of photographs, add the corners "
+    )
 
 
 @pytest.mark.parametrize(
@@ -331,6 +333,24 @@ def test_options_that_no_command_line_can_hold_are_one_line(app, request_changes
     body, headers = form({"a.csv": b""}, {"data": ["a.csv"]} | request_changes)
     message = {"error": "names and options are too long; expected at most 100 kB together"}
     assert post(app, "inspect", body, **headers) == (200, [message])
+
+
+@pytest.mark.parametrize("operation", ["inspect", "calibrate", "board"])
+@pytest.mark.parametrize("text", ["tool0\0", "\ud800", "tool0\nx", "\x1b[31m"])
+def test_characters_that_no_command_line_can_hold_are_one_line(app, operation, text):
+    for field in ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper", "mend"):
+        value = [text] if field == "mend" else text
+        body, headers = form({"a.csv": b""}, {"robot": "a.csv", "data": ["a.csv"], field: value})
+        error = f"{f'--{field}={text}'!r}: has characters that cannot be printed; remove them"
+        assert post(app, operation, body, **headers) == (200, [{"error": error}])
+
+
+@pytest.mark.parametrize("request_changes", [{"robot": ["a.csv"]}, {"data": [["a.csv"]]}, {"images": [{}]}])
+def test_names_of_files_that_are_no_texts_are_one_line(app, request_changes):
+    body, headers = form({"a.csv": b""}, {"data": ["a.csv"]} | request_changes)
+    status, (message,) = post(app, "inspect", body, **headers)
+    assert status == 200
+    assert message["error"].endswith(": the file is missing; add it again")
 
 
 def test_the_next_start_removes_the_folder_of_a_killed_server(tmp_path):

@@ -136,6 +136,26 @@ def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_t
     assert result.validate(images)["residual_rms"] < 1.2 * np.sqrt(2) * 1e3 * image_noise
 
 
+@pytest.mark.parametrize(
+    ("sets", "missing"),
+    [("camera,board", "base,tool"), ("minimal,camera,board", "base,tool"), ("base,camera,board", "tool")],
+)
+def test_base_and_tool_are_named_where_a_tracker_beside_images_needs_them(sim_6dof, sets, missing):
+    """With the sets that the message names, the calibration works."""
+    rng = np.random.default_rng(3)
+    truth = placed(small_errors(sim_6dof, rng) if "minimal" in sets else sim_6dof)
+    data = [
+        KINDS[kind].simulate(truth, rng.uniform(-2.5, 2.5, (40, 6)), Noise(1e-4), rng)
+        for kind in ("camera", "position")
+    ]
+    with pytest.raises(InvalidArgumentError, match=f"add {missing} to the parameters: ") as caught:
+        calibrate(sim_6dof, data, sets, session="off")
+    named = str(caught.value).rpartition(": ")[2]
+    assert set(named.split(",")) == {*sets.split(","), *missing.split(",")}
+    result = calibrate(sim_6dof, data, named, session="off", extend="none")
+    assert result.comparisons[-1].after["position_rms_m"] < 1.1 * np.sqrt(3) * 1e-4
+
+
 def test_poses_in_the_rig_that_are_far_from_the_true_ones_are_named():
     """The rig states the cameras in the measuring frame; without positions its place is not known."""
     rng = np.random.default_rng(9)

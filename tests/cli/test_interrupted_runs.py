@@ -20,7 +20,7 @@ def outcomes(folder: Path, command: str, name: str, n_steps: int, n_times: int) 
     return json.loads(done.stdout.splitlines()[-1])
 
 
-COMMANDS = some_slow([("report", "SIGKILL"), ("study", "SIGINT")], {0})
+COMMANDS = some_slow([("report", "SIGKILL"), ("study", "SIGINT"), ("calibrate", "SIGTERM")], {0, 2})
 
 
 @pytest.mark.parametrize(("command", "name"), COMMANDS)

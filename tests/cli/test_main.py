@@ -70,18 +70,42 @@ def interrupted_in_a_library():
         raise TypeError("Cannot compare structured arrays") from None
 
 
-@pytest.mark.parametrize("is_library", [False, True])
-def test_interrupt_writes_nothing(run, robot_folder, monkeypatch, is_library):
+def terminated():
+    assert signal.getsignal(signal.SIGTERM) != signal.SIG_DFL
+    signal.raise_signal(signal.SIGTERM)
+
+
+def interrupted():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("stop", [interrupted, interrupted_in_a_library, terminated])
+def test_interrupt_writes_nothing(run, robot_folder, monkeypatch, stop):
     def interrupt(*_, **__):
-        if is_library:
-            interrupted_in_a_library()
-        raise KeyboardInterrupt
+        stop()
 
     before = folder_contents(robot_folder)
     monkeypatch.setattr(model_selection, "extend", interrupt)
     assert run(*CALIBRATE, "--json", "-") == (130, "", "dhcal: interrupted; nothing written\n")
     assert folder_contents(robot_folder) == before
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize(("words", "status"), [("completion bash", 0), ("check no.urdf", -signal.SIGINT)])
+def test_an_interrupt_at_the_end_of_the_process_gives_no_traceback(tmp_path, words, status):
+    """A finished command keeps its exit status."""
+    script = (
+        "import atexit, signal, sys\n"
+        "from dhcal_pin.cli.main import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "atexit.register(signal.raise_signal, signal.SIGINT)\n"
+        "sys.exit(main())"
+    )
+    command = [sys.executable, "-c", script, *words.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert "Traceback" not in done.stderr
 
 
 def test_lack_of_memory_is_one_line(assert_refused, monkeypatch):

@@ -14,6 +14,7 @@ from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.problem import StructuredRows
 from dhcal_pin.estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurements
@@ -232,3 +233,10 @@ def test_view_draws_the_uncertainty_ellipsoids_of_a_file(calibrated, tmp_path):
     squares = [np.sum(np.square(each["axes"])) for each in scene["ellipsoids"]]
     q = np.array([each["q"] for each in scene["ellipsoids"]])
     np.testing.assert_allclose(np.sqrt(squares), calibrated.predict(q).position_std, rtol=1e-3)
+
+
+def test_rows_without_transmission_coefficients_are_their_dense_columns():
+    dense = np.random.default_rng(0).normal(size=(4, 3, 5))
+    rows = StructuredRows.of(dense, np.empty((0, 3, 5)), [], [], 3)
+    flat = dense.reshape(4, -1)
+    np.testing.assert_allclose(rows.products(), flat @ flat.T)

@@ -11,9 +11,9 @@ import pytest
 from robots import write
 
 from dhcal_pin import se3
-from dhcal_pin.estimation import Uncertainty
+from dhcal_pin.estimation import PARAMETER_SETS, Uncertainty
 from dhcal_pin.estimation.uncertainty import FamilyGain, ModelFit
-from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.io import (
     read_instrument,
     read_measured_region,
@@ -24,6 +24,9 @@ from dhcal_pin.io import (
 )
 from dhcal_pin.io.sidecar import sidecar_text
 from dhcal_pin.measurements import MeasuredRegion
+from dhcal_pin.robot import Transmission
+from dhcal_pin.robot.error_families import JOINT_TERMS
+from dhcal_pin.robot.transmission import coefficient_indices
 
 
 def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
@@ -32,6 +35,13 @@ def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
     write_urdf(placed, tmp_path / "out.urdf")
     q = rng.uniform(-1, 1, (20, 2))
     np.testing.assert_allclose(read_robot(tmp_path / "out.urdf").poses(q), placed.poses(q), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["x.txt", "x", "x.urdf.xacro", "x.dh.toml", "x.json", "urdf"])
+def test_a_robot_is_not_written_under_an_unknown_ending(tmp_path, scara, name):
+    with pytest.raises(InvalidArgumentError, match=r"expected \.urdf or \.xml$"):
+        write_urdf(scara, tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_old_sidecar_is_replaced_with_its_robot(tmp_path, scara):
@@ -44,6 +54,22 @@ def test_an_old_sidecar_is_replaced_with_its_robot(tmp_path, scara):
     write_urdf(scara, tmp_path / "out.urdf")
     assert tomllib.loads(side.read_text())["base"]["xyz_m"] == [0.0, 0.0, 0.0]
     np.testing.assert_array_equal(read_robot(tmp_path / "out.urdf").base, np.eye(4))
+
+
+def test_elasticity_of_a_joint_that_gravity_does_not_load_is_read_back(tmp_path):
+    """Gravity loaded it in the nominal robot."""
+    arm = read_robot("example:ur10", "tool0")
+    names = [parameter.name for parameter in PARAMETER_SETS["compliance"](arm)]
+    assert "wrist_3_joint.compliance" not in names
+    terms = coefficient_indices(6, 6).joint_terms[list(JOINT_TERMS).index("compliance")]
+    arm = arm.with_transmission(Transmission.zero(arm.loads))
+    root = np.random.default_rng(0).normal(size=(6 * 7 + 6, 3))
+    known = Uncertainty(arm, terms, root, root[:, :0])
+    path = write(tmp_path, "a.toml", sidecar_text(arm, np.eye(4), arm.urdf.data, uncertainty=known) or "")
+    read = read_uncertainty(path, arm)
+    assert read is not None
+    np.testing.assert_array_equal(read.entries, terms)
+    np.testing.assert_array_equal(read.sqrt_covariance, root)
 
 
 @pytest.mark.parametrize(

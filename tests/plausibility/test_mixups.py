@@ -335,6 +335,18 @@ def test_files_with_different_frames_fit_separately(ur10):
     assert not found.hypotheses
 
 
+def test_wrong_joint_errors_of_the_robot_are_no_mistake_in_the_measurements(ur10):
+    """A coupling of 0.05 moves the other joints with the last one, whose axis the target is on."""
+    errors = select_parameters(ur10, "coupling")
+    wrong = errors.at(np.array([0.05 * p.name.endswith(".wrist_3_joint") for p in errors.parameters]))
+    base, tool = frames()
+    tool[:2, 3] = 0.0
+    arm = real_ur10().with_base_and_tool(base, tool)
+    q = 0.4 * joint_positions(arm, 60)
+    data = Position.simulate(arm, q, Noise(1e-4), np.random.default_rng(0))
+    assert not diagnose_mixups(wrong, [data]).hypotheses
+
+
 def test_another_robot_gives_no_hypothesis(ur10):
     other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
     data = Position.simulate(other, joint_positions(other, 60), Noise(1e-4), np.random.default_rng(1))

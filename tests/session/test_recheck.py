@@ -16,7 +16,7 @@ from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 from dhcal_pin import Result, calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
-from dhcal_pin.io import measurement_text, write_urdf
+from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
 from dhcal_pin.planning import change_options, plan
 from dhcal_pin.session import Recheck, recheck
@@ -133,6 +133,28 @@ def test_a_turn_about_the_first_axis_names_joint_and_base():
     zeros[0] = ANGLE
     result = recheck(fit.chain, [measured(sim, q, Position, True, zeros=zeros)], fit.uncertainty)
     assert [each.of or each.kind for each in result.changes] == [sim.chain.joint_names[0], "base"]
+
+
+def test_a_rotation_of_the_tool_that_was_never_measured_is_no_change(tmp_path):
+    """The tool moved during the measurement of a point of it: the fit holds its rotation."""
+    sim = Simulation("ur10", 60, 3)
+    moved = pin.SE3(np.eye(3), np.array([0.002, -0.001, 0.0]))
+    q = np.split(sim.q, 2)
+    halves = [measured(sim, q[i], Position, True, tool=tool) for i, tool in enumerate((moved, STILL))]
+    data = Position(sim.q, np.concatenate([half.positions() for half in halves]), NOISE)
+    fit = calibrate(sim.chain, data, extend="none")
+    assert fit.session is not None
+    assert [cause.block.kind for cause in fit.session.causes] == ["tool"]
+    write_urdf(fit, tmp_path / "cal.urdf")
+    uncertainty = read_uncertainty(
+        tmp_path / "cal.calibration.toml", read_robot(tmp_path / "cal.urdf", "tool0")
+    )
+    turned = pin.SE3(pin.exp3(np.array([0.02, 0.0, 0.0])), np.zeros(3))
+    q = sim.q[::6]
+    for each in (fit.uncertainty, uncertainty):
+        assert recheck(fit.chain, [measured(sim, q, Pose, True, tool=turned)], each).verdict == "ok"
+    changed_joint = measured(sim, q, Pose, True, tool=turned, zeros=2 * ANGLE * np.eye(6)[2])
+    assert recheck(fit.chain, [changed_joint], uncertainty).what == f"joint {sim.chain.joint_names[2]}"
 
 
 def test_it_cannot_say():
