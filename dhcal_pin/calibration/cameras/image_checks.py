@@ -139,9 +139,8 @@ def seen_ranges_warning(chain: Chain, data: Sequence[Measurement]) -> str:
 
 def largest_position_std(names: Sequence[str], covariance: Array) -> float:
     """Return the largest standard deviation of the position of any camera or board in any direction [m]."""
-    entries = [name.removesuffix(".x") for name in names if name.startswith(("camera_", "board_"))]
-    blocks = [_position_block(entry, names, covariance) for entry in entries if f"{entry}.x" in names]
-    return _largest_std(blocks)
+    first = [name for name in names if name.startswith(("camera_", "board_")) and name.endswith(".x")]
+    return _largest_std([_position_block(name.removesuffix(".x"), names, covariance) for name in first])
 
 
 def largest_tool_std(
