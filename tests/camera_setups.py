@@ -12,6 +12,7 @@ from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.estimation.error_model import ErrorModel
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.measurements.mounting import MountedRig, mount_rig
+from dhcal_pin.robot.inverse_kinematics import pose_task, solve_ik
 from dhcal_pin.se3 import exp3, inverse, transform
 
 ARMS = {
@@ -296,3 +297,25 @@ def random_setup(seed: int) -> Setup:
         sigma=rng.uniform(0.1, 0.3),
         model="fisheye" if seed % 5 == 4 else "pinhole",
     )
+
+
+def turned_configurations(
+    chain: Chain, home: np.ndarray, rng: np.random.Generator, turns: np.ndarray, count: int = 300
+) -> np.ndarray:
+    """Return configurations within 0.2 m of home, with the tool turned by up to ± these vectors (t, 3)."""
+    targets = np.repeat(chain.poses(home[None]), count, 0)
+    targets[:, :3, 3] += rng.uniform(-0.2, 0.2, (count, 3))
+    angles = rng.uniform(-1, 1, (count, len(turns))) @ turns
+    targets[:, :3, :3] = targets[:, :3, :3] @ np.array([exp3(angle) for angle in angles])
+    start = np.clip(home + rng.normal(0, 0.3, (count, chain.n_joints)), chain.lower, chain.upper)
+    q, errors = solve_ik(chain, pose_task(targets, 0.3), start)
+    return q[errors < 1e-6]
+
+
+def photograph(setup: Setup, q: np.ndarray, rng: np.random.Generator, n_images: int) -> CameraCorners:
+    """Take the first images at other configurations that show a board of a set-up of one camera and board."""
+    rows = visible_corners(setup.truth, setup.exact.rig, q)[:n_images]
+    assert len(rows) == n_images
+    q, _, _, corner, pixels = (np.concatenate(each) for each in zip(*rows, strict=True))
+    noisy = pixels + setup.sigma * rng.standard_normal(pixels.shape)
+    return CameraCorners(q, noisy, corner, setup.images.rig)

@@ -13,6 +13,7 @@ from .._typing import Array, Progress
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
+from ..estimation.uncertainty import Uncertainty
 from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.diagnosis import Diagnosis
@@ -125,6 +126,25 @@ class Evidence(FittedModel):
         None if the calibrated arm fits the images, without images, and with fewer than five configurations.
         """
         return self.hand_eye_fit.diagnosis if self.hand_eye_fit else None
+
+    @cached_property
+    def hand_eye_std(self) -> float | None:
+        """Largest standard deviation of the position of a camera or a board relative to the tool [m].
+
+        It is that along the worst direction. Errors of the arm that no image shows, such as that of the
+        length of the last link, are not contained. None without images, if the arm is kept, whose errors
+        displace the camera by more, if the tool frame is estimated, too, and if no such position is.
+        """
+        tool_frame = self.errors.chain.tool_frame_index
+        has_tool = any(p.error_frame == tool_frame for p in self.errors.parameters)
+        if self.rig is None or not self.errors.has_arm or has_tool:
+            return None
+        count = len(self.errors.parameters)
+        priors = Uncertainty.from_errors(
+            self.errors, self.x[:count], self.chain, np.diag(self.prior_std[:count]), np.empty((count, 0))
+        )
+        names = [p.name for p in self.parameters]
+        return cameras.largest_tool_std(self.rig, names, self.covariance, priors)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:

@@ -77,6 +77,14 @@ def parameter_notes(unobservable: Sequence[str], weakly_observable: Sequence[str
     ]
 
 
+def position_notes(std: float | None) -> list[str]:
+    """Return a sentence on the positions of camera and board, if their standard deviation [m] is known."""
+    if std is None or not np.isfinite(std):
+        return []
+    size = Quantity.error(std, "m")
+    return [f"Positions of camera and board relative to the arm: standard deviation {size}."]
+
+
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:
     """Sort the corrections x of the robot by their effect on the measured values."""
     order = np.argsort(-np.abs(x) * system.column_norms, kind="stable")

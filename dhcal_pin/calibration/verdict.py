@@ -153,6 +153,7 @@ def judge(fit: Evidence) -> Verdict:
             *_session(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
+            *_weak_positions(fit),
             *_unknown_size(fit),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
@@ -355,6 +356,16 @@ def _hand_eye_images(fit: Evidence) -> list[Finding]:
         f"Take images at {cameras.MIN_CONFIGURATIONS} or more."
     )
     return [Finding("caution", text)]
+
+
+def _weak_positions(fit: Evidence) -> list[Finding]:
+    """Advise caution if images of a calibrated arm do not determine the positions of cameras and boards."""
+    board = fit.comparisons[-1].after.groups.get("board")
+    if fit.hand_eye or not (fit.camera_stages and board) or fit.hand_eye_std is None:
+        return []
+    rotation = cameras.second_rotation(fit.errors.chain, fit.data)
+    text = cameras.describe_weak_positions(fit.hand_eye_std, board.rms, rotation)
+    return [Finding("caution", text)] if text else []
 
 
 def _describe(size: CorrectionSize) -> str:

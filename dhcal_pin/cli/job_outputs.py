@@ -173,7 +173,8 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
         data = contents[output]
         assert isinstance(data, bytes)
         for frame in frames(data):
-            contents |= camera_files(frame, f"{options['camera_files']}_{frame.camera.name}")
+            prefix = f"{options['camera_files']}_{frame.camera.name}"
+            contents |= camera_files(frame, prefix, fit.hand_eye_std)
     return contents
 
 

@@ -40,6 +40,8 @@ N_COMPARED = 60
 NO_EFFECT_RTOL = 1e-5
 # Largest sine of the angle between an effect and those of base and tool poses that is the same effect.
 SAME_EFFECT_TOL = 1e-3
+# Unit of the poses of base and tool beside errors of the arm [m and rad], about the size of the latter.
+FRAME_UNIT = 1e-3
 # Largest number of measured configurations that base and tool are fitted to.
 MAX_FITTED = 500
 # Smallest distance at which angles count as lengths [m].
@@ -58,6 +60,24 @@ def separate_frames(uncertainty: Uncertainty, undetermined: Array, q: Array) -> 
         return uncertainty
     effects, all_effects = (_effects(uncertainty, part, q, lever) for part in (gauge, columns))
     return replace(uncertainty, frame_part=gauge @ np.linalg.lstsq(effects, all_effects, rcond=None)[0])
+
+
+def tool_gauge_covariance(priors: Uncertainty) -> Array:
+    """Compute the covariance (6, 6) of the tool pose that errors of the arm can imitate everywhere.
+
+    The columns of `priors` are the errors of the arm, each by one standard deviation. The tool pose is a
+    twist [v, ω] in axes of the tool. Images do not show it: a camera or a board on the tool that moves
+    against the tool has the same effect.
+    """
+    chain, n_errors = priors.chain, priors.sqrt_covariance.shape[1]
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_COMPARED + n_errors, chain.n_joints))
+    lever = max(se3.rms_radius(chain.poses(q)[:, :3, 3]), MIN_LEVER)
+    by_error = _effects(priors, priors.sqrt_covariance, q, lever)
+    effects = np.concatenate([by_error, FRAME_UNIT * frame_effects(chain, q, lever)], 1)
+    _, s, combinations = np.linalg.svd(effects, full_matrices=False)
+    without_effect = combinations[s <= NO_EFFECT_RTOL * s[0]].T
+    errors, tool = without_effect[:n_errors], FRAME_UNIT * without_effect[-6:]
+    return tool @ np.linalg.pinv(errors.T @ errors, NO_EFFECT_RTOL, hermitian=True) @ tool.T
 
 
 def _gauge_directions(uncertainty: Uncertainty, undetermined: Array, lever: float) -> Array:

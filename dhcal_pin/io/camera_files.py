@@ -16,6 +16,7 @@ import pinocchio as pin
 from .. import se3
 from .._typing import Array, PathLike
 from ..cameras.rig import TIP, Camera
+from ..formatting import Quantity
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 
@@ -76,12 +77,14 @@ def _frame_name(rig: MountedRig, camera: Camera, name: str | None) -> str:
     return name if len(rig.cameras) == 1 else f"{name}_{camera.name}"
 
 
-def camera_files(frame: CameraFrame, prefix: str) -> dict[PathLike, str | bytes]:
-    """Return the contents of the files of a camera."""
+def camera_files(
+    frame: CameraFrame, prefix: str, position_std: float | None = None
+) -> dict[PathLike, str | bytes]:
+    """Return the contents of the files of a camera, with the standard deviation of its position [m]."""
     return {
         f"{prefix}.camera_info.yaml": camera_info_text(frame.camera),
         f"{prefix}.opencv.yaml": opencv_text(frame.camera),
-        f"{prefix}.handeye.yaml": hand_eye_text(frame),
+        f"{prefix}.handeye.yaml": hand_eye_text(frame, position_std),
     }
 
 
@@ -136,12 +139,13 @@ def opencv_text(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
-def hand_eye_text(frame: CameraFrame) -> str:
+def hand_eye_text(frame: CameraFrame, position_std: float | None = None) -> str:
     """Return the pose of a camera in its link as easy_handeye 0.4 keeps it.
 
     Its publisher sends the pose of `tracking_base_frame` in `robot_effector_frame` if `eye_on_hand` is true,
     otherwise in `robot_base_frame`. It also stores all frames in the parameter server of ROS, under
-    `namespace`, and stops at one without a name. Keys that it does not know stop it, too.
+    `namespace`, and stops at one without a name. Keys that it does not know stop it, too: the standard
+    deviation of the position [m] is a comment.
     """
     ending = "eye_on_hand" if frame.moves else "eye_on_base"
     parameters = {
@@ -153,7 +157,11 @@ def hand_eye_text(frame: CameraFrame) -> str:
         "tracking_marker_frame": frame.board,
     }
     values = [*frame.pose[:3, 3], *pin.Quaternion(frame.pose[:3, :3]).coeffs()]
-    lines = ["parameters:", *(f"  {key}: {json.dumps(value)}" for key, value in parameters.items())]
+    comment = []
+    if position_std is not None and np.isfinite(position_std):
+        std = Quantity.error(position_std, "m")
+        comment = [f"# standard deviation of the position relative to the arm: {std}"]
+    lines = [*comment, "parameters:", *(f"  {key}: {json.dumps(value)}" for key, value in parameters.items())]
     lines.append("transformation:")
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     lines += [f"  {name}: {_number(value)}" for name, value in zip(names, values, strict=True)]

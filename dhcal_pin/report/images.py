@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
+from ..calibration import summary
 from ..calibration.cameras import ImageError, Stage
 from ..calibration.evaluation import compute_errors
 from ..cameras.rig import Camera
@@ -60,6 +61,7 @@ def image_section(context: ReportContext) -> Section | None:
         )
         items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
         tables.append(stage_table(stages))
+    sentences += summary.position_notes(context.fit.hand_eye_std)
     hand_eye = context.fit.hand_eye
     if hand_eye is not None:
         likely = "" if hand_eye.is_noise else hand_eye.likely

@@ -83,6 +83,7 @@ def result_to_dict(
         "signs": fit.signs.to_dict() if fit.signs else None,
         "camera_stages": [stage.to_dict() for stage in fit.camera_stages],
         "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
+        "hand_eye_std_m": fit.hand_eye_std,
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "unobservable": fit.unobservable,

@@ -103,6 +103,14 @@ def test_frames_have_the_names_of_the_rig_without_another_name():
     assert published(text)[1] == "2"
 
 
+def test_the_standard_deviation_is_a_comment():
+    _, _, (frame,) = frames_on("tip")
+    plain, stated = (str(camera_files(frame, "out", std)["out.handeye.yaml"]) for std in (None, 0.0123))
+    comment = "# standard deviation of the position relative to the arm: 12.3 mm\n"
+    assert stated == comment + plain
+    assert published(stated)[:2] == ("tool0", "eye")
+
+
 def test_opencv_reads_its_file(tmp_path):
     cv2 = pytest.importorskip("cv2")
     (tmp_path / "c.yaml").write_text(opencv_text(CAMERA))

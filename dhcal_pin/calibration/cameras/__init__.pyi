@@ -10,11 +10,14 @@ from .board_size import find_board_size as find_board_size
 from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
-from .diagnosis import largest_position_std as largest_position_std
 from .gate import apply_gate as apply_gate
 from .gate import judge_stages as judge_stages
 from .gate import judge_target_points as judge_target_points
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
+from .image_checks import describe_weak_positions as describe_weak_positions
+from .image_checks import largest_position_std as largest_position_std
+from .image_checks import largest_tool_std as largest_tool_std
+from .image_checks import second_rotation as second_rotation
 from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .image_checks import small_ranges as small_ranges
 from .image_session import find_image_session as find_image_session

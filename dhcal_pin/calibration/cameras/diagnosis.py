@@ -53,6 +53,7 @@ from .causes import (
     fit_causes,
 )
 from .gate import residual_jitter
+from .image_checks import MIN_ROTATION, MORE_ROTATIONS, NO_ROTATION, describe_rotation, second_rotation
 from .sets import MAX_POINTS, count_corners, describe_configurations, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
@@ -65,8 +66,6 @@ MAX_NOISE_RATIO = 1.5
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
 # Larger errors are not stated as numbers [px], [m]: boards behind a camera have no place in the image.
 MAX_STATED_PIXELS, MAX_STATED_DISTANCE = 5000.0, 10.0
-# Rotation about a second axis that is none [rad].
-NO_ROTATION = 1e-4
 # Largest error of left-out images with exchanged links, as a fraction of the size of the image: links do not
 # explain images that are paired with wrong joint values.
 MAX_LINKS_ERROR = 0.05
@@ -84,9 +83,6 @@ N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
 # Largest number of configurations in which causes are looked for, and of corners in over a third of them:
 # more of them do not change the cause.
 MAX_CONFIGURATIONS, MAX_CORNERS = 300, 3000
-# RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
-# the images show.
-MIN_ROTATION = np.deg2rad(8.0)
 
 
 @dataclass(frozen=True)
@@ -166,13 +162,10 @@ class HandEyeDiagnosis:
         """What is wrong with the choice of the images, one finding each."""
         out = []
         if self.has_few_rotations:
-            turns = self.rotation > NO_ROTATION
-            angle = f"by {np.degrees(self.rotation):.2g}° (RMS)" if turns else "never"
-            size = f"by up to {1 / self.rotation:.2g} mm" if turns else "by metres"
+            size = f"by up to {1 / self.rotation:.2g} mm" if self.rotation > NO_ROTATION else "by metres"
             out.append(
-                f"Too few rotations: the tool turned {angle} about a second axis. An error of the arm of "
-                f"1 mm displaces the camera {size}, and the images do not show it. Add images that are "
-                "turned by 30° or more about two axes that are not parallel."
+                f"Too few rotations: {describe_rotation(self.rotation)}. An error of the arm of "
+                f"1 mm displaces the camera {size}, and the images do not show it. {MORE_ROTATIONS}"
             )
         names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:
@@ -268,20 +261,6 @@ class HandEyeFit:
         return diagnose_hand_eye(self.fit, self.position_std, self.holdout, self.is_arm_tried)
 
 
-def largest_position_std(names: Sequence[str], covariance: Array) -> float:
-    """Return the largest standard deviation of the position of any camera or board in any direction [m]."""
-    index = {name: i for i, name in enumerate(names)}
-    largest = 0.0
-    for name in names:
-        entry, _, component = name.rpartition(".")
-        if component == "x" and entry.startswith(("camera_", "board_")):
-            position = [index[f"{entry}.{axis}"] for axis in "xyz"]
-            block = covariance[np.ix_(position, position)]
-            is_known = np.isfinite(block).all()
-            largest = max(largest, float(np.linalg.eigvalsh(block)[-1]) if is_known else np.inf)
-    return float(np.sqrt(largest))
-
-
 def diagnose_hand_eye(
     fit: Fit, position_std: float, holdout: Sequence[Measurement], is_arm_tried: bool
 ) -> HandEyeDiagnosis | None:
@@ -304,7 +283,7 @@ def diagnose_hand_eye(
         found.causes,
         found.alternatives,
         found.trials,
-        second_rotation(fit, found.hand_eye.data),
+        second_rotation(fit.problem.errors.chain, found.hand_eye.data),
         position_std,
         tuple(
             label
@@ -350,15 +329,6 @@ def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, wei
     is_wrong = np.sqrt(squares) > MIN_WRONG_RATIO * state.error.pixels
     first = np.unique(rejected.image, return_index=True)[1]
     return [rejected.image_labels[i] for i in np.argsort(first) if is_wrong[i]]
-
-
-def second_rotation(fit: Fit, data: Sequence[Measurement]) -> float:
-    """Return the RMS rotation of the tool about the axis with the second largest rotation [rad]."""
-    q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
-    rotations = fit.problem.errors.chain.poses(q)[:, :3, :3]
-    mean = se3.nearest_rotation(rotations.mean(0))
-    turns = np.array([se3.log3(mean.T @ rotation) for rotation in rotations])
-    return float(np.linalg.svd(turns, compute_uv=False)[1] / np.sqrt(len(turns)))
 
 
 @dataclass(frozen=True, eq=False)

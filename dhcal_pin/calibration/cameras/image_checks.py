@@ -1,22 +1,33 @@
-"""Whether images belong to the joint values and to the robot, and which joint ranges they show.
+"""Whether images belong to the joint values and to the robot, and what they show of joints and poses.
 
 A rotation between two poses of the camera or of the board has the same angle as the rotation of the tool, for
 any pose of both on the robot: in T·B and T'·B the tool turns by T⁻¹·T', and what is on it by B⁻¹·(T⁻¹·T')·B.
 The angles that images show, each from the image alone, are compared with those of the nominal arm. Zeros that
 are wrong by 15° in every joint change half of them by less than 4°; joint values of other images, wrong signs
 or another robot by 10° to 60°.
+
+If the tool keeps its orientation in all images, camera and board can move by any common displacement against
+the arm, and no image changes. With small rotations φ of the tool, an error e at the board displaces them by
+e/φ. Errors of the arm can imitate another pose of the tool, too, such as another length of the last link.
+Rotations do not help, but camera and board are right relative to the calibrated arm all the same. This part
+of their covariance is that of the priors (`tool_gauge_covariance`), and is subtracted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from ... import se3
 from ..._typing import Array
+from ...estimation.frame_gauge import tool_gauge_covariance
 from ...estimation.robust import ZERO_WEIGHT
+from ...estimation.uncertainty import Uncertainty
+from ...formatting import Quantity
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
+from ...measurements.mounting import MountedRig
 from ...robot.chain import Chain
 from ..partition import different_configurations
 from ..reweighting import Fit
@@ -30,6 +41,16 @@ MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 6, 200
 SHIFTS = (-2, -1, 1, 2)
 # Share of outliers above which a fit says nothing.
 MAX_IMAGE_OUTLIER_SHARE = 0.5
+# RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
+# the images show, and the ratio of both errors at this rotation.
+MIN_ROTATION = np.deg2rad(8.0)
+MAX_ERROR_RATIO = 1 / MIN_ROTATION
+# Rotation about a second axis that is none [rad].
+NO_ROTATION = 1e-4
+# Smaller errors at the board count as this one [m]: those of simulated images without noise are rounding.
+MIN_BOARD_ERROR = 1e-6
+# What to do about too few rotations.
+MORE_ROTATIONS = "Add images that are turned by 30° or more about two axes that are not parallel."
 
 
 def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
@@ -114,3 +135,83 @@ def seen_ranges_warning(chain: Chain, data: Sequence[Measurement]) -> str:
         f"The images show less than half of the range of {count}: {', '.join(names[:MAX_JOINTS])}{more}. "
         "Outside of what they show, the corrections of the arm are not verified."
     )
+
+
+def largest_position_std(names: Sequence[str], covariance: Array) -> float:
+    """Return the largest standard deviation of the position of any camera or board in any direction [m]."""
+    first = [name for name in names if name.startswith(("camera_", "board_")) and name.endswith(".x")]
+    return _largest_std([_position_block(name.removesuffix(".x"), names, covariance) for name in first])
+
+
+def largest_tool_std(
+    rig: MountedRig, names: Sequence[str], covariance: Array, priors: Uncertainty
+) -> float | None:
+    """Return the largest standard deviation of the position of a camera or a board relative to the tool [m].
+
+    `covariance` (p, p) is that of the unknowns `names`. `priors` are the standard deviations of the errors of
+    the arm before the measurement: what these imitate is not contained. None without such an unknown.
+    """
+    gauge, blocks = tool_gauge_covariance(priors), []
+    for entry, link_pose, pose in _entries_on_tool(rig):
+        if f"{entry}.x" in names:
+            axes = link_pose[:3, :3]
+            by_tool = np.concatenate([np.eye(3), -se3.skew(link_pose[:3, 3] + axes @ pose[:3, 3])], 1)
+            imitated = axes.T @ by_tool @ gauge @ by_tool.T @ axes
+            blocks.append(_position_block(entry, names, covariance) - imitated)
+    return _largest_std(blocks) if blocks else None
+
+
+def _entries_on_tool(rig: MountedRig) -> Iterator[tuple[str, Array, Array]]:
+    """Yield the prefix of the names, the pose of the link, and the pose in it, of what the tool carries."""
+    for kind, entries, mounts in (
+        ("camera", rig.cameras, rig.camera_mounts),
+        ("board", rig.boards, rig.board_mounts),
+    ):
+        for entry, mount in zip(entries, mounts, strict=True):
+            if mount.moves and entry.pose is not None:
+                yield f"{kind}_{entry.name}", mount.link_pose, entry.pose
+
+
+def _position_block(entry: str, names: Sequence[str], covariance: Array) -> Array:
+    """Return the covariance (3, 3) of the position of a camera or a board."""
+    position = [names.index(f"{entry}.{axis}") for axis in "xyz"]
+    return covariance[np.ix_(position, position)]
+
+
+def _largest_std(blocks: Sequence[Array]) -> float:
+    """Return the largest standard deviation in any direction of positions with these covariances (3, 3)."""
+    if not all(np.isfinite(block).all() for block in blocks):
+        return np.inf
+    return float(np.sqrt(max([0.0, *(np.linalg.eigvalsh(block)[-1] for block in blocks)])))
+
+
+def second_rotation(chain: Chain, data: Sequence[Measurement]) -> float:
+    """Return the RMS rotation of the tool about the axis with the second largest rotation [rad]."""
+    q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
+    rotations = chain.poses(q)[:, :3, :3]
+    mean = se3.nearest_rotation(rotations.mean(0))
+    turns = np.array([se3.log3(mean.T @ rotation) for rotation in rotations])
+    return float(np.linalg.svd(turns, compute_uv=False)[1] / np.sqrt(len(turns)))
+
+
+def describe_rotation(rotation: float) -> str:
+    """Say how far the tool turned about a second axis [rad]."""
+    if rotation <= NO_ROTATION:
+        return "the tool never turned about a second axis"
+    return f"the tool turned by {np.degrees(rotation):.2g}° (RMS) about a second axis"
+
+
+def describe_weak_positions(std: float, error: float, rotation: float) -> str:
+    """Say that the images do not determine camera and board relative to the arm; empty if they do.
+
+    Arguments are the standard deviation [m] of these positions, the error at the board [m] and the rotation
+    about the second axis [rad].
+    """
+    if std <= MAX_ERROR_RATIO * max(error, MIN_BOARD_ERROR):
+        return ""
+    size = f"have a standard deviation of {Quantity.error(std, 'm')}" if np.isfinite(std) else "are unknown"
+    found = f"The positions of camera and board relative to the arm {size}, and the images do not show it: "
+    found += f"the error at the board is {Quantity.error(error, 'm')}."
+    if rotation >= MIN_ROTATION:
+        return f"Too few images. {found} Take more images."
+    return f"Too few rotations: {describe_rotation(rotation)}. {found} {MORE_ROTATIONS}"

@@ -207,6 +207,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
     return [
         Block(table, noun="figure", rank=7, n_kept=len(rows), has_space=True),
         Block(sentences),
+        Block(summary.position_notes(fit.hand_eye_std)),
         Block(summary.regressions(fit.errors, fit.comparisons), "yellow"),
     ]
 
