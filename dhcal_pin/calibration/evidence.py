@@ -73,6 +73,9 @@ class Evidence(FittedModel):
         session: What happened during the measurement; None if this was not examined.
         with_auto: Function that calibrates with the loss "auto", whose verdict counts, too; None if this
             calibration did.
+        with_full_set: Function that calibrates with all parameters of the arm, base and tool; None if this
+            calibration did, or if a smaller choice was deliberate.
+        has_default_sets: Whether the parameter sets are the default ones of the robot.
         signs: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are
             those of the URDF.
         arm_type: Limits by which images are judged.
@@ -87,6 +90,8 @@ class Evidence(FittedModel):
     earlier_diagnosis: Diagnosis | None = None
     session: Session | None = None
     with_auto: Callable[[], Evidence] | None = None
+    with_full_set: Callable[[], Evidence] | None = None
+    has_default_sets: bool = False
     signs: plausibility.SignDecision | None = None
     arm_type: ArmType = INDUSTRIAL
 

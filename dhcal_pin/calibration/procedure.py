@@ -55,7 +55,15 @@ from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import can_have_session, find_scale, find_session
 from . import cameras, model_selection
-from .cameras import arm_type, default_sets, has_images, held_values, require_joint_values, split_sets
+from .cameras import (
+    arm_type,
+    default_sets,
+    has_images,
+    has_joint_values,
+    held_values,
+    require_joint_values,
+    split_sets,
+)
 from .cross_validation import leave_regions_out
 from .evaluation import accuracy, fit_nominal
 from .evidence import diagnose
@@ -178,6 +186,25 @@ def calibrate(
     if LOW_COST in robot_sets:
         chain = replace(chain, parameters=HAND_BUILT)
     require_joint_values((*data, *holdout), [*robot_sets, *free])
+    is_deliberate = method != "lm" or bool(fix or free or bounds) or not has_joint_values((*data, *holdout))
+    with_full_set = (
+        partial(
+            recalibrate,
+            data,
+            parameters=model_selection.FULL_SET,
+            priors=_full_set_priors(chain, priors),
+            holdout=holdout,
+            extend="none",
+            turned=turned,
+        )
+        if model_selection.is_restricted([*robot_sets, *rig_sets]) and not is_deliberate
+        else None
+    )
+    settings: dict[str, Any] = {
+        "with_auto": with_auto,
+        "with_full_set": with_full_set,
+        "has_default_sets": parameters is None,
+    }
     signs = None
     if turned != "auto":
         names = turned.split(",") if isinstance(turned, str) else turned
@@ -246,17 +273,25 @@ def calibrate(
                 found = without_changes(found)
     data = fit.data
     if method != "lm":
-        return replace(make_result(fit, 1.0, holdout, method), signs=signs, with_auto=with_auto)
+        return replace(make_result(fit, 1.0, holdout, method), signs=signs, **settings)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)
         images = cameras.calibrate_images(fitting, fit, chain, holdout, exchanges, families)
-        return replace(images, signs=signs, with_auto=with_auto, session=of_images)
+        return replace(images, signs=signs, session=of_images, **settings)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
     result = _calibrate_samples(fit, groups, families, holdout, extended, signs, progress)
-    return replace(result, session=found, with_auto=with_auto)
+    return replace(result, session=found, **settings)
+
+
+def _full_set_priors(chain: Chain, priors: Priors) -> Priors:
+    """Return the priors for all parameters of the arm, without those of other parameters."""
+    if not isinstance(priors, Mapping):
+        return priors
+    names = [p.name for p in select_parameters(chain, model_selection.FULL_SET).parameters]
+    return {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
 
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:

@@ -31,6 +31,7 @@ from ..se3 import rms_length
 from . import cameras
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
+from .model_selection import FULL_SET
 from .partition import configuration_groups
 from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
 
@@ -49,6 +50,9 @@ MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
 # belong together. The first of image coordinates depends on the type of arm.
 MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
+# More parameters are suggested if they reduce the error at least to this fraction, and not if the error is
+# below this fraction of that of the nominal robot: exact data.
+MAX_FULL_SET_RATIO, EXACT_FIT_RATIO = 0.8, 1e-6
 # Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
 MAX_FRAME_RATIO = 1 / 3
 # Largest number of iterations of such a fit.
@@ -151,6 +155,7 @@ def judge(fit: Evidence) -> Verdict:
         found = [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_session(fit),
+            *_small_parameter_set(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
             *_weak_positions(fit),
@@ -194,6 +199,35 @@ def _other_loss(fit: Evidence, verdict: Verdict) -> list[Finding]:
         f"Outliers spoil the fit: {heads[0].after} with them, {heads[1].after} with {option}, which excludes"
     )
     return [Finding("caution", f"{text} those far from the other samples.")]
+
+
+def _small_parameter_set(fit: Evidence) -> list[Finding]:
+    """Advise caution if the default parameters of the robot cannot represent its errors."""
+    text = suggest_full_set(fit) if fit.has_default_sets else ""
+    reason = f"The default parameters cannot represent the errors: {text}."
+    return [Finding("caution", reason)] if text else []
+
+
+def suggest_full_set(fit: Evidence) -> str:
+    """Suggest the full parameter set if it considerably reduces the error on samples that are not fitted."""
+    if fit.with_full_set is None:
+        return ""
+    # The other calibration does not leave out regions.
+    current = next(each for each in fit.comparisons if each.title != "region hold-out")
+    group, after = next(iter(current.after.groups.items()))
+    if current.title == "fitted" or after.rms < EXACT_FIT_RATIO * current.before.groups[group].rms:
+        return ""
+    full_fit = fit.with_full_set()
+    full = full_fit.comparisons[0]
+    if not full_fit.converged or full.after.groups[group].rms > MAX_FULL_SET_RATIO * after.rms:
+        return ""
+    if judge(full_fit).is_refused:
+        return ""  # More parameters do not explain the measurements either.
+    with_full_set, with_this_set = headline([full]).after, headline([current]).after
+    return (
+        f"--parameters {FULL_SET} reduces the RMS {ERROR_GROUPS[group].label} on samples that are not "
+        f"fitted from {with_this_set} to {with_full_set}"
+    )
 
 
 def _unmoved_joints(fit: Evidence) -> list[Finding]:

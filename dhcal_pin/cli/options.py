@@ -160,8 +160,8 @@ MEND: dict[str, Any] = {
 JSON: dict[str, Any] = {"metavar": "FILE", "help": "write the result as JSON; - for stdout"}
 PARAMETERS: dict[str, Any] = {
     "metavar": "SET[,SET]",
-    "help": "parameter sets to estimate (default: minimal,base,tool for a URDF, dh for a DH file): "
-    "{parameter_sets}",
+    "help": "parameter sets to estimate (default: minimal,base,tool for a URDF, dh or modified-dh for a DH "
+    "file): {parameter_sets}",
 }
 FIX: dict[str, Any] = {
     "metavar": "NAME[,NAME]",

@@ -12,7 +12,6 @@ A job runs in these steps. Invalid input is found before anything is written.
 
 from __future__ import annotations
 
-import fnmatch
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,16 +22,16 @@ import numpy as np
 
 from .. import io, plausibility
 from .._typing import PathLike, Progress
-from ..calibration import model_selection, partition, procedure, summary
-from ..calibration.cameras import MIXED_SETS, default_sets, has_images, has_joint_values
+from ..calibration import model_selection, partition, procedure
+from ..calibration.cameras import MIXED_SETS, default_sets, has_images
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.evidence import diagnose
-from ..calibration.model_selection import FULL_SET, is_restricted
 from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
+from ..calibration.verdict import suggest_full_set
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
-from ..estimation.parameters import LOW_COST, select_parameters
+from ..estimation.parameters import LOW_COST
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
 from ..io.measurement_files import MeasurementFile, read_measurement_file
@@ -41,7 +40,6 @@ from ..io.robot import read_robot
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument
 from ..measurements.base import Measurement
-from ..measurements.groups import ERROR_GROUPS
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import TaskExecutor
@@ -82,12 +80,6 @@ NO_CORRECTIONS = (
 # Largest number of rows of a file that are used. The standard deviations of parameters are then far below all
 # other errors; a calibration takes about 15 s and 0.6 GB.
 MAX_FILE_ROWS = 200_000
-
-# More parameters are suggested if they reduce the error at least to this fraction.
-MAX_ERROR_RATIO = 0.8
-
-# They are not suggested if the calibrated error is below this fraction of the nominal one: exact data.
-EXACT_FIT_RATIO = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +148,7 @@ def run_job(
     }
     measurements = list(data.fit.values())
     _require_cameras(job, measurements)
-    fit = _calibrate(job, chain, data, sets, restrictions, options, progress)
+    fit = _calibrate(job, chain, data, restrictions, options, progress)
     on_images = fit.input_warnings
     fit = replace(
         fit,
@@ -164,11 +156,11 @@ def run_job(
         + tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts),
     )
     fit = fit.accepted
-    # More parameters are not suggested if the choice was deliberate, or if the columns may be mixed up.
-    is_deliberate = job.method != "lm" or any(restrictions.values()) or not has_joint_values(measurements)
-    if not is_deliberate and not any(data.warnings.values()) and is_restricted(split_commas(sets)):
-        suggestion = improvement_hint(fit, chain, measurements, **options)
-        data.warnings[job.robot] = [suggestion] if suggestion else []
+    # More parameters are not suggested if the columns may be mixed up. The verdict judges default ones.
+    if not fit.has_default_sets and not any(data.warnings.values()):
+        text = suggest_full_set(fit)
+        warning = f"{text}: the chosen parameters cannot represent the errors"
+        data.warnings[job.robot] = [warning] if text else []
     hint = _add_warnings(job, fit, data, sets, on_images)
     return _write_job(job, fit, sets, data, inputs, hint, servos, shown or {})
 
@@ -360,7 +352,6 @@ def _calibrate(
     job: Job,
     chain: Chain,
     data: _JobData,
-    sets: str,
     restrictions: Mapping[str, Any],
     options: Mapping[str, Any],
     progress: Progress | None,
@@ -373,7 +364,9 @@ def _calibrate(
         **options,
     }
     try:
-        fit = procedure.calibrate(chain, list(data.fit.values()), sets, progress=progress, **settings)
+        fit = procedure.calibrate(
+            chain, list(data.fit.values()), job.parameters, progress=progress, **settings
+        )
     except UnknownNameError as error:
         sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
         path = sources.get(error.argument)
@@ -386,7 +379,7 @@ def _calibrate(
             without_holdout["turned"] = fit.signs.turned
         regions = leave_regions_out(
             fit,
-            lambda part: procedure.calibrate(chain, part, sets, **without_holdout),
+            lambda part: procedure.calibrate(chain, part, job.parameters, **without_holdout),
             progress,
         )
         fit = replace(fit, region_comparison=regions)
@@ -416,31 +409,6 @@ def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
     if not is_default or any(data.warnings.values()) or set(split_commas(sets)) <= {"base", "tool"}:
         return ""
     return model_selection.family_hint(fit.problem, fit.x, fit.weights)
-
-
-def improvement_hint(fit: Result, chain: Chain, data: Sequence[Measurement], **options: Any) -> str:
-    """Suggest the full parameter set if it considerably reduces the error on samples that are not fitted."""
-    # The other calibration does not leave out regions.
-    current = next(each for each in fit.comparisons if each.title != "region hold-out")
-    group, after = next(iter(current.after.groups.items()))
-    if current.title == "fitted" or after.rms < EXACT_FIT_RATIO * current.before.groups[group].rms:
-        return ""
-    if isinstance(priors := options.get("priors"), Mapping):
-        # The user's priors are for the chosen sets; drop those without a parameter in the full set.
-        names = [p.name for p in select_parameters(chain, FULL_SET).parameters]
-        options["priors"] = {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
-    full_fit = procedure.calibrate(chain, data, FULL_SET, extend="none", **options)
-    full = full_fit.comparisons[0]
-    if not full_fit.converged or full.after.groups[group].rms > MAX_ERROR_RATIO * after.rms:
-        return ""
-    fitted = {item.source: item for item in full_fit.data}
-    if any(poorly_fitted_files(full_fit.chain, fitted, full_fit.instruments).values()):
-        return ""  # More parameters do not explain the measurements either.
-    with_full_set, with_this_set = summary.headline([full]).after, summary.headline([current]).after
-    return (
-        f"--parameters {FULL_SET} reduces the RMS {ERROR_GROUPS[group].label} on samples that are not "
-        f"fitted from {with_this_set} to {with_full_set}: the chosen parameters cannot represent the errors"
-    )
 
 
 # --- output ----------------------------------------------------------------------------------------

@@ -194,7 +194,8 @@ class Chain:
             name: Name of the robot in the URDF.
 
         Returns:
-            Chain with the tip link `tool0`, whose default parameter set is `dh`.
+            Chain with the tip link `tool0`, whose default parameter set is that of the table: `dh` or
+            `modified-dh`.
 
         Raises:
             InvalidArgumentError: The table is not a `DHTable`.
@@ -205,7 +206,7 @@ class Chain:
 
         text = dh_to_urdf(table, name)
         chain = cls.from_urdf(parse_urdf(text.encode(), f"{name}.urdf"), "tool0")
-        return replace(chain, parameters="dh")
+        return replace(chain, parameters="dh" if table.convention == "standard" else "modified-dh")
 
     def __repr__(self) -> str:
         return f"Chain(name={self.urdf.name!r}, tip={self.tip!r}, n_joints={self.n_joints})"

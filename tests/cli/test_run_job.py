@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import os
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +29,11 @@ from robots import URDF
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin.calibration.summary import format_share
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.io import measurement_text, read_dh
-from dhcal_pin.measurements import Position
+from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.robot import Chain, read_urdf
+from dhcal_pin.se3 import exp3, transform
 
 
 def test_json_of_a_calibration(run, robot_folder):
@@ -419,6 +423,48 @@ def test_restricted_parameters_are_reported(run, tmp_path, monkeypatch):
     status, _, err = run("calibrate", "arm.dh.toml", "data.csv", *sets, "-o", "out.urdf")
     assert status == 0, err
     assert "arm.dh.toml: warning: --parameters minimal,base,tool reduces" in err
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_default_parameters_of_a_dh_file(run, tmp_path, monkeypatch, convention):
+    """They are those of its convention. An error of the base is a reason for caution; the remedy helps."""
+    monkeypatch.chdir(tmp_path)
+    rows = [
+        (0, 433, 0, 0),
+        (0, 150, 0, -90),
+        (0, 0, 432, 0),
+        (0, 432, 20, -90),
+        (0, 0, 0, 90),
+        (0, 56, 0, -90),
+    ]
+    if convention == "standard":
+        rows = [(*row[:2], *after[2:]) for row, after in zip(rows, [*rows[1:], (0, 0, 0, 0)], strict=True)]
+    text = f'convention = "{convention}"\n[units]\nlength = "mm"\nangle = "deg"\n'
+    for i, row in enumerate(rows, 1):
+        entries = "".join(
+            f"{key} = {v}.0\n" for key, v in zip(("theta", "d", "a", "alpha"), row, strict=True)
+        )
+        text += f'[[joint]]\nname = "j{i}"\ntype = "revolute"\n{entries}'
+    Path("arm.dh.toml").write_text(text)
+    arm, rng = Chain.from_dh(read_dh("arm.dh.toml")), np.random.default_rng(3)
+    errors = select_parameters(arm, "dh" if convention == "standard" else "modified-dh")
+    truth = errors.at(rng.normal(size=len(errors.parameters)) * 2e-3)
+    base = transform(exp3([1e-3, 2e-3, -3e-3]), [5e-3, -3e-3, 4e-3])
+    for moved, verdict, largest in ((np.eye(4), "ok", 2e-4), (base, "caution", 0.02)):
+        q = rng.uniform(-2.5, 2.5, (100, 6))
+        data = Pose.simulate(replace(truth, base=moved), q, Noise(5e-5, 1e-4), rng)
+        Path("data.csv").write_text(measurement_text(data, arm))
+        command = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf", "--json", "r.json", "--force")
+        status, _, err = run(*command)
+        found = json.loads(Path("r.json").read_text())
+        assert (status, found["verdict"]["status"]) == (0, verdict), err
+        assert found["cross_validated_after"]["position_rms_m"] < largest
+    expected = "The default parameters cannot represent the errors: --parameters minimal,base,tool reduces"
+    assert found["verdict"]["reasons"][0].startswith(expected)
+    assert run(*command, "--parameters", "minimal,base,tool")[0] == 0
+    found = json.loads(Path("r.json").read_text())
+    assert found["verdict"]["status"] == "ok"
+    assert found["cross_validated_after"]["position_rms_m"] < 2e-4
 
 
 def test_the_screen_says_whether_outliers_in_the_fit_do_harm(run, robot_folder):
