@@ -46,6 +46,10 @@ if TYPE_CHECKING:
 
 # Values of `Compensation.status`.
 OK, SINGULAR, LIMITS, OUT = "ok", "near singular", "joint limits", "out of reach"
+OTHER = "other configuration"
+
+# A solution is another configuration of the arm if a joint is farther from the given position [rad].
+_MAX_ROTATION = np.pi / 2
 
 # A target is near a singularity if a joint rate of 1 rad moves the tool by less than this, as a fraction of
 # the characteristic length per radian [1] or as an angle [rad/rad].
@@ -75,7 +79,9 @@ class Compensation:
         poses: Corrected targets for a controller with the nominal model, shape (m, 4, 4) [m]: the poses of
             its tool, with its own base and tool frame, at `q`.
         status: "ok", "near singular" (reached, but small motions of the tool need large motions of the
-            joints), "joint limits" (reached only beyond the limits) or "out of reach", for each target.
+            joints), "other configuration" (reached, but a joint is more than 90° from the position that was
+            given for this target), "joint limits" (reached only beyond the limits) or "out of reach", for
+            each target.
         residual_error: Distance and angle between the calibrated tool and the target, shape (m, 2) [m, rad];
             of the nearest solution if the target is not reached. The angle is 0 for position targets.
     """
@@ -87,8 +93,8 @@ class Compensation:
 
     @property
     def reached(self) -> Array:
-        """Whether each target is reached, that is "ok" or "near singular", shape (m,)."""
-        return np.isin(self.status, (OK, SINGULAR))
+        """Whether each target is reached, in any configuration of the arm, shape (m,)."""
+        return np.isin(self.status, (OK, SINGULAR, OTHER))
 
 
 def compensate(
@@ -128,6 +134,7 @@ def compensate(
             f"of {nominal.urdf.source}: {', '.join(nominal.joint_names)}"
         )
     targets = _validated_targets(targets)
+    is_near_each_target = near is not None and np.ndim(near) == 2
     near = calibrated.validated_q(np.atleast_2d(_mid_range(calibrated) if near is None else near))
     if len(near) not in (1, len(targets)):
         raise InvalidArgumentError(f"near has {len(near)} rows; expected 1 or {len(targets)}, one per target")
@@ -149,6 +156,9 @@ def compensate(
     poses[reached] = nominal.poses(q[reached])
     is_singular = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
     status[reached[is_singular]] = SINGULAR
+    if is_near_each_target:
+        rotations = np.where(calibrated.is_prismatic, 0.0, np.abs(q - near))
+        status[(status == OK) & np.any(rotations > _MAX_ROTATION, 1)] = OTHER
     return Compensation(q, poses, tuple(status.tolist()), residual_error)
 
 

@@ -238,6 +238,21 @@ def test_status_distinguishes_limits_from_reach():
     assert np.isnan(found.q).all()
 
 
+def test_another_configuration_than_the_given_one_is_named():
+    """The given configuration has its elbow on the other side, where the limits do not let it be."""
+    table = replace(paper("experiment"), lower=np.deg2rad([-90, -90, -150]), upper=np.deg2rad([90, 90, -5]))
+    arm = Chain.from_dh(table)
+    q = np.deg2rad([20, 30, -70])
+    given = np.array([q, q + np.deg2rad([0, -70, 140])])
+    targets = np.repeat(arm.poses(q[None])[:, :3, 3], 2, 0)
+    found = compensate(arm, arm, targets, given)
+    assert found.status == ("ok", "other configuration")
+    assert found.reached.all()
+    np.testing.assert_allclose(found.q, [q, q], atol=1e-6)
+    # One start for all targets only selects solutions.
+    assert compensate(arm, arm, targets, given[1]).status == ("ok", "ok")
+
+
 def test_nearest_of_several_solutions_is_chosen():
     rng = np.random.default_rng(3)
     arm = ROBOTS["ur10"]()
