@@ -155,7 +155,6 @@ def judge(fit: Evidence) -> Verdict:
         found = [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_session(fit),
-            *_small_parameter_set(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
             *_weak_positions(fit),
@@ -172,6 +171,8 @@ def judge(fit: Evidence) -> Verdict:
             found = [replace(each, status="refused") for each in hidden] + [
                 f for f in found if f not in hidden
             ]
+        else:
+            found = [*_small_parameter_set(fit), *found]
         findings += found
     verdict = Verdict.from_findings(findings)
     return Verdict.from_findings([*_other_loss(fit, verdict), *findings])
