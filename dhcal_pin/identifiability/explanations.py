@@ -555,7 +555,8 @@ def explain_weakly_observable(
             text += f"; {relation}"
         change = full_range[:, members] @ (prior_std[list(members), None] * main)
         s = np.linalg.norm(change, axis=0) / noise
-        if np.all(1 / np.hypot(1.0, s) < observability.MAX_KNOWN_STD_RATIO):
+        is_known = np.all(1 / np.hypot(1.0, s) < observability.MAX_KNOWN_STD_RATIO)
+        if is_known and not any(item.rig for item in problem.data):
             text += "; measure over the full range of the joints"
         out.append(text)
     return out

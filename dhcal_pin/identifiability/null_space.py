@@ -39,6 +39,8 @@ from ..robot.chain import Chain
 from .propagation import NEGLIGIBLE
 
 Cause = Literal["structure", "instrument", "poses", "unmoved"]
+# Half of the range of joint positions around those of an image in which a board stays in view [rad or m].
+_IMAGE_RANGE = 0.1
 # Rows of hypothetical measurements per unknown.
 _ROWS_PER_UNKNOWN = 6
 # Singular values below this fraction of the norm of R count as zero.
@@ -118,14 +120,20 @@ class ObservabilityProbe:
         return rng.uniform(low, high, (m, chain.n_joints))
 
     def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
-        """Return a measurement with some joints drawn anew; contacts are returned unchanged."""
+        """Return a measurement with some joints drawn anew; contacts are returned unchanged.
+
+        Joints of images are drawn near the measured ones, so that boards stay in view.
+        """
         if item.is_contact:
             return item
         if len(joints) == self.chain.n_joints and not item.instrument_parameters:
             # All samples are alike; more rows would only take time.
             item = item.take(np.s_[: 1 + _ROWS_PER_UNKNOWN * len(self.x) // item.residual_dim])
         q = item.configurations().copy()
-        q[:, joints] = self.draw_configurations(rng, len(q))[:, joints]
+        if item.rig is None:
+            q[:, joints] = self.draw_configurations(rng, len(q))[:, joints]
+        else:
+            q[:, joints] += rng.uniform(-_IMAGE_RANGE, _IMAGE_RANGE, q[:, joints].shape)
         return item.resample(q)
 
     def hypothetical_r_factor(self, joints: Sequence[int], *extra: type[Pose] | type[Position]) -> Array:
@@ -148,7 +156,7 @@ class ObservabilityProbe:
 
     @cached_property
     def full_range(self) -> Array:
-        """R factor of hypothetical measurements with all joints drawn anew, shape (p, p)."""
+        """R factor of hypothetical measurements with all joints drawn anew, (p, p); of images near them."""
         return self.hypothetical_r_factor(range(self.chain.n_joints))
 
     def unmoved_joints(self) -> list[int]:

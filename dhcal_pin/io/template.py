@@ -45,8 +45,8 @@ class _Size(NamedTuple):
 
 # Largest motion of a frame that counts as the same frame before and after a calibration.
 SAME_FRAME = _Size(0.01, 0.05)
-# Largest motion of an axis or a tip; beyond it the files describe different robots. A calibration of a low-cost
-# arm turns axes by up to 8 degrees.
+# Largest motion of an axis or a tip; beyond it the files describe different robots. A calibration of a
+# low-cost arm turns axes by up to 8 degrees.
 SAME_ROBOT = _Size(0.05, 0.2)
 # Largest difference of axes in the same frame.
 _AXIS_TOL = 1e-9

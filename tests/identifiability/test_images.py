@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, wrong_arm
+from camera_setups import ARMS, random_setup, wrong_arm
 
 import dhcal_pin as dh
+from dhcal_pin.estimation.qr import rank
 from dhcal_pin.identifiability import EXPECTED
+from dhcal_pin.identifiability.null_space import ObservabilityProbe
 from dhcal_pin.measurements import Noise
 
 
@@ -46,3 +48,15 @@ def test_a_joint_that_never_moved_still_asks_for_action():
     fit = simulated("minimal,base,tool,camera,board", unmoved=3)
     actions = [text for text in fit.unobservable if not text.startswith(EXPECTED)]
     assert any("wrist_1_joint never moved; " in text and "move this joint" in text for text in actions)
+
+
+@pytest.mark.parametrize("seed", [8, 20])
+def test_more_images_of_the_same_kind_determine_at_least_as_much(seed):
+    """Configurations in which no board is in view would say nothing of what images determine."""
+    setup = random_setup(seed)
+    fit = dh.calibrate(setup.nominal, setup.images, "placement,offset,camera,board,intrinsics")
+    system = fit.solution.system
+    probe = ObservabilityProbe(fit.problem, fit.x)
+    assert rank(probe.full_range) == rank(system.r) == fit.rank
+    # The full range of the joints is no remedy for a distortion that images do not determine.
+    assert not any("full range of the joints" in text for text in fit.weakly_observable)
