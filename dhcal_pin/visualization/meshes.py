@@ -330,8 +330,9 @@ def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
     triangles than their share are not simplified.
     """
     remaining, roots = float(total), np.sqrt(counts)
-    rate = np.inf
-    for i in np.argsort(roots):
+    rate = 0.0
+    # A damaged mesh may have no triangles.
+    for i in (i for i in np.argsort(roots) if roots[i]):
         rate = remaining / roots[roots >= roots[i]].sum()
         if roots[i] > rate:
             break

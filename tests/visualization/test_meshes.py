@@ -87,6 +87,8 @@ def test_a_robot_keeps_as_many_triangles_as_it_may_and_its_form(file):
 
 def test_small_meshes_stay_whole():
     assert allocate_triangles([4, 1600, 9, 400], 613) == [4, 400, 9, 200]
+    assert allocate_triangles([0, 4, 0], 100) == [0, 4, 0]
+    assert allocate_triangles([0, 0], 100) == [0, 0]
     assert allocate_triangles([10, 20], 400) == [10, 20]
     assert allocate_triangles([100, 100, 100], 30) == [10, 10, 10]
     assert allocate_triangles([], 30) == []
