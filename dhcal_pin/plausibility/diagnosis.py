@@ -33,6 +33,12 @@ class Diagnosis:
     source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
     #: Whether each of several measurements fits the robot, but not all of them together.
     fits_separately: bool = False
+    gain: float = 0.0  #: Logarithm of the ratio of the evidence with the first hypothesis to that before.
+
+    @property
+    def log(self) -> float:
+        """Logarithm of the evidence with the first hypothesis, or of the measurements as they were read."""
+        return self.before.log + self.gain
 
     @property
     def is_suspicious(self) -> bool:
