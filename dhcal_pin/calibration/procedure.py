@@ -236,7 +236,7 @@ def calibrate(
             changed = found.applied(data, holdout)
             sets = HAND_BUILT if signs else MANUFACTURED
             is_likely, diagnosis = compare_with_mistakes(
-                found, fit.problem.errors.chain, (data, changed[0]), sets, progress
+                found, fit.problem.errors.chain, data, changed[0], sets, progress
             )
             held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
             refit = start(changed[0], errors=held) if is_likely else fit

@@ -20,10 +20,10 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation.solver import minimize
 from ..measurements.base import Measurement
-from ..plausibility.diagnosis import Diagnosis
+from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import Evidence
-from ..plausibility.mixups import diagnose_mixups
+from ..plausibility.mixups import diagnose_mixups, fit_as_read
 from ..robot.chain import Chain
 from ..session import Session
 from ..session.causes import Step
@@ -44,31 +44,32 @@ MIN_GROSS_RATIO = 10.0
 MAX_GROWTH = 0.01
 # Largest step and drift of the zero of a joint that is believed if the robot does not fit otherwise [rad].
 MAX_ZERO_STEP, MAX_ZERO_DRIFT = np.deg2rad((30.0, 10.0))
+# Largest errors of a robot that is not compared with mistakes, in default standard deviations.
+MAX_WIDTH = 8.0
 
 
 def compare_with_mistakes(
     session: Session,
     chain: Chain,
-    variants: tuple[Sequence[Measurement], Sequence[Measurement]],
+    data: Sequence[Measurement],
+    with_changes: Sequence[Measurement],
     sets: str,
     progress: Progress | None,
-) -> tuple[bool, Diagnosis]:
-    """Return whether changes explain measurements better than mistakes do, and the better diagnosis.
-
-    `variants` are the measurements as they were read, and those with the changes.
-    """
-    changed = diagnose_mixups(chain, variants[1], sets, progress)
-    grows = any(drift.kind == "links" and drift.size > _max_growth(chain) for drift in session.drifts)
-    if not (grows or changed.is_suspicious):
-        return True, changed
-    unchanged = diagnose_mixups(chain, variants[0], sets, progress)
-    is_mistake = unchanged.hypotheses and unchanged.log > changed.log
-    is_doubtful = not changed.hypotheses and (
-        _fits_no_robot(chain, changed.before) or (not changed.is_explained and _turns_far(session))
-    )
-    if grows or is_mistake or is_doubtful:
-        return False, unchanged
-    return True, changed
+) -> tuple[bool, Diagnosis | None]:
+    """Return whether changes explain measurements better than mistakes do, and a diagnosis that was made."""
+    evidence = fit_as_read(chain, with_changes, sets)
+    grows = any(d.kind == "links" and d.size > MAX_GROWTH * workspace_radius(chain) for d in session.drifts)
+    turns = _turns_far(session)
+    if not (grows or turns or leaves_residuals(evidence) or evidence.width > MAX_WIDTH):
+        return True, None if is_suspicious(evidence) else Diagnosis(evidence)
+    as_read = diagnose_mixups(chain, data, sets, progress)
+    if grows or (as_read.is_certain and as_read.log > evidence.log):
+        return False, as_read
+    changed = diagnose_mixups(chain, with_changes, sets, progress)
+    if as_read.hypotheses and as_read.log > changed.log:
+        return False, as_read
+    is_impossible = leaves_residuals(evidence) and (turns or _fits_no_robot(chain, evidence))
+    return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
 
 
 def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
@@ -122,11 +123,6 @@ def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
 def residuals_of(fit: Fit) -> Sequence[Array]:
     """Return the residuals of a fit, (k, m) each, without the weights of the samples."""
     return fit.problem.residuals(fit.solution.x, fit.data)
-
-
-def _max_growth(chain: Chain) -> float:
-    """Return the largest motion of the tool by a growth of the links [m]."""
-    return MAX_GROWTH * workspace_radius(chain)
 
 
 def _fits_no_robot(chain: Chain, evidence: Evidence) -> bool:

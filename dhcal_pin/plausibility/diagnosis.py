@@ -46,6 +46,11 @@ class Diagnosis:
         return is_suspicious(self.before)
 
     @property
+    def is_certain(self) -> bool:
+        """Whether a robot with errors of ordinary size fits the measurements after the change."""
+        return self.after is not None and not is_suspicious(self.after)
+
+    @property
     def is_explained(self) -> bool:
         """Whether a robot with errors of any size fits the measurements, if base and tool are free."""
         return not leaves_residuals(self.before)

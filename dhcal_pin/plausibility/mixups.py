@@ -16,8 +16,8 @@ joint and the zeros of two others; all of them are reported.
 
 If there is no such pair either, the base may have moved or something else may have happened during the
 measurement. One event leaves at least two of three parts of the file without a change. A single hypothesis
-that is found in two of them is therefore reported if it is decisive for the whole file, too, whatever the event
-leaves of the residuals.
+that is found in two of them is therefore reported if it is decisive for the whole file, too, whatever
+residuals the event leaves.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .._typing import Progress, no_progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious, leaves_residuals
-from .evidence import MANUFACTURED, fit_evidence
+from .evidence import MANUFACTURED, Evidence, fit_evidence
 
 if TYPE_CHECKING:
     from .trials import Trial
@@ -108,17 +108,28 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
+def fit_as_read(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of measurements as they were read."""
+    return _fit_samples(chain, draw_samples(comparable_items(data))[0], sets)
+
+
+def _fit_samples(chain: Chain, samples: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of samples, which is that of nothing if they are too few."""
+    if not has_enough_rows(samples):
+        return NO_EVIDENCE
+    before = fit_evidence(chain, samples, sets)
+    if is_suspicious(before) and chain.error_families:
+        # The joint errors of the robot may be wrong instead of the measurements.
+        return max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
+    return before
+
+
 def _find_single(
     chain: Chain, data: Sequence[Measurement], sets: str, progress: Progress
 ) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
-    if not has_enough_rows(samples):
-        return Diagnosis(NO_EVIDENCE), None
-    before = fit_evidence(chain, samples, sets)
-    if is_suspicious(before) and chain.error_families:
-        # The joint errors of the robot may be wrong instead of the measurements.
-        before = max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
+    before = _fit_samples(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before), None
     from .trials import try_hypotheses  # lazy import: few measurements are suspicious

@@ -13,7 +13,7 @@ import numpy as np
 from .._typing import Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import Diagnosis, is_suspicious, leaves_residuals
+from .diagnosis import Diagnosis, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -88,7 +88,7 @@ class Trial(NamedTuple):
             if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
                 closest.append(pair)
         found = _decisive(self, closest, PAIRS)
-        if _is_certain(found):
+        if found.is_certain:
             return found
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
@@ -122,7 +122,7 @@ def try_hypotheses(
     trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before), progress)
     largest = _largest_misfit(trial)
     found = _decisive(trial, [each for each in candidates if each.misfit <= largest], SINGLES)
-    return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
+    return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
 
 def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:
@@ -216,11 +216,6 @@ def _decisive(
     log, _, after = ties[0]
     hypotheses = tuple(hypothesis for _, hypothesis, _ in ties)
     return Diagnosis(trial.before, hypotheses, after, gain=log - trial.before.log)
-
-
-def _is_certain(diagnosis: Diagnosis) -> bool:
-    """Return whether a robot with errors of ordinary size fits the samples after the change."""
-    return diagnosis.after is not None and not is_suspicious(diagnosis.after)
 
 
 def _count(data: Sequence[Measurement]) -> int:
