@@ -23,7 +23,7 @@ from ..measurements.base import Measurement
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import Evidence
-from ..plausibility.mixups import diagnose_mixups, fit_as_read
+from ..plausibility.mixups import diagnose_mixups, fit_drawn_samples
 from ..robot.chain import Chain
 from ..session import Session
 from ..session.causes import Step
@@ -57,16 +57,16 @@ def compare_with_mistakes(
     progress: Progress | None,
 ) -> tuple[bool, Diagnosis | None]:
     """Return whether changes explain measurements better than mistakes do, and a diagnosis that was made."""
-    evidence = fit_as_read(chain, with_changes, sets)
+    evidence = fit_drawn_samples(chain, with_changes, sets)
     grows = any(d.kind == "links" and d.size > MAX_GROWTH * workspace_radius(chain) for d in session.drifts)
     turns = _turns_far(session)
     if not (grows or turns or leaves_residuals(evidence) or evidence.width > MAX_WIDTH):
         return True, None if is_suspicious(evidence) else Diagnosis(evidence)
     as_read = diagnose_mixups(chain, data, sets, progress)
-    if grows or (as_read.is_certain and as_read.log > evidence.log):
+    if grows or (as_read.is_certain and _explains_better(as_read, Diagnosis(evidence))):
         return False, as_read
     changed = diagnose_mixups(chain, with_changes, sets, progress)
-    if as_read.hypotheses and as_read.log > changed.log:
+    if as_read.hypotheses and _explains_better(as_read, changed):
         return False, as_read
     is_impossible = leaves_residuals(evidence) and (turns or _fits_no_robot(chain, evidence))
     return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
@@ -123,6 +123,11 @@ def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
 def residuals_of(fit: Fit) -> Sequence[Array]:
     """Return the residuals of a fit, (k, m) each, without the weights of the samples."""
     return fit.problem.residuals(fit.solution.x, fit.data)
+
+
+def _explains_better(as_read: Diagnosis, changed: Diagnosis) -> bool:
+    """Return whether a mistake is more likely than changes; the evidence of one of several files is its own."""
+    return not changed.is_explained if as_read.source else as_read.log > changed.log
 
 
 def _fits_no_robot(chain: Chain, evidence: Evidence) -> bool:

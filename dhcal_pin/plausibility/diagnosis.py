@@ -69,7 +69,8 @@ class Diagnosis:
         ):
             if before > _MIN_NAMED_RATIO * after:
                 sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
-                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}."
+                rest = " Something else is wrong, too." * leaves_residuals(self.after)
+                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}.{rest}"
         return f"{text}: undoing this makes the measurements fit a robot with ordinary errors."
 
     @property

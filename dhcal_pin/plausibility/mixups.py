@@ -108,13 +108,13 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
-def fit_as_read(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
-    """Compute the evidence of measurements as they were read."""
+def fit_drawn_samples(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of samples that are drawn from measurements."""
     return _fit_samples(chain, draw_samples(comparable_items(data))[0], sets)
 
 
 def _fit_samples(chain: Chain, samples: Sequence[Measurement], sets: str) -> Evidence:
-    """Compute the evidence of samples, which is that of nothing if they are too few."""
+    """Compute the evidence of samples; that of nothing if they are too few."""
     if not has_enough_rows(samples):
         return NO_EVIDENCE
     before = fit_evidence(chain, samples, sets)

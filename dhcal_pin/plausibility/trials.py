@@ -29,7 +29,7 @@ from .hypotheses import (
 from .misfit import MAX_MISFIT, nominal_misfits
 
 # Logarithm of the ratio of evidence above which a hypothesis is decisive. Honest data reach 4.
-MIN_LOG_RATIO = 15.0
+_MIN_LOG_RATIO = 15.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
 # Number of pairs of mistakes with the smallest misfits, and of those among them that change the samples
@@ -200,7 +200,7 @@ def _decisive(
 ) -> Diagnosis:
     """Return the diagnosis with the best hypotheses if a robot fits the samples after their change.
 
-    If they are a part of the truth, no robot needs to fit.
+    If something else is wrong, too (`is_partial`), no robot needs to fit.
     """
     scored = []
     for step, (hypothesis, changed, _) in enumerate(candidates, 1):
@@ -211,7 +211,7 @@ def _decisive(
     best = max((log for log, _, _ in scored), default=-np.inf)
     ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
     ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]
-    if best - trial.before.log < MIN_LOG_RATIO or not ties:
+    if best - trial.before.log < _MIN_LOG_RATIO or not ties:
         return Diagnosis(trial.before)
     log, _, after = ties[0]
     hypotheses = tuple(hypothesis for _, hypothesis, _ in ties)
