@@ -126,7 +126,7 @@ def residuals_of(fit: Fit) -> Sequence[Array]:
 
 
 def _explains_better(as_read: Diagnosis, changed: Diagnosis) -> bool:
-    """Return whether a mistake is more likely than changes; the evidence of one of several files is its own."""
+    """Return whether a mistake is more likely than changes; a mistake in one file has evidence of its own."""
     return not changed.is_explained if as_read.source else as_read.log > changed.log
 
 

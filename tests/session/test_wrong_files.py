@@ -13,6 +13,7 @@ from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.measurements import Measurement, Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.plausibility.mixups import diagnose_mixups
+from dhcal_pin.session import Session
 
 DEGREE = np.deg2rad(1.0)
 NOTHING = Changes()
@@ -33,6 +34,12 @@ def with_mistake(data: Measurement, name: str, joint: int) -> tuple[Measurement,
     return data.resample(q), f"{name}:{{}}" + ":-90deg" * (name == "zero")
 
 
+def session_of(fit: Result) -> Session:
+    """Return what was found in a calibration."""
+    assert fit.session is not None
+    return fit.session
+
+
 def judge(arm: str, seed: int, kind: type[Measurement], name: str, joint: int, event: str) -> Result:
     """Calibrate with a mistake; return the result if the mistake is named and no event is."""
     simulation = Simulation(arm, 80, seed)
@@ -40,7 +47,7 @@ def judge(arm: str, seed: int, kind: type[Measurement], name: str, joint: int, e
     fit = calibrate(simulation.chain, wrong, extend="none")
     assert key.format(simulation.chain.joint_names[joint]) in [h.key for h in fit.diagnosis.hypotheses]
     assert fit.verdict.is_refused
-    assert event or not (fit.session and fit.session.found)
+    assert event or not session_of(fit).found
     return fit
 
 
@@ -55,7 +62,7 @@ def judge(arm: str, seed: int, kind: type[Measurement], name: str, joint: int, e
 def test_a_mistake_is_named_in_place_of_false_events(arm, kind, name, joint, event):
     fit = judge(arm, 0, kind, name, joint, event)
     mended = mend(fit.errors.chain, fit.data[0], fit.diagnosis.hypotheses[0].key)
-    session = calibrate(fit.errors.chain, mended, extend="none").session
+    session = session_of(calibrate(fit.errors.chain, mended, extend="none"))
     assert [found.kind for found in session.events] == [event] * bool(event)
     assert not session.drifts
 
@@ -78,7 +85,7 @@ def test_large_events_are_found_in_a_good_file():
     simulation = Simulation("ur10", 60, 1)
     changes = Changes(joint=(3, 40 * DEGREE))
     fit = calibrate(simulation.chain, simulation.measure(Position, changes), extend="none")
-    (event,) = fit.session.events
+    (event,) = session_of(fit).events
     assert (event.kind, event.of) == ("joint", simulation.chain.joint_names[3])
     assert event.size == pytest.approx(40 * DEGREE, rel=1e-3)
     assert not fit.diagnosis.hypotheses
@@ -89,8 +96,8 @@ def test_links_grow_by_what_is_possible_only(growth):
     """Thermal growth is far below 1 %."""
     simulation = Simulation("ur10", 80, 2)
     fit = calibrate(simulation.chain, simulation.measure(Position, Changes(growth=growth, at=None)))
-    assert [drift.kind for drift in fit.session.drifts] == ["links"] * (growth < 0.01)
-    assert fit.session.changes.is_empty == (growth > 0.01)
+    assert [drift.kind for drift in session_of(fit).drifts] == ["links"] * (growth < 0.01)
+    assert session_of(fit).changes.is_empty == (growth > 0.01)
 
 
 @pytest.mark.parametrize(("seed", "event"), some_slow(list(product(range(12), EVENTS)), {0}))
