@@ -47,8 +47,9 @@ from ..formatting import join_names
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..parallel import SERIAL, TaskExecutor
+from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import workspace_radius
-from ..plausibility.evidence import HAND_BUILT
+from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import has_enough_rows
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
@@ -69,7 +70,7 @@ from .evaluation import accuracy, fit_nominal
 from .evidence import diagnose
 from .result import Result, make_result
 from .reweighting import Fit, reweight
-from .session_check import confirm_changes, without_changes
+from .session_check import compare_with_mistakes, confirm_changes, without_changes, without_findings
 from .shrinkage import compute_shrinkage_factor
 from .verdict import MAX_FRAME_ITERATIONS, MAX_FRAME_RATIO, MAX_USUAL_ERROR
 
@@ -254,15 +255,21 @@ def calibrate(
     groups = _prior_groups(fit, priors)
     reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
-    found = None
+    found, diagnosis = None, None
     if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
         unweighted = replace(fit.problem, data=fit.data)
         found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
         if not found.changes.is_empty:
             changed = found.applied(data, holdout)
+            sets = HAND_BUILT if signs else MANUFACTURED
+            is_likely, diagnosis = compare_with_mistakes(
+                found, fit.problem.errors.chain, data, changed[0], sets, progress
+            )
             held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
-            refit = start(changed[0], errors=held)
-            if found.has_two_robots or confirm_changes(
+            refit = start(changed[0], errors=held) if is_likely else fit
+            if not is_likely:
+                found = without_findings(found)
+            elif found.has_two_robots or confirm_changes(
                 found,
                 fit,
                 reweighted(refit, AUTO),
@@ -270,7 +277,7 @@ def calibrate(
             ):
                 fit, holdout = refit, changed[1]
             else:
-                found = without_changes(found)
+                found, diagnosis = without_changes(found), None
     data = fit.data
     if method != "lm":
         return replace(make_result(fit, 1.0, holdout, method), signs=signs, **settings)
@@ -282,7 +289,7 @@ def calibrate(
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, progress)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, diagnosis, progress)
     return replace(result, session=found, **settings)
 
 
@@ -413,12 +420,14 @@ def _calibrate_samples(
     holdout: tuple[Measurement, ...],
     extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
     signs: plausibility.SignDecision | None,
+    diagnosis: Diagnosis | None,
     progress: Progress | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     inliers = fit.without_rejected().problem
     shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
-    result = replace(make_result(fit, shrinkage_factor, holdout, "lm"), signs=signs)
+    result = make_result(fit, shrinkage_factor, holdout, "lm")
+    result = replace(result, signs=signs, earlier_diagnosis=diagnosis)
     # Residuals of mixed-up measurements say nothing about other errors.
     if families and shrinkage_factor == 1:
         result = replace(result, earlier_diagnosis=diagnose(result, progress))

@@ -1,4 +1,9 @@
-"""Confirmation of changes during a session by a model with all joint errors.
+"""Confirmation of changes during a session: by mistakes in the file, and by a model with all joint errors.
+
+A mistake in the whole file, such as the sign of a joint, leaves errors that changes during the session reduce
+a little. Changes with which no ordinary robot fits the measurements are therefore compared with mistakes in
+the measurements as they were read. They are dropped if a mistake explains the measurements better, or if no
+robot fits with them.
 
 Errors that the geometry leaves, such as gear errors, differ between configurations. If the configurations at
 the begin of a session differ from those at its end, such errors look like a change. The changes are therefore
@@ -12,15 +17,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._typing import Array
+from .._typing import Array, Progress
 from ..estimation.solver import minimize
 from ..measurements.base import Measurement
+from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
+from ..plausibility.displacement import workspace_radius
+from ..plausibility.evidence import Evidence
+from ..plausibility.mixups import diagnose_mixups, fit_drawn_samples
+from ..robot.chain import Chain
 from ..session import Session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
 from .model_selection import outlier_weights
 from .reweighting import Fit
+from .verdict import MAX_USUAL_ERROR
 
 # Logarithm of the evidence that each coefficient of a change costs.
 COST_PER_COEFFICIENT = 5.0
@@ -28,6 +39,37 @@ COST_PER_COEFFICIENT = 5.0
 MAX_ITERATIONS = 20
 # Ratio of the residuals without changes to those with them above which joint errors need not be compared.
 MIN_GROSS_RATIO = 10.0
+
+# Largest growth of links, relative to the reach of the robot: ten times that of aluminium at 50 K.
+MAX_GROWTH = 0.01
+# Largest step and drift of the zero of a joint that is believed if the robot does not fit otherwise [rad].
+MAX_ZERO_STEP, MAX_ZERO_DRIFT = np.deg2rad((30.0, 10.0))
+# Largest errors of a robot that is not compared with mistakes, in default standard deviations.
+MAX_WIDTH = 8.0
+
+
+def compare_with_mistakes(
+    session: Session,
+    chain: Chain,
+    data: Sequence[Measurement],
+    with_changes: Sequence[Measurement],
+    sets: str,
+    progress: Progress | None,
+) -> tuple[bool, Diagnosis | None]:
+    """Return whether changes explain measurements better than mistakes do, and a diagnosis that was made."""
+    evidence = fit_drawn_samples(chain, with_changes, sets)
+    grows = any(d.kind == "links" and d.size > MAX_GROWTH * workspace_radius(chain) for d in session.drifts)
+    turns = _turns_far(session)
+    if not (grows or turns or leaves_residuals(evidence) or evidence.width > MAX_WIDTH):
+        return True, None if is_suspicious(evidence) else Diagnosis(evidence)
+    as_read = diagnose_mixups(chain, data, sets, progress)
+    if grows or (as_read.is_certain and _explains_better(as_read, Diagnosis(evidence))):
+        return False, as_read
+    changed = diagnose_mixups(chain, with_changes, sets, progress)
+    if as_read.hypotheses and _explains_better(as_read, changed):
+        return False, as_read
+    is_impossible = leaves_residuals(evidence) and (turns or _fits_no_robot(chain, evidence))
+    return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
 
 
 def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
@@ -81,6 +123,28 @@ def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:
 def residuals_of(fit: Fit) -> Sequence[Array]:
     """Return the residuals of a fit, (k, m) each, without the weights of the samples."""
     return fit.problem.residuals(fit.solution.x, fit.data)
+
+
+def _explains_better(as_read: Diagnosis, changed: Diagnosis) -> bool:
+    """Return whether a mistake is more likely than changes; a mistake in one file has evidence of its own."""
+    return not changed.is_explained if as_read.source else as_read.log > changed.log
+
+
+def _fits_no_robot(chain: Chain, evidence: Evidence) -> bool:
+    """Return whether the residuals are far larger than those of any robot."""
+    limits = MAX_USUAL_ERROR["m"] * workspace_radius(chain), MAX_USUAL_ERROR["rad"]
+    return evidence.length_scale > limits[0] or evidence.angle_scale > limits[1]
+
+
+def _turns_far(session: Session) -> bool:
+    """Return whether the zero of a joint changed by more than what is believed."""
+    changes = [*((e, MAX_ZERO_STEP) for e in session.events), *((d, MAX_ZERO_DRIFT) for d in session.drifts)]
+    return any(each.kind == "joint" and each.unit == "rad" and each.size > most for each, most in changes)
+
+
+def without_findings(session: Session) -> Session:
+    """Return a session in which nothing was found."""
+    return Session(RobotChanges(), session.timeline, session.chain, session.is_ordered)
 
 
 def without_changes(session: Session) -> Session:

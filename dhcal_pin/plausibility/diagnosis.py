@@ -33,11 +33,22 @@ class Diagnosis:
     source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
     #: Whether each of several measurements fits the robot, but not all of them together.
     fits_separately: bool = False
+    gain: float = 0.0  #: Logarithm of the ratio of the evidence with the first hypothesis to that before.
+
+    @property
+    def log(self) -> float:
+        """Logarithm of the evidence with the first hypothesis, or of the measurements as they were read."""
+        return self.before.log + self.gain
 
     @property
     def is_suspicious(self) -> bool:
         """Whether the measurements, as they were read, need large errors or leave large residuals."""
         return is_suspicious(self.before)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether a robot with errors of ordinary size fits the measurements after the change."""
+        return self.after is not None and not is_suspicious(self.after)
 
     @property
     def is_explained(self) -> bool:
@@ -58,7 +69,8 @@ class Diagnosis:
         ):
             if before > _MIN_NAMED_RATIO * after:
                 sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
-                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}."
+                rest = " Something else is wrong, too." * leaves_residuals(self.after)
+                return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}.{rest}"
         return f"{text}: undoing this makes the measurements fit a robot with ordinary errors."
 
     @property

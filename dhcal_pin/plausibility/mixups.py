@@ -13,6 +13,11 @@ closest ones is computed. Single hypotheses that need large errors of the robot 
 the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong hypothesis
 makes of the measurements. Several hypotheses can describe the same change of the data, such as the sign of a
 joint and the zeros of two others; all of them are reported.
+
+If there is no such pair either, the base may have moved or something else may have happened during the
+measurement. One event leaves at least two of three parts of the file without a change. A single hypothesis
+that is found in two of them is therefore reported if it is decisive for the whole file, too, whatever
+residuals the event leaves.
 """
 
 from __future__ import annotations
@@ -26,8 +31,8 @@ import numpy as np
 from .._typing import Progress, no_progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious
-from .evidence import MANUFACTURED, fit_evidence
+from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious, leaves_residuals
+from .evidence import MANUFACTURED, Evidence, fit_evidence
 
 if TYPE_CHECKING:
     from .trials import Trial
@@ -40,6 +45,8 @@ _MAX_DISTANCE_RATIO = 8.0
 _MAX_ITEMS = 6
 # Smallest numbers of samples and rows that the evidence is computed from, and of samples of each measurement.
 _N_SAMPLES, _N_ROWS, _MIN_SAMPLES_PER_ITEM = 50, 200, 8
+# Number of parts of a file.
+_N_PARTS = 3
 
 
 def diagnose_mixups(
@@ -70,7 +77,16 @@ def diagnose_mixups(
                 return replace(one, source=item.source)
         if not any(one.is_suspicious for _, one in separate):
             return replace(diagnosis, fits_separately=True)
-    return trial.find_pair()
+    found = trial.find_pair()
+    if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):
+        return found
+    return trial.find_common([_find_alone(chain, part, sets, report) for part in _parts(items[0])])
+
+
+def _parts(item: Measurement) -> list[Measurement]:
+    """Divide a measurement into parts that follow each other."""
+    order = np.argsort(item.rows, kind="stable")
+    return [item.take(part) for part in np.array_split(order, _N_PARTS)]
 
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
@@ -92,22 +108,39 @@ def has_enough_rows(samples: Sequence[Measurement]) -> bool:
     return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
 
 
+def fit_drawn_samples(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of samples that are drawn from measurements."""
+    return _fit_samples(chain, draw_samples(comparable_items(data))[0], sets)
+
+
+def _fit_samples(chain: Chain, samples: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of samples; that of nothing if they are too few."""
+    if not has_enough_rows(samples):
+        return NO_EVIDENCE
+    before = fit_evidence(chain, samples, sets)
+    if is_suspicious(before) and chain.error_families:
+        # The joint errors of the robot may be wrong instead of the measurements.
+        return max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
+    return before
+
+
 def _find_single(
     chain: Chain, data: Sequence[Measurement], sets: str, progress: Progress
 ) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
-    if not has_enough_rows(samples):
-        return Diagnosis(NO_EVIDENCE), None
-    before = fit_evidence(chain, samples, sets)
-    if is_suspicious(before) and chain.error_families:
-        # The joint errors of the robot may be wrong instead of the measurements.
-        before = max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
+    before = _fit_samples(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before), None
     from .trials import try_hypotheses  # lazy import: few measurements are suspicious
 
     return try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
+
+
+def _find_alone(chain: Chain, item: Measurement, sets: str, progress: Progress) -> Diagnosis:
+    """Look for one mistake in one measurement."""
+    diagnosis, trial = _find_single(chain, [item], sets, progress)
+    return trial.single if trial else diagnosis
 
 
 def _find_one_or_two(chain: Chain, item: Measurement, sets: str, progress: Progress) -> Diagnosis:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from heapq import nsmallest
 from itertools import islice, permutations, product, starmap
@@ -12,7 +13,7 @@ import numpy as np
 from .._typing import Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import Diagnosis, is_suspicious, leaves_residuals
+from .diagnosis import Diagnosis, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -42,6 +43,8 @@ _TOLERANCE = 1e-6
 # least limit, or if it exceeds the largest limit, which depends on the errors that the robot may have.
 _MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
 _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
+# Number of parts of a file in which a mistake is found if it is in the whole file.
+_MIN_PARTS = 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Phases of the progress.
@@ -85,10 +88,16 @@ class Trial(NamedTuple):
             if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
                 closest.append(pair)
         found = _decisive(self, closest, PAIRS)
-        if _is_certain(found):
+        if found.is_certain:
             return found
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
+
+    def find_common(self, parts: Sequence[Diagnosis]) -> Diagnosis:
+        """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
+        counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
+        common = [each for each in self.candidates if counts[each.hypothesis.key] >= _MIN_PARTS]
+        return _decisive(self, common, SINGLES, is_partial=True)
 
     def _changes_of_pairs(self) -> Iterator[_Change]:
         """Yield pairs of mistakes with the samples after both changes."""
@@ -113,7 +122,7 @@ def try_hypotheses(
     trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before), progress)
     largest = _largest_misfit(trial)
     found = _decisive(trial, [each for each in candidates if each.misfit <= largest], SINGLES)
-    return (found, None) if _is_certain(found) else (Diagnosis(before), trial._replace(single=found))
+    return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
 
 def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:
@@ -186,8 +195,13 @@ def _are_equal(first: _Candidate, second: _Candidate) -> bool:
     return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
 
 
-def _decisive(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> Diagnosis:
-    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
+def _decisive(
+    trial: Trial, candidates: Sequence[_Candidate], phase: str, is_partial: bool = False
+) -> Diagnosis:
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change.
+
+    If something else is wrong, too (`is_partial`), no robot needs to fit.
+    """
     scored = []
     for step, (hypothesis, changed, _) in enumerate(candidates, 1):
         trial.progress(phase, step, len(candidates))
@@ -195,16 +209,13 @@ def _decisive(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> Dia
         log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
         scored.append((log, hypothesis, after))
     best = max((log for log, _, _ in scored), default=-np.inf)
-    ties = [(hypothesis, after) for log, hypothesis, after in scored if log >= best - _MAX_LOG_TIE]
-    ties = [(hypothesis, after) for hypothesis, after in ties if not leaves_residuals(after)]
+    ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
+    ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]
     if best - trial.before.log < _MIN_LOG_RATIO or not ties:
         return Diagnosis(trial.before)
-    return Diagnosis(trial.before, tuple(hypothesis for hypothesis, _ in ties), ties[0][1])
-
-
-def _is_certain(diagnosis: Diagnosis) -> bool:
-    """Return whether a robot with errors of ordinary size fits the samples after the change."""
-    return diagnosis.after is not None and not is_suspicious(diagnosis.after)
+    log, _, after = ties[0]
+    hypotheses = tuple(hypothesis for _, hypothesis, _ in ties)
+    return Diagnosis(trial.before, hypotheses, after, gain=log - trial.before.log)
 
 
 def _count(data: Sequence[Measurement]) -> int:
