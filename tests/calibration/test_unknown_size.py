@@ -65,7 +65,7 @@ def test_errors_of_positions_that_residuals_do_not_show_are_stated(arm, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", some_slow(["position", "sphere", "distance", "relative", "wires", "pose"], {0, 1})
+    "kind", some_slow(["position", "distance", "relative", "wires", "pose"], {0, 1})
 )
 def test_measured_lengths_determine_the_size(kind):
     nominal, truth, data = simulated("ur10", kind, 4)
