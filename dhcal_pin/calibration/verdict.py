@@ -50,8 +50,8 @@ MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
 # Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
 MAX_FRAME_RATIO = 1 / 3
-# Positions are wrong by more than the residuals suggest if the predicted error exceeds these by this factor. It
-# is at most 0.8 if positions, poses or enough lengths in several directions are measured.
+# Positions are wrong by more than the residuals suggest if the predicted error exceeds these by this factor.
+# The ratio is at most 0.8 if positions, poses or enough lengths in several directions are measured.
 MAX_HIDDEN_RATIO = 2.0
 # Reason for such errors.
 PART_OF_POSITION = "the measurements show only a part of the position"
@@ -433,14 +433,17 @@ def _plausible_cause(fit: Evidence) -> str:
 
 
 def _hidden_position_errors(fit: Evidence) -> list[Finding]:
-    """Advise caution if residuals do not show the errors of positions, and state the predicted size of these."""
+    """Advise caution if residuals do not show the errors of positions, and state their predicted size."""
     if not (fit.errors.has_arm and fit.shrinkage_factor):
         return []
     unknown = explain_unknown_size(ObservabilityProbe(fit.problem, fit.x))
     std, shown = fit.position_std, _shown_position_error(fit)
     if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
         return []
-    statement, advice = unknown or (PART_OF_POSITION, "measure the position of the tool in a fixed frame, too")
+    statement, advice = unknown or (
+        PART_OF_POSITION,
+        "measure the position of the tool in a fixed frame, too",
+    )
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]

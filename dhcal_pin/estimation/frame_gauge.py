@@ -68,7 +68,8 @@ def best_frames_std(uncertainty: Uncertainty, q: Array) -> float:
         return np.nan
     chain, count = uncertainty.chain, uncertainty.sqrt_covariance.shape[1]
     columns = np.concatenate([uncertainty.sqrt_covariance, uncertainty.unbounded_directions], 1)
-    displacements = uncertainty.tool_twists(chain.forward_kinematics(q), columns)[:, :3].reshape(3 * len(q), -1)
+    twists = uncertainty.tool_twists(chain.forward_kinematics(q), columns)
+    displacements = twists[:, :3].reshape(3 * len(q), -1)
     frames = position_frame_effects(chain, q).reshape(3 * len(q), 9)
     displacements -= frames @ np.linalg.lstsq(frames, displacements, rcond=NO_EFFECT_RTOL)[0]
     mean_squares = np.sum(displacements**2, 0) / len(q)
@@ -99,7 +100,7 @@ def _gauge_directions(uncertainty: Uncertainty, undetermined: Array, lever: floa
     chain = uncertainty.chain
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_COMPARED, chain.n_joints))
     effects = _effects(uncertainty, undetermined, q, lever)
-    smallest = np.linalg.norm(undetermined, 2) * lever
+    smallest = float(np.linalg.norm(undetermined, 2)) * lever
     return undetermined @ frame_combinations(effects, frame_effects(chain, q, lever), smallest)
 
 

@@ -140,7 +140,7 @@ class Measurement(ABC):
     shows_changes: ClassVar[bool] = False
     # Whether a file may have poses of the tip in place of joint values.
     accepts_tool_poses: ClassVar[bool] = False
-    # What `simulate` assumes about the instrument and its place, for plans; empty if there is nothing to choose.
+    # What `simulate` assumes about the instrument and its place, for plans; empty without any choice.
     simulated_instrument: ClassVar[str] = ""
 
     def __init_subclass__(cls, **options: Any) -> None:

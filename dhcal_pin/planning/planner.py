@@ -392,9 +392,12 @@ def _prepare(
     )
     # Parts of the task error that no measurement of this kind determines do not depend on the selection.
     ranking = TaskError.over(information, pool.task_q).observable_part(observable)
-    undetermined = null_space(observable)
-    combinations, has_free_frames = information.relative_combinations(pool.task_q, undetermined)
-    expected = TaskError(information, combinations)
+    expected, has_free_frames, hidden = _expected_error(information, observable, pool.task_q)
+    if hidden > MIN_HIDDEN_ERROR and (complete := _with_redundant_parameters(exact)) is not exact:
+        # Where nothing is measured, the errors that the minimal set leaves out as redundant count, too.
+        known = Information.from_prior(complete, pool.q)
+        observable_of_all = known.observable_directions(known.rows(pool.q[every_nth]).transpose(2, 1, 0))
+        expected, has_free_frames, hidden = _expected_error(known, observable_of_all, pool.task_q)
     if exact is not planned:
         expected = TaskError.over(Information.from_prior(planned, pool.q), pool.task_q)
     goal = DesignGoal(
@@ -413,13 +416,33 @@ def _prepare(
             "the predicted error does not contain poses of base and tool that "
             f"{planned.kind} measurements do not determine"
         )
-    hidden = float(np.linalg.norm(undetermined.T @ combinations))
     if hidden > MIN_HIDDEN_ERROR:
         notes.append(
             f"{planned.kind} measurements do not determine positions: {1e3 * hidden:.3g} mm of the predicted "
             "error are those of the priors, whatever the poses"
         )
     return goal, candidate_set, notes
+
+
+def _expected_error(
+    information: Information, observable: Array, task_q: Array
+) -> tuple[TaskError, bool, float]:
+    """Return the error to expect, relative to base and tool poses that measurements leave free.
+
+    Return, too, whether there are such poses, and the part of the error that only priors limit [m].
+    """
+    undetermined = null_space(observable)
+    combinations, has_free_frames = information.relative_combinations(task_q, undetermined)
+    hidden = float(np.linalg.norm(undetermined.T @ combinations))
+    return TaskError(information, combinations), has_free_frames, hidden
+
+
+def _with_redundant_parameters(planned: PlannedCalibration) -> PlannedCalibration:
+    """Return a calibration with all errors of the joint origins if it has the minimal ones."""
+    sets = [name.strip() for name in (planned.parameters or planned.chain.parameters).split(",")]
+    if planned.images is not None or "minimal" not in sets:
+        return planned
+    return replace(planned, parameters=",".join("placement" if name == "minimal" else name for name in sets))
 
 
 def _candidate_set(

@@ -74,7 +74,7 @@ def test_outliers_do_not_count():
     expected = calibrate(clean.errors.chain, Position(data.q[good], data.values[good]), "dh")
     folds = k_fold(fit.data, 5)
     found = cross_validate(fit, folds)
-    others = cross_validate(expected, [[mask[0][good]] for mask in folds])
+    others = cross_validate(expected, [(mask[0][good],) for mask in folds])
     assert found.accuracy["position_samples"] == 38
     assert sum(fold["position_samples"] for fold in found.folds) == 38
     assert found.accuracy["position_rms_m"] == pytest.approx(others.accuracy["position_rms_m"], rel=0.02)

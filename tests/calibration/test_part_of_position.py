@@ -52,25 +52,40 @@ def touches(simulation, n_spheres=1):
     ]
 
 
-@pytest.mark.parametrize(("measure", "seeds"), some_slow([(heights, 1), (touches, 1), (heights, 8), (touches, 8)], {0, 1}))
-def test_errors_of_positions_that_residuals_do_not_show_are_stated(measure, seeds):
-    """The stated size is the RMS of the true errors of many arms in the measured region."""
-    stated, true = [], []
-    for seed in range(seeds):
+@pytest.mark.parametrize("measure", [heights, touches])
+def test_errors_of_positions_that_residuals_do_not_show_are_stated(measure):
+    simulation = Simulation("ur10", 100, 0)
+    fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
+    assert fit.verdict.status == "caution"
+    (reason,) = fit.verdict.reasons
+    assert reason.startswith(REASON)
+    assert reason.endswith("Measure the position of the tool in a fixed frame, too.")
+    stated = 1e-3 * float(re.findall(r"of about ([\d.]+) mm", reason)[0])
+    (after,) = fit.comparisons[0].after.groups.values()
+    assert stated > 2 * after.rms
+    assert 1 / 3 < stated / true_error(simulation, fit) < 3
+
+
+def true_error(simulation, fit):
+    """Return the RMS position error in the measured region, with the best base and tool point [m]."""
+    simulation.end_model, simulation.end_zeros = simulation.model, 0.0
+    simulation.test_q = fit.measured_region.draw(np.random.default_rng(1), 200)
+    return simulation.true_error(fit.chain)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", [heights, touches])
+def test_predicted_errors_are_those_of_many_arms(measure):
+    """No position error is far above the residual without a caution."""
+    ratios = []
+    for seed in range(8):
         simulation = Simulation("ur10", 100, seed)
         fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
-        assert fit.verdict.status == "caution"
-        reason = fit.verdict.reasons[0]
-        assert reason.startswith(REASON)
-        assert reason.endswith("Measure the position of the tool in a fixed frame, too.")
-        stated.append(1e-3 * float(re.findall(r"of about ([\d.]+) mm", reason)[0]))
+        true = true_error(simulation, fit)
+        ratios.append(fit.position_std / true)
         (after,) = fit.comparisons[0].after.groups.values()
-        assert stated[-1] > 2 * after.rms
-        simulation.end_model, simulation.end_zeros = simulation.model, 0.0
-        simulation.test_q = fit.measured_region.draw(np.random.default_rng(1), 200)
-        true.append(simulation.true_error(fit.chain))
-    ratio = np.linalg.norm(stated) / np.linalg.norm(true)
-    assert (0.3 < ratio < 3) if seeds == 1 else (0.7 < ratio < 1.5)
+        assert fit.verdict.status == "caution" or true < 2.5 * after.rms
+    assert 0.5 < np.median(ratios) < 2.0
 
 
 SETUPS = {
