@@ -111,9 +111,9 @@ class CrossValidation:
     """Errors of held-out samples.
 
     Attributes:
-        folds: Accuracy of the held-out samples of each fold.
+        folds: Accuracy of the held-out samples of each fold, without outliers of the calibration.
         errors: RMS of the held-out rows of each fold in standard deviations, (k,).
-        accuracy: Accuracy of the held-out samples of all folds together.
+        accuracy: The same of all folds together. A sample counts once for each fold that holds it out.
     """
 
     folds: tuple[Accuracy, ...]
@@ -140,7 +140,8 @@ def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
 def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> CrossValidation:
     """Measure how well the model of a calibration predicts samples that it is not fitted to.
 
-    Standard deviations, weights and priors are those of the calibration.
+    Standard deviations, weights and priors are those of the calibration. As in all figures of a calibration,
+    its outliers do not count.
 
     Args:
         fit: FittedModel of a calibration.
@@ -148,7 +149,7 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
             with the contacts of the measurements if not given.
 
     Returns:
-        Errors of the held-out samples.
+        Errors of the held-out samples without outliers, and how many there are.
 
     Raises:
         InvalidArgumentError: The folds are no sequence.
@@ -160,11 +161,20 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
     if folds is None:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     results = list(cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, partial(refit, fit)))
+    counted = [
+        take_errors(result.errors, _counted_in(fold, fit.is_counted))
+        for result, fold in zip(results, folds, strict=True)
+    ]
     return CrossValidation(
-        tuple(Accuracy.from_errors(fold.errors) for fold in results),
+        tuple(map(Accuracy.from_errors, counted)),
         np.array([fold.rms for fold in results]),
-        Accuracy.from_errors([item for fold in results for item in fold.errors]),
+        Accuracy.from_errors([item for errors in counted for item in errors]),
     )
+
+
+def _counted_in(fold: Fold, is_counted: Sequence[Array]) -> list[Array]:
+    """Return whether each sample of a fold counts, of each measurement that the fold has samples of."""
+    return [counted[mask] for counted, mask in zip(is_counted, fold, strict=True) if mask.any()]
 
 
 # --- accuracy within and beyond the measured region ------------------------------------------------
@@ -209,9 +219,7 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
         )
         if is_fitted.any()
     ]
-    is_judged = [
-        counted[mask] for fold in folds for counted, mask in zip(is_counted, fold, strict=True) if mask.any()
-    ]
+    is_judged = [judged for fold in folds for judged in _counted_in(fold, is_counted)]
     for fold_after in cross_validate_folds(
         fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor, fit.bare
     ):

@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import plausibility
 from .._typing import Array, Progress
+from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import linearize_and_factor
 from ..estimation.qr import rank
 from ..estimation.trimmed_squares import linearize_rows
@@ -39,12 +40,14 @@ from .evaluation import (
 )
 from .fitted import FittedModel
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, k_fold
+from .partition import configuration_groups, different_configurations, k_fold
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
 # So few configurations are held out one by one instead.
 MAX_LEAVE_ONE_OUT = 10
+# Configurations of the measured region at which errors are predicted.
+N_PREDICTED = 300
 # More samples are not examined for repeated configurations.
 MAX_EXAMINED = 1000
 
@@ -261,6 +264,15 @@ class Evidence(FittedModel):
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
         return estimate_generalization(self, self.random_folds, self._measured_region, self.region_comparison)
+
+    @cached_property
+    def position_std(self) -> float:
+        """Predicted RMS position error in the measured region with the best base and tool [m]."""
+        q, _ = different_configurations(self.inliers)
+        if (region := self.measured_region) is not None:
+            drawn = region.draw(np.random.default_rng(0), N_PREDICTED)
+            q = np.clip(drawn, self.chain.lower, self.chain.upper)
+        return best_frames_std(self.uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
 
     @property
     def measured_region(self) -> MeasuredRegion | None:

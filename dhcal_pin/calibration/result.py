@@ -101,6 +101,8 @@ class Result(Evidence, ResultPlots):
     def validate(self, data: Measurement | Sequence[Measurement]) -> Accuracy:
         """Compute the accuracy of the calibrated chain on other measurements.
 
+        All samples count. Nothing tells outliers of other measurements from errors of the robot.
+
         Args:
             data: One measurement or several, in the frames of the fitted ones.
 

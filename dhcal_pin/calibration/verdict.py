@@ -27,7 +27,6 @@ from ..measurements.images.names import list_images
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
-from ..se3 import rms_length
 from . import cameras
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
@@ -55,6 +54,11 @@ MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
 MAX_FULL_SET_RATIO, EXACT_FIT_RATIO = 0.8, 1e-6
 # Base or tool should be estimated if that alone reduces the RMS error of the nominal robot below this share.
 MAX_FRAME_RATIO = 1 / 3
+# Positions are wrong by more than the residuals suggest if the predicted error exceeds these by this factor.
+# The ratio is at most 0.8 if positions, poses or enough lengths in several directions are measured.
+MAX_HIDDEN_RATIO = 2.0
+# Reason for such errors.
+PART_OF_POSITION = "the measurements show only a part of the position"
 # Largest number of iterations of such a fit.
 MAX_FRAME_ITERATIONS = 20
 # A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
@@ -157,8 +161,7 @@ def judge(fit: Evidence) -> Verdict:
             *_session(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
-            *_weak_positions(fit),
-            *_unknown_size(fit),
+            *(_weak_positions(fit) or _hidden_position_errors(fit)),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
             *_regional_errors(fit),
@@ -464,18 +467,33 @@ def _plausible_cause(fit: Evidence) -> str:
     )
 
 
-def _unknown_size(fit: Evidence) -> list[Finding]:
-    """Advise caution if the measurements contain no length: residuals do not show errors of positions."""
-    unknown = explain_unknown_size(ObservabilityProbe(fit.problem, fit.x)) if fit.errors.has_arm else None
-    if unknown is None:
+def _hidden_position_errors(fit: Evidence) -> list[Finding]:
+    """Advise caution if residuals do not show the errors of positions, and state their predicted size."""
+    if not (fit.errors.has_arm and fit.shrinkage_factor):
         return []
-    statement, advice = unknown
-    std = rms_length(
-        fit.relative.predict(np.concatenate([item.q for item in fit.data])).position_std[:, None]
+    unknown = explain_unknown_size(ObservabilityProbe(fit.problem, fit.x))
+    std, shown = fit.position_std, _shown_position_error(fit)
+    if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
+        return []
+    statement, advice = unknown or (
+        PART_OF_POSITION,
+        "measure the position of the tool in a fixed frame, too",
     )
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]
+
+
+def _shown_position_error(fit: Evidence) -> float:
+    """Return the position error that residuals and stated standard deviations suggest [m]; NaN if none."""
+    groups = headline(fit.comparisons).comparison.after.groups.values()
+    lever = {"m": 1.0, "rad": workspace_radius(fit.chain)}
+    for unit in lever:
+        errors = [group.rms * lever[unit] for group in groups if group.unit == unit]
+        if errors:
+            # Stated standard deviations may be larger than the residuals.
+            return max(errors) / min(max(fit.unit_weight_std, np.finfo(float).tiny), 1.0)
+    return np.nan
 
 
 def _held_out_errors(fit: Evidence) -> list[Finding]:

@@ -32,7 +32,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..robot.chain import Chain
-from .uncertainty import Uncertainty
+from .uncertainty import UNBOUNDED_TOL, Uncertainty
 
 # Configurations at which the effects of undetermined directions are compared with those of base and tool.
 N_COMPARED = 60
@@ -62,6 +62,21 @@ def separate_frames(uncertainty: Uncertainty, undetermined: Array, q: Array) -> 
     return replace(uncertainty, frame_part=gauge @ np.linalg.lstsq(effects, all_effects, rcond=None)[0])
 
 
+def best_frames_std(uncertainty: Uncertainty, q: Array) -> float:
+    """Predict the RMS position error at q with the base and the tool that fit best [m]; NaN without any q."""
+    if not len(q):
+        return np.nan
+    chain, count = uncertainty.chain, uncertainty.sqrt_covariance.shape[1]
+    columns = np.concatenate([uncertainty.sqrt_covariance, uncertainty.unbounded_directions], 1)
+    twists = uncertainty.tool_twists(chain.forward_kinematics(q), columns)
+    displacements = twists[:, :3].reshape(3 * len(q), -1)
+    frames = position_frame_effects(chain, q).reshape(3 * len(q), 9)
+    displacements -= frames @ np.linalg.lstsq(frames, displacements, rcond=NO_EFFECT_RTOL)[0]
+    mean_squares = np.sum(displacements**2, 0) / len(q)
+    is_unbounded = bool(np.any(mean_squares[count:] > UNBOUNDED_TOL))
+    return np.inf if is_unbounded else float(np.sqrt(np.sum(mean_squares[:count])))
+
+
 def tool_gauge_covariance(priors: Uncertainty) -> Array:
     """Compute the covariance (6, 6) of the tool pose that errors of the arm can imitate everywhere.
 
@@ -84,15 +99,24 @@ def _gauge_directions(uncertainty: Uncertainty, undetermined: Array, lever: floa
     """Return the undetermined directions that are only another pose of base or tool, (6(k+1)+e, g)."""
     chain = uncertainty.chain
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_COMPARED, chain.n_joints))
-    left, s, right = np.linalg.svd(_effects(uncertainty, undetermined, q, lever), full_matrices=False)
-    has_effect = s > NO_EFFECT_RTOL * max(s[0], np.linalg.norm(undetermined, 2) * lever)
-    frames, frame_s, _ = np.linalg.svd(frame_effects(chain, q, lever), full_matrices=False)
+    effects = _effects(uncertainty, undetermined, q, lever)
+    smallest = float(np.linalg.norm(undetermined, 2)) * lever
+    return undetermined @ frame_combinations(effects, frame_effects(chain, q, lever), smallest)
+
+
+def frame_combinations(effects: Array, frames: Array, smallest: float) -> Array:
+    """Return combinations (d, g) of effects (k, d) that are those of base and tool poses, (k, c).
+
+    The combined effects are orthonormal. Effects of relative size `NO_EFFECT_RTOL` of `smallest` are none.
+    """
+    left, s, right = np.linalg.svd(effects, full_matrices=False)
+    has_effect = s > NO_EFFECT_RTOL * max(s[0], smallest)
+    frames, frame_s, _ = np.linalg.svd(frames, full_matrices=False)
     frames = frames[:, frame_s > NO_EFFECT_RTOL * frame_s[0]]
     # Principal angles between both spaces of effects.
     outside = left[:, has_effect] - frames @ (frames.T @ left[:, has_effect])
     _, sines, combinations = np.linalg.svd(outside, full_matrices=False)
-    is_frame = sines < SAME_EFFECT_TOL
-    return undetermined @ (right[has_effect].T / s[has_effect]) @ combinations[is_frame].T
+    return (right[has_effect].T / s[has_effect]) @ combinations[sines < SAME_EFFECT_TOL].T
 
 
 def _effects(uncertainty: Uncertainty, directions: Array, q: Array, lever: float) -> Array:
@@ -112,3 +136,8 @@ def frame_effects(chain: Chain, q: Array, lever: float) -> Array:
     out[:, :3, 6:9] = out[:, 3:, 9:] = poses[:, :3, :3]
     out[:, 3:] *= lever
     return out.reshape(-1, 12)
+
+
+def position_frame_effects(chain: Chain, q: Array) -> Array:
+    """Return the displacements of the tool point by twists of the base and motions of the tool, (m, 3, 9)."""
+    return frame_effects(chain, q, 1.0).reshape(len(q), 6, 12)[:, :3, :9]

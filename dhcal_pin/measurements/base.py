@@ -140,6 +140,8 @@ class Measurement(ABC):
     shows_changes: ClassVar[bool] = False
     # Whether a file may have poses of the tip in place of joint values.
     accepts_tool_poses: ClassVar[bool] = False
+    # What `simulate` assumes about the instrument and its place, for plans; empty without any choice.
+    simulated_instrument: ClassVar[str] = ""
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Derive the columns of files from `COLUMNS`, and enter the residual groups."""

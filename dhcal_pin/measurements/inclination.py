@@ -95,6 +95,7 @@ class Inclination(Measurement):
     required_columns = (frozenset(_ANGLES), frozenset(_ACCELERATIONS))
     sample_fields = (*Measurement.sample_fields, "angles", "sigma")
     symmetry_axis = "gravity"
+    simulated_instrument = "a sensor on the tip; gravity is along the z axis of the base"
 
     def __init__(
         self, q: ArrayLike, angles: ArrayLike, sigma: ArrayLike | None = None, link: str = ""

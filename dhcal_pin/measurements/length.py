@@ -57,6 +57,7 @@ class Wires(PointMeasurement):
     kind = "wires"
     shows_changes = True
     residual_groups: ClassVar = {"length": Group.of(LENGTHS, slice(None))}
+    simulated_instrument = "three wires from a triangle of radius 0.3 m, 1.5 m from the tool points"
     COLUMNS = length_columns(
         "lengths", "length", *(f"L{i}" for i in range(1, MAX_WIRES + 1)), plausible_range=instrument_range
     )

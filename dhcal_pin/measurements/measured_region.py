@@ -99,6 +99,14 @@ class MeasuredRegion:
         """Check which configurations are in the region."""
         return self.distances(q) <= self.radius
 
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Draw configurations of the region: each is near one that represents it."""
+        directions = rng.standard_normal((count, len(self.spread)))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        sizes = self.radius * rng.uniform(size=(count, 1)) ** (1 / len(self.spread))
+        centres = self.configurations[rng.integers(len(self.configurations), size=count)]
+        return centres + sizes * directions * np.maximum(self.spread, MIN_SPREAD)
+
     def excess(self, q: Array) -> Array:
         """Compute how far joint values are outside the measured range of their joint."""
         width = self.upper - self.lower

@@ -199,6 +199,7 @@ class PositionComponents(PointMeasurement):
     residual_groups: ClassVar = {"axes": Group.of(LENGTHS, slice(None))}
     COLUMNS = length_columns("values", *_AXES)
     required_columns = tuple(frozenset([axis]) for axis in _AXES)
+    simulated_instrument = "x and z of each position are measured; one of them alone says far less"
 
     def __init__(
         self, q: ArrayLike, values: ArrayLike, axes: Sequence[int], sigma: ArrayLike | None = None

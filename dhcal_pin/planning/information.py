@@ -24,6 +24,7 @@ from ..calibration.cameras import held_values, image_sets, split_sets
 from ..calibration.procedure import calibrate
 from ..estimation import qr
 from ..estimation.error_model import ErrorModel
+from ..estimation.frame_gauge import frame_combinations
 from ..estimation.initialization import make_problem
 from ..estimation.parameters import PARAMETER_SETS, select_parameters
 from ..estimation.priors import Priors, prior_weights
@@ -122,9 +123,27 @@ class Information:
 
     def task_combinations(self, q: Array) -> Array:
         """Compute combinations of the unknowns whose variances sum to the mean squared position error."""
+        return np.asarray(np.linalg.qr(self._task_rows(q), mode="r")).T
+
+    def _task_rows(self, q: Array) -> Array:
+        """Compute the displacements (k, p+s') whose squares sum to the mean squared position error."""
         found = self._of_unknowns(*self.instrument.displacements(self._model, q))
-        rows = found.reshape(len(found), -1).T / np.sqrt(len(q))
-        return np.asarray(np.linalg.qr(rows, mode="r")).T
+        return found.reshape(len(found), -1).T / np.sqrt(len(q))
+
+    def relative_combinations(self, q: Array, undetermined: Array) -> tuple[Array, bool]:
+        """Compute the combinations of errors relative to base and tool poses that fit the task best.
+
+        Of these, only poses that measurements leave free count, by directions (p+s', d) that they do not
+        determine. Return, too, whether there are any.
+        """
+        rows = self._task_rows(q)
+        frames = self.instrument.frame_displacements(self._model, q)
+        is_free = bool(undetermined.size and frames.size)
+        if is_free:
+            effects, largest = rows @ undetermined, float(np.linalg.norm(rows, 2))
+            combined = effects @ frame_combinations(effects, frames.reshape(len(frames), -1).T, largest)
+            rows, is_free = rows - combined @ (combined.T @ rows), bool(combined.size)
+        return np.asarray(np.linalg.qr(rows, mode="r")).T, is_free
 
     def without_omitted(self) -> Information:
         """Return the knowledge about the fitted unknowns alone, as if the omitted ones were zero."""

@@ -24,6 +24,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
+from ..estimation.frame_gauge import position_frame_effects
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise, whitened_jacobian
 from ..measurements.camera import CameraCorners, exp_and_jacobian
@@ -60,6 +61,11 @@ class Instrument(Protocol):
         """Standard deviation along each axis of a position by this instrument [m]."""
         ...
 
+    @property
+    def assumption(self) -> str:
+        """What is assumed about this instrument, for messages; empty if all of it is stated."""
+        ...
+
     def template(self, chain: Chain, q: Array) -> Measurement:
         """Return measurements whose instrument parameters have initial values."""
         ...
@@ -76,6 +82,10 @@ class Instrument(Protocol):
         """
         ...
 
+    def frame_displacements(self, model: PresentModel, q: Array) -> Array:
+        """Compute derivatives (c, d, m) of these coordinates by poses that have no meaning for the task."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedInstrument:
@@ -88,6 +98,11 @@ class SimulatedInstrument:
     def position_sigma(self) -> float:
         """Standard deviation along each axis of a position [m]."""
         return self.noise.position
+
+    @property
+    def assumption(self) -> str:
+        """What is assumed about this instrument."""
+        return self.kind.simulated_instrument
 
     def template(self, chain: Chain, q: Array) -> Measurement:
         """Return measurements whose instrument parameters have initial values."""
@@ -108,11 +123,16 @@ class SimulatedInstrument:
         jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)[:, :3]
         return jacobian, np.zeros((len(model.values), 3, len(q)))
 
+    def frame_displacements(self, model: PresentModel, q: Array) -> Array:
+        """Compute displacements of the tool point by poses of base and tool."""
+        return position_frame_effects(model.chain, q).transpose(2, 1, 0)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraInstrument:
     """Cameras that see boards; a measurement is all images of one configuration."""
 
+    assumption = ""
     images: PlannedImages  # Cameras, boards, and limits of their views
     # Standard deviations of the displacement of the tool that all corners of a configuration share.
     noise: Noise
@@ -246,6 +266,10 @@ class CameraInstrument:
             by_instrument.append(part)
         scale = 1 / np.sqrt(len(self.images.pairs))
         return scale * np.concatenate(by_errors, 1), scale * np.concatenate(by_instrument, 1)
+
+    def frame_displacements(self, model: PresentModel, q: Array) -> Array:
+        """Return none: displacements between cameras and boards do not depend on where the robot stands."""
+        return np.zeros((0, 3 * len(self.images.pairs), len(q)))
 
     def _ends(self, camera: int, board: int, u: Array) -> tuple[_End, _End]:
         """Return the moving and the standing one of a camera and a board."""

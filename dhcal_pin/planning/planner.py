@@ -26,6 +26,7 @@ from .._typing import Array, Progress
 from ..calibration.cameras import judged_boards, split_sets
 from ..estimation.parameters import LOW_COST
 from ..estimation.priors import Priors
+from ..estimation.qr import null_space
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise
@@ -39,7 +40,7 @@ from .curve_prediction import CurvePrediction, predict_curves
 from .error_curve import error_curve, plans_for_curves, random_errors, recommended_size
 from .exchange import CandidateSet, compute_sqrt_covariance, improve_by_exchange, select_greedily
 from .information import Information, PlannedCalibration, add_joint_scatter
-from .named_criteria import UNOBSERVABLE_RTOL, CriterionOption, parse_criterion
+from .named_criteria import CriterionOption, parse_criterion
 from .refinement import DesignGoal, Selection, refine
 from .sources import ImageSource, MeasurementSource, ToolSource
 from .task_error import TaskError
@@ -58,6 +59,8 @@ MAX_CANDIDATES = 50_000
 # Smallest distance of two poses, in the units of `scale_joint_units`: the effects that no model describes are
 # similar at closer poses. If random poses are closer, their median distance is used.
 MIN_DISTANCE_RAD = np.deg2rad(20.0)
+# Position errors below this value that no measurement shows are not mentioned [m].
+MIN_HIDDEN_ERROR = 1e-6
 # Phases of `plan`, in their order.
 PHASES = (
     "drawing candidates",
@@ -376,7 +379,7 @@ def _prepare(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[DesignGoal, CandidateSet, list[str]]:
-    """Collect the knowledge before measuring; return the goal, the candidates, and a note on the task."""
+    """Collect the knowledge before measuring; return the goal, the candidates, and notes."""
     # Unknown corners of boards add many rows and columns, and the same error to all plans of one size. Poses
     # are therefore chosen as if the corners were exact; the errors that are reported contain them.
     exact = planned.with_free_points(())
@@ -387,13 +390,15 @@ def _prepare(
     observable = information.observable_directions(
         candidate_set.rows_of(every_nth)[..., full_information.fitted]
     )
-    whole = TaskError.over(information, pool.task_q)
-    # Parts of the task error that no measurement of this kind determines, such as the base pose with wires of
-    # unknown anchors, do not depend on the selection.
-    ranking = whole.observable_part(observable)
-    expected = ranking
+    # Parts of the task error that no measurement of this kind determines do not depend on the selection.
+    ranking = TaskError.over(information, pool.task_q).observable_part(observable)
+    expected, has_free_frames, hidden = _expected_error(information, observable, pool.task_q)
+    if hidden > MIN_HIDDEN_ERROR and (complete := _with_redundant_parameters(exact)) is not exact:
+        # Where nothing is measured, the errors that the minimal set leaves out as redundant count, too.
+        known = Information.from_prior(complete, pool.q)
+        observable_of_all = known.observable_directions(known.rows(pool.q[every_nth]).transpose(2, 1, 0))
+        expected, has_free_frames, hidden = _expected_error(known, observable_of_all, pool.task_q)
     if exact is not planned:
-        # The scale of robot and board together is such a part, but the priors limit it.
         expected = TaskError.over(Information.from_prior(planned, pool.q), pool.task_q)
     goal = DesignGoal(
         expected=expected,
@@ -405,14 +410,39 @@ def _prepare(
         sampler=pool.sampler,
         bin_columns=bin_columns,
     )
-    unobservable = np.linalg.norm(whole.combinations - ranking.combinations)
-    if unobservable <= UNOBSERVABLE_RTOL * np.linalg.norm(ranking.combinations):
-        return goal, candidate_set, []
-    note = (
-        f"the predicted error does not contain the base pose, which {planned.kind} measurements do not "
-        "determine"
-    )
-    return goal, candidate_set, [note]
+    notes = [f"assumed: {assumption}"] if (assumption := information.instrument.assumption) else []
+    if has_free_frames:
+        notes.append(
+            "the predicted error does not contain poses of base and tool that "
+            f"{planned.kind} measurements do not determine"
+        )
+    if hidden > MIN_HIDDEN_ERROR:
+        notes.append(
+            f"{planned.kind} measurements do not determine positions: {1e3 * hidden:.3g} mm of the predicted "
+            "error are those of the priors, whatever the poses"
+        )
+    return goal, candidate_set, notes
+
+
+def _expected_error(
+    information: Information, observable: Array, task_q: Array
+) -> tuple[TaskError, bool, float]:
+    """Return the error to expect, relative to base and tool poses that measurements leave free.
+
+    Return, too, whether there are such poses, and the part of the error that only priors limit [m].
+    """
+    undetermined = null_space(observable)
+    combinations, has_free_frames = information.relative_combinations(task_q, undetermined)
+    hidden = float(np.linalg.norm(undetermined.T @ combinations))
+    return TaskError(information, combinations), has_free_frames, hidden
+
+
+def _with_redundant_parameters(planned: PlannedCalibration) -> PlannedCalibration:
+    """Return a calibration with all errors of the joint origins if it has the minimal ones."""
+    sets = [name.strip() for name in (planned.parameters or planned.chain.parameters).split(",")]
+    if planned.images is not None or "minimal" not in sets:
+        return planned
+    return replace(planned, parameters=",".join("placement" if name == "minimal" else name for name in sets))
 
 
 def _candidate_set(

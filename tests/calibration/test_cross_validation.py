@@ -62,6 +62,25 @@ def test_errors_of_left_out_samples_are_larger_by_the_number_of_unknowns():
     assert np.mean(ratios) == pytest.approx(expected, rel=0.03)
 
 
+def test_outliers_do_not_count():
+    """Two samples are wrong by decimetres; the figure is that of the others, calibrated without them."""
+    clean = fitted(Position)
+    (data,) = clean.data
+    values = data.values.copy()
+    values[[3, 20], 0] += [0.3, -0.2]
+    fit = calibrate(clean.errors.chain, Position(data.q, values), "dh")
+    assert fit.n_outliers == 2
+    good = np.delete(np.arange(40), [3, 20])
+    expected = calibrate(clean.errors.chain, Position(data.q[good], data.values[good]), "dh")
+    folds = k_fold(fit.data, 5)
+    found = cross_validate(fit, folds)
+    others = cross_validate(expected, [(mask[0][good],) for mask in folds])
+    assert found.accuracy["position_samples"] == 38
+    assert sum(fold["position_samples"] for fold in found.folds) == 38
+    assert found.accuracy["position_rms_m"] == pytest.approx(others.accuracy["position_rms_m"], rel=0.02)
+    assert fit.validate(fit.data)["position_samples"] == 40
+
+
 def test_folds_of_other_data_are_refused():
     with pytest.raises(DhcalError, match="made for other data"):
         cross_validate(fitted(m=30), k_fold(fitted().data, 5))

@@ -64,9 +64,7 @@ def test_errors_of_positions_that_residuals_do_not_show_are_stated(arm, kind):
     assert 0.5 < np.linalg.norm(stated) / np.linalg.norm(true) < 2.0
 
 
-@pytest.mark.parametrize(
-    "kind", some_slow(["position", "sphere", "distance", "relative", "wires", "pose"], {0, 1})
-)
+@pytest.mark.parametrize("kind", some_slow(["position", "distance", "relative", "wires", "pose"], {0, 1}))
 def test_measured_lengths_determine_the_size(kind):
     nominal, truth, data = simulated("ur10", kind, 4)
     fit = calibrate(nominal, data, extend="none", session="off")

@@ -8,13 +8,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from robots import paper, robot_file
+from sessions import Simulation
+from slow_cases import some_slow
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_configurations, read_robot, read_uncertainty, write_urdf
-from dhcal_pin.measurements import KINDS, Noise
+from dhcal_pin.measurements import (
+    KINDS,
+    Inclination,
+    Measurement,
+    Noise,
+    Pose,
+    Position,
+    PositionComponents,
+)
 from dhcal_pin.planning import Information, PlannedCalibration, plan
 from dhcal_pin.planning.criteria import DOptimality
 from dhcal_pin.planning.exchange import (
@@ -256,6 +266,60 @@ def test_predicted_errors_agree_with_simulation():
 def test_predicted_errors_agree_with_simulation_of_many_robots():
     for predicted, reached in curve((8, 12, 16, 24, 40), 100):
         assert predicted == pytest.approx(reached, rel=0.10)
+
+
+def measured(simulation: Simulation, kind: str) -> Measurement:
+    """Return measurements of a kind by a level robot, without the model of the project."""
+    poses = [pose * simulation.tool for pose in simulation.poses(simulation.q)]
+    points = np.array([pose.translation for pose in poses])
+    points += simulation.rng.normal(0, NOISE.position, points.shape)
+    if kind == "position":
+        return Position(simulation.q, points, NOISE.position)
+    if kind == "axes":
+        return PositionComponents(simulation.q, points[:, [0, 2]], (0, 2), NOISE.position)
+    turned = [pin.exp3(w) for w in simulation.rng.normal(0, NOISE.rotation, (len(poses), 3))]
+    if kind == "pose":
+        rotations = [pose.rotation @ turn for pose, turn in zip(poses, turned, strict=True)]
+        matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+        matrices[:, :3, :3], matrices[:, :3, 3] = rotations, points
+        return Pose(simulation.q, matrices, NOISE.position, NOISE.rotation)
+    up = [turn @ pose.rotation[2] for pose, turn in zip(poses, turned, strict=True)]
+    return Inclination.from_acceleration(simulation.q, np.array(up), NOISE.rotation)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "seeds"),
+    some_slow(
+        [
+            ("inclination", 40, 3),
+            ("pose", 30, 8),
+            ("position", 30, 8),
+            ("axes", 60, 8),
+            ("inclination", 60, 8),
+        ],
+        {0},
+    ),
+)
+def test_predicted_errors_are_those_of_positions_with_the_best_base_and_tool(kind, count, seeds):
+    found = plan(arm("ur10"), count, kind=kind, noise=NOISE, candidates=500)
+    true = []
+    for seed in range(seeds):
+        simulation = Simulation("ur10", count, seed)
+        simulation.q, simulation.end_model, simulation.end_zeros = found.q, simulation.model, 0.0
+        fit = calibrate(simulation.chain, measured(simulation, kind), extend="none", session="off")
+        true.append(simulation.true_error(fit.chain))
+    assert 0.7 < found.error / np.sqrt(np.mean(np.square(true))) < 1.5
+
+
+def test_what_a_plan_assumes_and_cannot_determine_is_noted():
+    chain = arm("ur10")
+    height, inclination, pose = (
+        plan(chain, 12, kind=kind, noise=NOISE, candidates=100).notes
+        for kind in ("axes", "inclination", "pose")
+    )
+    assert height[0].startswith("assumed: x and z of each position are measured")
+    assert any("do not determine positions: 5." in note for note in inclination)
+    assert not any("do not determine positions" in note for note in (*height, *pose))
 
 
 def test_existing_measurements_are_complemented():

@@ -1,0 +1,116 @@
+"""Measurements of a part of the position: the verdict states the position errors that residuals do not show.
+
+The true arms and their errors are those of `sessions`, without the model of the project.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from sessions import NOISE, Simulation
+from slow_cases import some_slow
+
+from dhcal_pin import calibrate
+from dhcal_pin.measurements import Pose, Position, PositionComponents, SphereContact
+
+REASON = "The measurements show only a part of the position: errors of positions of about"
+
+
+def points(simulation, q):
+    """Return the measured points of the true arm, with a level base."""
+    return np.array([(pose * simulation.tool).translation for pose in simulation.poses(q)])
+
+
+def heights(simulation):
+    """Return heights by a gauge."""
+    z = points(simulation, simulation.q)[:, 2]
+    return [PositionComponents(simulation.q, z + simulation.rng.normal(0, NOISE, len(z)), (2,))]
+
+
+def touches(simulation, n_spheres=1):
+    """Return contacts with spheres, by Newton steps in joint space from random configurations."""
+    rng, q, step = simulation.rng, simulation.q.copy(), 1e-5
+    centres = points(simulation, simulation.test_q[:n_spheres])
+    which = np.arange(len(q)) % n_spheres
+    radius = 0.15 + rng.normal(0, NOISE, len(q))
+
+    def height(q):
+        return np.linalg.norm(points(simulation, q) - centres[which], axis=1) - radius
+
+    for _ in range(30):
+        now = height(q)
+        slopes = np.stack([(height(q + step * axis) - now) / step for axis in np.eye(q.shape[1])], 1)
+        moves = now[:, None] * slopes / np.maximum(np.sum(slopes**2, 1), 1e-3)[:, None]
+        q -= np.clip(moves, -0.5, 0.5)
+    touching = np.abs(height(q)) < 1e-7
+    assert touching.mean() > 0.8
+    return [
+        SphereContact(q[touching & (which == i)], np.full(np.sum(touching & (which == i)), 0.15), name=str(i))
+        for i in range(n_spheres)
+    ]
+
+
+@pytest.mark.parametrize("measure", [heights, touches])
+def test_errors_of_positions_that_residuals_do_not_show_are_stated(measure):
+    simulation = Simulation("ur10", 100, 0)
+    fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
+    assert fit.verdict.status == "caution"
+    (reason,) = fit.verdict.reasons
+    assert reason.startswith(REASON)
+    assert reason.endswith("Measure the position of the tool in a fixed frame, too.")
+    stated = 1e-3 * float(re.findall(r"of about ([\d.]+) mm", reason)[0])
+    (after,) = fit.comparisons[0].after.groups.values()
+    assert stated > 2 * after.rms
+    assert 1 / 3 < stated / true_error(simulation, fit) < 3
+
+
+def true_error(simulation, fit):
+    """Return the RMS position error in the measured region, with the best base and tool point [m]."""
+    simulation.end_model, simulation.end_zeros = simulation.model, 0.0
+    simulation.test_q = fit.measured_region.draw(np.random.default_rng(1), 200)
+    return simulation.true_error(fit.chain)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", [heights, touches])
+def test_predicted_errors_are_those_of_many_arms(measure):
+    """No position error is far above the residual without a caution."""
+    ratios = []
+    for seed in range(8):
+        simulation = Simulation("ur10", 100, seed)
+        fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
+        true = true_error(simulation, fit)
+        ratios.append(fit.position_std / true)
+        (after,) = fit.comparisons[0].after.groups.values()
+        assert fit.verdict.status == "caution" or true < 2.5 * after.rms
+    assert 0.5 < np.median(ratios) < 2.0
+
+
+SETUPS = {
+    "few positions": (25, 2.8, lambda s: [s.measure(Position)]),
+    "local positions": (60, 0.2, lambda s: [s.measure(Position)]),
+    "local poses": (40, 0.3, lambda s: [s.measure(Pose)]),
+    "wires": (60, 2.8, lambda s: [s.measure_wires()]),
+    "targets": (30, 2.8, lambda s: [s.measure_targets()]),
+    "spheres": (400, 2.8, lambda s: touches(s, 4)),
+    "heights with positions": (150, 2.8, lambda s: [*heights(s), *some_positions(s)]),
+}
+
+
+def some_positions(simulation):
+    """Return positions at a fifth of the configurations, in the frame of the heights."""
+    q = simulation.q[::5]
+    return [Position(q, points(simulation, q) + simulation.rng.normal(0, NOISE, (len(q), 3)))]
+
+
+@pytest.mark.parametrize("name", some_slow(list(SETUPS), {1}))
+def test_measurements_that_determine_positions_are_ok(name):
+    count, half, measure = SETUPS[name]
+    for seed in range(3):
+        simulation = Simulation("ur10", count, seed)
+        if half < 1:
+            simulation.q = [0.3, -1.2, 1.3, -0.5, 0.6, 0.2] + half * simulation.rng.uniform(-1, 1, (count, 6))
+        fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
+        assert not fit.verdict.reasons
