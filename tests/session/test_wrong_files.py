@@ -69,7 +69,7 @@ def test_a_mistake_is_named_in_place_of_false_events(arm, kind, name, joint, eve
 
 @pytest.mark.slow
 def test_mistakes_are_named_in_place_of_false_events():
-    cases = list(product(("ur10", "panda", "xarm7"), (Pose, Position), ("sign", "zero"), (1, 3, 4)))
+    cases = list(product(("ur10", "panda", "xarm7"), (Pose, Position), ("sign", "zero"), (1, 3)))
     missed = []
     for seed, event in enumerate(("", *EVENTS)):
         for case in cases:
