@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from camera_setups import ARMS, Setup, photograph, simulate, turned_configurations
+from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
@@ -70,7 +71,7 @@ class Photographer:
         return float(np.sqrt(np.mean(np.sum((places[0] - places[1]) ** 2, 1))))
 
 
-@pytest.mark.parametrize("is_on_wrist", [False, True])
+@pytest.mark.parametrize("is_on_wrist", some_slow([False, True], {0}))
 def test_rotations_mend_what_the_reason_names(is_on_wrist):
     photographer = Photographer("ur10", 0, is_on_wrist)
     images = photographer.take(NONE, 15)
