@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from dhcal_pin.calibration import accuracy, calibrate, cross_validate, k_fold
+from dhcal_pin.calibration.cross_validation import cross_validate_folds, refit
+from dhcal_pin.calibration.evaluation import Accuracy
 from dhcal_pin.cli.commands import demo
 from dhcal_pin.diagnostics import find_unreachable_rows
 from dhcal_pin.io import measurement_text, read_measurement_file
@@ -45,9 +49,14 @@ def test_the_cross_validation_of_a_result_agrees(experiment, options, fitted, le
     assert (first.title, second.title) == ("cross-validated", "fitted")
     assert 1e3 * fit.validate(experiment.data)["position_rms_m"] == pytest.approx(fitted, abs=5e-4)
     folds = k_fold(fit.data, len(experiment.data.rows))
-    assert 1e3 * cross_validate(fit, folds).accuracy["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
+    held_out = cross_validate_folds(fit.problem, fit.solution.x, fit.data, folds, partial(refit, fit))
+    every = Accuracy.from_errors([item for fold in held_out for item in fold.errors])
+    assert 1e3 * every["position_rms_m"] == pytest.approx(left_out, abs=2e-3)
     # Figures of a result are without outliers.
-    assert (second.after["position_rms_m"] < 1e-3 * fitted - 1e-4) == bool(second.n_outliers)
+    counted = cross_validate(fit, folds).accuracy["position_rms_m"]
+    assert counted == pytest.approx(first.after["position_rms_m"], rel=1e-6)
+    for without, all_samples in ((counted, left_out), (second.after["position_rms_m"], fitted)):
+        assert (without < 1e-3 * all_samples - 1e-4) == bool(second.n_outliers)
 
 
 def test_unreachable_rows_are_found_with_their_reasons(experiment):
