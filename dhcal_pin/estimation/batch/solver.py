@@ -298,7 +298,7 @@ def _undamped_steps(batch: BatchProblem, x: Array, cost: Array) -> tuple[Array, 
 def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
     """Run `solver.levenberg_marquardt` in lockstep, then on the remaining problems one by one."""
     x, iterations, converged = _lockstep(batch, x, min(max_iterations, MAX_LOCKSTEP))
-    for i in np.flatnonzero(~converged & (iterations < max_iterations)):
+    for i in np.flatnonzero(~converged & (iterations < max_iterations)).tolist():
         found = levenberg_marquardt(batch.problem(i), x[i], max_iterations - int(iterations[i]))
         x[i], converged[i] = found.x, found.converged
         iterations[i] += found.iterations
