@@ -143,6 +143,27 @@ def test_another_robot_is_refused(tmp_path, case):
         convert_robot(UR10, "out.xml", "tool0", template=template)
 
 
+@pytest.mark.parametrize(("degrees", "is_same"), [(8, True), (15, False)])
+def test_axes_turn_as_far_as_in_a_low_cost_arm(tmp_path, degrees, is_same):
+    """The last axis is turned. MuJoCo gives the poses of the result."""
+    nominal = read_robot(UR10, "tool0")
+    template = write(tmp_path, "template.xml", mjcf_of(nominal, other_frames(nominal, 0, 0)))
+    origins = nominal.origins.copy()
+    axis = np.cross(nominal.axes[5], [1, 2, 3])
+    turn = se3.exp3(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
+    origins[5] = origins[5] @ se3.transform(turn, np.zeros(3))
+    for path, content in urdf_files(replace(nominal, origins=origins), tmp_path / "robot.urdf").items():
+        write(tmp_path, os.path.basename(path), content)
+    if not is_same:
+        with pytest.raises(DhcalError, match=r"the axis of joint 'wrist_3_joint' is .* mm and 15° from"):
+            convert_robot(tmp_path / "robot.urdf", "out.xml", "tool0", template=template)
+        return
+    robot = read_robot(tmp_path / "robot.urdf", "tool0")
+    text = convert_robot(tmp_path / "robot.urdf", "out.xml", "tool0", template=template).text
+    by_mujoco = mujoco_poses(text.encode(), "tool0", robot.joint_names, draw(robot))
+    np.testing.assert_allclose(by_mujoco, _pinocchio_poses(robot, draw(robot)), atol=1e-9)
+
+
 def test_a_template_of_another_format_is_refused(tmp_path):
     template = write(tmp_path, "template.xml", SCARA)
     with pytest.raises(DhcalError, match=r"out\.urdf: .*template\.xml has another format"):

@@ -120,7 +120,7 @@ class BatchProblem:
             n_padding=self._padding()[:, members],
         )
 
-    def problem(self, number: int) -> Problem:
+    def _problem(self, number: int) -> Problem:
         """Build one of the problems."""
         samples = tuple(self._samples_of(item, np.array([number])) for item in self.data)
         return Problem(self.chains.error_model(number), samples, self.weights, self.known)
@@ -299,7 +299,7 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
     """Run `solver.levenberg_marquardt` in lockstep, then on the remaining problems one by one."""
     x, iterations, converged = _lockstep(batch, x, min(max_iterations, MAX_LOCKSTEP))
     for i in np.flatnonzero(~converged & (iterations < max_iterations)).tolist():
-        found = levenberg_marquardt(batch.problem(i), x[i], max_iterations - int(iterations[i]))
+        found = levenberg_marquardt(batch._problem(i), x[i], max_iterations - int(iterations[i]))
         x[i], converged[i] = found.x, found.converged
         iterations[i] += found.iterations
     return x, iterations, converged
