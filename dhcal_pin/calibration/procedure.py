@@ -36,11 +36,8 @@ from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
 from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
-from ..estimation.problem import (
-    Problem,
-    merge_instrument_parameters,
-)
-from ..estimation.solver import METHODS, SolverResult, minimize
+from ..estimation.problem import Problem, merge_instrument_parameters
+from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import join_names
@@ -54,7 +51,7 @@ from ..plausibility.mixups import has_enough_rows
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
-from ..session import can_have_session, find_scale, find_session
+from ..session import can_have_session, find_scale
 from . import cameras, model_selection
 from .cameras import (
     arm_type,
@@ -70,7 +67,7 @@ from .evaluation import accuracy, fit_nominal
 from .evidence import diagnose
 from .result import Result, make_result
 from .reweighting import Fit, reweight
-from .session_check import compare_with_mistakes, confirm_changes, without_changes, without_findings
+from .session_check import SessionFit, SessionModels, fit_session
 from .shrinkage import compute_shrinkage_factor
 from .verdict import MAX_FRAME_ITERATIONS, MAX_FRAME_RATIO, MAX_USUAL_ERROR
 
@@ -174,54 +171,45 @@ def calibrate(
         return replace(result, region_comparison=leave_regions_out(result, again, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
     _check_options(data, parameters, method, loss, bounds, session, max_iterations)
-    with_auto = (
-        None
-        if method == "lm" and loss == "auto"
-        else partial(recalibrate, data, holdout=holdout, method="lm", loss="auto", turned=turned)
-    )
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
+    again = partial(recalibrate, data, holdout=holdout, turned=turned)
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
     chain = _at_measured_temperature(chain, data)
     robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
-    if LOW_COST in robot_sets:
+    is_low_cost = LOW_COST in robot_sets
+    if is_low_cost:
         chain = replace(chain, parameters=HAND_BUILT)
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     is_deliberate = method != "lm" or bool(fix or free or bounds) or not has_joint_values((*data, *holdout))
-    with_full_set = (
-        partial(
-            recalibrate,
-            data,
-            parameters=model_selection.FULL_SET,
-            priors=_full_set_priors(chain, priors),
-            holdout=holdout,
-            extend="none",
-            turned=turned,
-        )
-        if model_selection.is_restricted([*robot_sets, *rig_sets]) and not is_deliberate
-        else None
-    )
-    settings: dict[str, Any] = {
-        "with_auto": with_auto,
-        "with_full_set": with_full_set,
-        "has_default_sets": parameters is None,
-    }
-    signs = None
-    if turned != "auto":
-        names = turned.split(",") if isinstance(turned, str) else turned
-        signs = plausibility.known_signs(chain, [name.strip() for name in names if name != "none"])
-    elif LOW_COST in robot_sets:
-        if progress:
-            progress("signs of the joints", 1, 1)
-        signs = plausibility.decide_signs(chain, data)
+    can_suggest = not is_deliberate and model_selection.is_restricted([*robot_sets, *rig_sets])
+    full_set: dict[str, Any] = {
+        "parameters": model_selection.FULL_SET, "priors": _full_set_priors(chain, priors), "extend": "none",
+    }  # fmt: skip
+    signs = _joint_signs(chain, data, turned, is_low_cost, progress)
     chain = signs.apply(chain) if signs else chain
+    settings: dict[str, Any] = {
+        "with_auto": None if method == "lm" and loss == "auto" else partial(again, method="lm", loss="auto"),
+        "with_full_set": partial(again, **full_set) if can_suggest else None,
+        "has_default_sets": parameters is None,
+        "signs": signs,
+    }
     exchanges: Sequence[cameras.Exchange] = ()
     if has_images(data):
         data, exchanges = cameras.exchange_axes(chain, data)
         holdout = cameras.reorder(holdout, exchanges)
-    of_images = None
+    known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
+    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
+    families = _extension_families(extend, errors, method, priors)
+    _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
+    if has_images(data):
+        cameras.require_shown_families(extend, families)
+    solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
+    first = plausibility.first_errors(chain, data) if is_low_cost else {}
+    start = partial(_first_fit, first=first, priors=priors, known=known, bounds=bounds, options=solver)
     arm = arm_type(robot_sets)
-    if session != "off" and method == "lm" and has_images(data):
+    finds_session = session != "off" and method == "lm"
+    if finds_session and has_images(data):
         of_poses = partial(
             calibrate,
             chain,
@@ -233,64 +221,55 @@ def calibrate(
             turned="none",
             executor=executor,
         )
-        of_images = cameras.find_image_session(chain, data, holdout, of_poses, arm)
-    known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
-    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
-    families = _extension_families(extend, errors, method, priors)
-    _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
-    if has_images(data):
-        cameras.require_shown_families(extend, families)
-    solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
-    first = plausibility.first_errors(chain, data) if LOW_COST in robot_sets else {}
-    start = partial(
-        _first_fit, errors=errors, first=first, priors=priors, known=known, bounds=bounds, options=solver
-    )
-    if of_images and not of_images.changes.is_empty:
-        of_images, fit, holdout = cameras.fit_with_changes(of_images, data, holdout, start)
+        begun = cameras.fit_image_session(chain, data, holdout, of_poses, partial(start, errors=errors), arm)
     else:
-        fit = start(data)
+        begun = SessionFit(start(data, errors), holdout)
     if has_images(data):
-        _require_frames(fit, [*robot_sets, *rig_sets])
+        _require_frames(begun.fit, [*robot_sets, *rig_sets])
     # The confirmation of changes and the calibration itself often need the same fits.
-    groups = _prior_groups(fit, priors)
+    groups = _prior_groups(begun.fit, priors)
     reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
-    found, diagnosis = None, None
-    if session != "off" and method == "lm" and can_have_session((*data, *holdout)):
-        unweighted = replace(fit.problem, data=fit.data)
-        found = find_session(unweighted, fit.solution.x, holdout, is_ordered=session == "auto")
-        if not found.changes.is_empty:
-            changed = found.applied(data, holdout)
-            sets = HAND_BUILT if signs else MANUFACTURED
-            is_likely, diagnosis = compare_with_mistakes(
-                found, fit.problem.errors.chain, data, changed[0], sets, progress
-            )
-            held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
-            refit = start(changed[0], errors=held) if is_likely else fit
-            if not is_likely:
-                found = without_findings(found)
-            elif found.has_two_robots or confirm_changes(
-                found,
-                fit,
-                reweighted(refit, AUTO),
-                lambda each: extended(reweighted(each, AUTO), EXTENSIONS)[0],
-            ):
-                fit, holdout = refit, changed[1]
-            else:
-                found, diagnosis = without_changes(found), None
-    data = fit.data
+    if finds_session and can_have_session((*data, *holdout)):
+        models = SessionModels(
+            errors,
+            start,
+            lambda fit: reweighted(fit, AUTO),
+            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS)[0],
+            HAND_BUILT if signs else MANUFACTURED,
+        )
+        begun = fit_session(begun.fit, data, holdout, models, session == "auto", progress)
+    fit, holdout, found = begun.fit, begun.holdout, begun.session
     if method != "lm":
-        return replace(make_result(fit, 1.0, holdout, method), signs=signs, **settings)
+        return replace(make_result(fit, 1.0, holdout, method), **settings)
     stages = robust.LOSSES[loss].stages
     if has_images(data) and priors != "none":
         fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)
         images = cameras.calibrate_images(fitting, fit, chain, holdout, exchanges, families)
-        return replace(images, signs=signs, session=of_images, **settings)
+        return replace(images, session=found, **settings)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, diagnosis, progress)
+    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, begun.diagnosis, progress)
     return replace(result, session=found, **settings)
+
+
+def _joint_signs(
+    chain: Chain,
+    data: Sequence[Measurement],
+    turned: str | Sequence[str],
+    is_low_cost: bool,
+    progress: Progress | None,
+) -> plausibility.SignDecision | None:
+    """Return which joints turn the other way: those that are named, or by evidence for a low-cost arm."""
+    if turned != "auto":
+        names = turned.split(",") if isinstance(turned, str) else turned
+        return plausibility.known_signs(chain, [name.strip() for name in names if name != "none"])
+    if not is_low_cost:
+        return None
+    if progress:
+        progress("signs of the joints", 1, 1)
+    return plausibility.decide_signs(chain, data)
 
 
 def _full_set_priors(chain: Chain, priors: Priors) -> Priors:
@@ -372,17 +351,6 @@ def _first_fit(
         problem = replace(problem, bounds=_bounds(problem, bounds))
     start = np.concatenate([_start(errors, first), problem.instrument_start(distortion)])
     return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
-
-
-def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
-    """Hold what no row shows of base and tool, such as the rotation of a tool of which a point is measured.
-
-    Changes of the tool act in its axes. These axes would turn until the changes fit better by chance.
-    """
-    system, n = solution.system, len(errors.parameters)
-    is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
-    held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
-    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held), undetermined=tuple(held))
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:

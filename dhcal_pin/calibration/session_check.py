@@ -13,19 +13,20 @@ kept only if the measurements support them beside all families of joint errors, 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .._typing import Array, Progress
-from ..estimation.solver import minimize
+from ..estimation.error_model import ErrorModel
+from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import Evidence
 from ..plausibility.mixups import diagnose_mixups, fit_drawn_samples
 from ..robot.chain import Chain
-from ..session import Session
+from ..session import Session, find_session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
@@ -48,7 +49,82 @@ MAX_ZERO_STEP, MAX_ZERO_DRIFT = np.deg2rad((30.0, 10.0))
 MAX_WIDTH = 8.0
 
 
-def compare_with_mistakes(
+@dataclass(frozen=True)
+class SessionFit:
+    """First fit of measurements, with what happened during the session.
+
+    Attributes:
+        fit: First fit, with the changes that are believed.
+        holdout: Measurements that are not fitted, with these changes.
+        session: What happened; None if it was not looked for.
+        diagnosis: Diagnosis of mistakes in the measurements; None if none was made.
+    """
+
+    fit: Fit
+    holdout: tuple[Measurement, ...]
+    session: Session | None = None
+    diagnosis: Diagnosis | None = None
+
+
+@dataclass(frozen=True)
+class SessionModels:
+    """Fits that are compared to decide whether changes are believed.
+
+    Attributes:
+        errors: Errors of the robot that are unknown.
+        start: Fit measurements for the first time, with given errors that are unknown.
+        reweighted: Fit with robust weights, from a first fit.
+        extended: Fit with robust weights and all families of joint errors, from a first fit.
+        sets: Name of the widths of ordinary errors in `plausibility.evidence`.
+    """
+
+    errors: ErrorModel
+    start: Callable[[tuple[Measurement, ...], ErrorModel], Fit]
+    reweighted: Callable[[Fit], Fit]
+    extended: Callable[[Fit], Fit]
+    sets: str
+
+
+def fit_session(
+    fit: Fit,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    models: SessionModels,
+    is_ordered: bool,
+    progress: Progress | None,
+) -> SessionFit:
+    """Find what happened during a session, and fit the measurements again with the changes that are believed.
+
+    `fit` is the first fit of `data`.
+    """
+    unweighted = replace(fit.problem, data=fit.data)
+    found = find_session(unweighted, fit.solution.x, holdout, is_ordered)
+    if found.changes.is_empty:
+        return SessionFit(fit, holdout, found)
+    changed, changed_holdout = found.applied(data, holdout)
+    chain, errors = fit.problem.errors.chain, models.errors
+    is_likely, diagnosis = _compare_with_mistakes(found, chain, data, changed, models.sets, progress)
+    if not is_likely:
+        return SessionFit(fit, holdout, Session(found.timeline, found.chain, found.is_ordered), diagnosis)
+    held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
+    refit = models.start(changed, held)
+    if found.has_two_robots or _confirm_changes(found, fit, models.reweighted(refit), models.extended):
+        return SessionFit(refit, changed_holdout, found, diagnosis)
+    return SessionFit(fit, holdout, without_changes(found))
+
+
+def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
+    """Hold what no row shows of base and tool, such as the rotation of a tool of which a point is measured.
+
+    Changes of the tool act in its axes. These axes would turn until the changes fit better by chance.
+    """
+    system, n = solution.system, len(errors.parameters)
+    is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
+    held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
+    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held), undetermined=tuple(held))
+
+
+def _compare_with_mistakes(
     session: Session,
     chain: Chain,
     data: Sequence[Measurement],
@@ -72,7 +148,7 @@ def compare_with_mistakes(
     return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
 
 
-def confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
+def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
     """Return whether changes explain measurements beside all families of joint errors.
 
     `without` and `fit` are the first fits without and with the changes; `extended` adds all families of joint
@@ -140,11 +216,6 @@ def _turns_far(session: Session) -> bool:
     """Return whether the zero of a joint changed by more than what is believed."""
     changes = [*((e, MAX_ZERO_STEP) for e in session.events), *((d, MAX_ZERO_DRIFT) for d in session.drifts)]
     return any(each.kind == "joint" and each.unit == "rad" and each.size > most for each, most in changes)
-
-
-def without_findings(session: Session) -> Session:
-    """Return a session in which nothing was found."""
-    return Session(RobotChanges(), session.timeline, session.chain, session.is_ordered)
 
 
 def without_changes(session: Session) -> Session:

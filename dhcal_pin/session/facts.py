@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -216,10 +216,10 @@ class Session:
     """What happened during a session.
 
     Attributes:
-        changes: Changes of the robot during the session.
         timeline: Timeline of the samples.
         chain: Robot with the base frame in which the base drifts.
         is_ordered: Whether the samples are in the order of measurement.
+        changes: Changes of the robot during the session.
         causes: What was found, in the order of its discovery.
         events: Sudden changes, in the order of measurement.
         drifts: Slow changes.
@@ -227,10 +227,10 @@ class Session:
         scales: Wrong scales of the instrument.
     """
 
-    changes: RobotChanges
     timeline: Timeline
     chain: Chain
     is_ordered: bool
+    changes: RobotChanges = field(default_factory=RobotChanges)
     causes: tuple[Cause, ...] = ()
     events: tuple[Event, ...] = ()
     drifts: tuple[SlowChange, ...] = ()

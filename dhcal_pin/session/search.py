@@ -733,7 +733,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     Held-out measurements only count for the timeline. Without an order only files may differ.
     """
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
-    nothing = Session(RobotChanges(), timeline, chain, is_ordered)
+    nothing = Session(timeline, chain, is_ordered)
     n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
     if n_rows < MIN_ROWS_PER_UNKNOWN * len(problem.weights):
         return nothing
@@ -757,10 +757,10 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     search.place_steps()
     causes = tuple(search.causes)
     return Session(
-        search.changes,
         timeline,
         chain,
         is_ordered,
+        search.changes,
         causes,
         (other_robot,) if other_robot else (),
         lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),

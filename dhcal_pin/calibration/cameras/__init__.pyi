@@ -20,8 +20,7 @@ from .image_checks import largest_tool_std as largest_tool_std
 from .image_checks import second_rotation as second_rotation
 from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .image_checks import small_ranges as small_ranges
-from .image_session import find_image_session as find_image_session
-from .image_session import fit_with_changes as fit_with_changes
+from .image_session import fit_image_session as fit_image_session
 from .lens_priors import lens_prior_groups as lens_prior_groups
 from .lens_priors import with_lens_priors as with_lens_priors
 from .lens_priors import with_stated_distortion as with_stated_distortion

@@ -30,8 +30,39 @@ from ...session.search import MAX_SAMPLE_COST, MIN_LOG_EVIDENCE, MIN_NOISE
 from ...session.timeline import Timeline, order_samples
 from ..result import Result
 from ..reweighting import Fit
-from ..session_check import residuals_of, without_changes
+from ..session_check import SessionFit, residuals_of, without_changes
 from .arm_types import ArmType
+
+
+def fit_image_session(
+    chain: Chain,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    calibrated: Callable[[Sequence[Pose]], Result],
+    start: Callable[[tuple[Measurement, ...]], Fit],
+    arm: ArmType,
+) -> SessionFit:
+    """Find what happened while images were taken, and fit them with the changes that are believed.
+
+    `calibrated` calibrates poses of the tool for some base and some tool; `start` fits images.
+    """
+    found = find_image_session(chain, data, holdout, calibrated, arm)
+    if found is None or found.changes.is_empty:
+        return SessionFit(start(data), holdout, found)
+    try:
+        fit = start(found.applied(data, holdout)[0])
+        found = refine_changes(found, replace(fit.problem, data=fit.data), fit.solution.x)
+        changed, held_out = found.applied(data, holdout)
+        fit = start(changed)
+    except DhcalError:
+        return SessionFit(start(data), holdout, without_changes(found))
+    try:
+        without = start(data)
+    except DhcalError:
+        return SessionFit(fit, held_out, found)
+    if found.has_two_robots or _explains_better(fit, without):
+        return SessionFit(fit, held_out, found)
+    return SessionFit(without, holdout, without_changes(found))
 
 
 def find_image_session(
@@ -43,7 +74,7 @@ def find_image_session(
 ) -> Session | None:
     """Find what happened while the images of one camera and one board were taken.
 
-    `calibrated` calibrates poses of the tool for some base and some tool. None if nothing can be said.
+    None if nothing can be said.
     """
     images = [item for item in data if isinstance(item, CameraCorners)]
     pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
@@ -79,29 +110,6 @@ def find_image_session(
         lag=None,
         scales=(),
     ).described()
-
-
-def fit_with_changes(
-    session: Session,
-    data: tuple[Measurement, ...],
-    holdout: tuple[Measurement, ...],
-    start: Callable[[tuple[Measurement, ...]], Fit],
-) -> tuple[Session, Fit, tuple[Measurement, ...]]:
-    """Fit images for the first time with the changes of a session; without if these do not explain them."""
-    try:
-        fit = start(session.applied(data, holdout)[0])
-        session = refine_changes(session, replace(fit.problem, data=fit.data), fit.solution.x)
-        changed, held_out = session.applied(data, holdout)
-        fit = start(changed)
-    except DhcalError:
-        return without_changes(session), start(data), holdout
-    try:
-        without = start(data)
-    except DhcalError:
-        return session, fit, held_out
-    if session.has_two_robots or _explains_better(fit, without):
-        return session, fit, held_out
-    return without_changes(session), without, holdout
 
 
 def _explains_better(fit: Fit, other: Fit) -> bool:
