@@ -52,7 +52,7 @@ function showError(id, text) {
 // Controls of the page by the options of the command line.
 const CONTROLS = {
   "--skip-bad-rows": "“Skip rows that lack a number or a name”", "--tip": "“Tip link”", "--columns": "a column map among the files",
-  "--rig": "a rig file among the files", "--robot": "a robot among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--force": "“Write the robot all the same”",
+  "--rig": "a rig file among the files", "--robot": "a robot among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--sheet": "“Sheet of Excel files”", "--force": "“Write the robot all the same”",
 };
 
 // A message of the command, in the words of the page.
@@ -121,6 +121,7 @@ function filesChanged() {
   const hasRig = named("rig").length > 0;
   if (hasRig && !$("parameters").disabled) $("holdout").value = $("parameters").value = "";
   $("parameters").disabled = hasRig;
+  $("sheet-field").hidden = named("images").length > 0 || !named("data").some(name => /\.xls[xm]$/i.test(name));
   if (named("images").length) $("rig-maker").open = !hasRig;
   $("parameters").options[0].text = hasRig ? "Arm, camera, board, lens" : "Joint origins, base, tool (default)";
   check();
@@ -247,7 +248,9 @@ async function printBoard(paper) {
 
 function form(request) {
   const out = new FormData();
-  const options = { tip: $("tip").disabled ? "" : $("tip").value.trim(), images: named("images") };
+  const options = {
+    tip: $("tip").disabled ? "" : $("tip").value.trim(), sheet: $("sheet-field").hidden ? "" : $("sheet").value.trim(), images: named("images"),
+  };
   for (const role of SINGLE) options[role] = named(role)[0] ?? "";
   out.append("request", JSON.stringify({ ...options, ...request }));
   for (const [name, { file }] of files) out.append("file", file, name);
@@ -543,7 +546,7 @@ for (const name of ["dragover", "dragleave", "drop"]) {
     if (name === "drop") addFiles(event.dataTransfer.files);
   });
 }
-$("tip").onchange = check;
+$("tip").onchange = $("sheet").onchange = check;
 for (const field of document.querySelectorAll("#rig-fields :is(select, input)")) field.oninput = writeRig;
 for (const button of document.querySelectorAll("[data-paper]")) button.onclick = () => printBoard(button.dataset.paper);
 $("rig-text").oninput = rigEdited;

@@ -68,8 +68,9 @@ async def inspect(upload: Upload, folder: Path) -> AsyncGenerator[dict[str, Any]
             return
         found = _read_json(folder)
         yield {key: found[key] for key in ("boards", "notes")}
-    kept = [word for name in ("tip", "columns", "rig", "servos") for word in upload.option(name)]
-    robot = [f"--robot={upload.robot}", *kept] if upload.robot else upload.option("rig")
+    robot = [f"--robot={upload.robot}"] if upload.robot else []
+    names = ("tip", "columns", "rig", "servos", "sheet") if robot else ("rig", "sheet")
+    robot += [word for name in names for word in upload.option(name)]
     run = _Run(folder)
     await run.finish("inspect", *_measurements(upload), *robot, f"--json={_RESULT}")
     yield run.error() or {"result": _read_json(folder)}

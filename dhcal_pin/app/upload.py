@@ -22,7 +22,7 @@ _MAX_NAME_BYTES = 255
 # Largest number of files, and longest command line that is made of a request [bytes].
 MAX_FILES, _MAX_COMMAND_BYTES = 90, 100_000
 # Options with one text each, by the name of their field.
-_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "rig", "servos", "paper")
+_TEXT_OPTIONS = ("tip", "parameters", "holdout", "columns", "sheet", "rig", "servos", "paper")
 TOO_MANY_FILES = (
     f"more than {MAX_FILES} files; instead of photographs, add the corners that `dhcal detect` finds in "
     "their folder; join the rows of several measurement files in one"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from openpyxl import Workbook
 from pages import AXE, READY, VIEWPORT, listen
 from robots import URDF
 from slow_cases import some_slow
@@ -240,6 +241,29 @@ def test_a_proposed_column_map_is_used(page, example):
     page.wait_for_selector("#result:not([hidden])")
     assert "Verdict: ok" in page.inner_text("#result")
     assert "--columns columns.toml" in page.text_content("#result pre")
+
+
+def test_a_sheet_of_an_excel_file_is_chosen(page, example, tmp_path):
+    lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
+    header, *rows = (line.split(",") for line in lines)
+    book = Workbook()
+    book.remove(book.active)
+    for title, part in (("first", rows[:60]), ("second", rows[60:])):
+        sheet = book.create_sheet(title)
+        sheet.append(header)
+        for row in part:
+            sheet.append([float(value) for value in row])
+    book.save(tmp_path / "laser.xlsx")
+    assert page.is_hidden("#sheet")
+    page.fill("#tip", "tool0")
+    page.set_input_files("#picker", [example / "ur10.urdf", tmp_path / "laser.xlsx"])
+    page.wait_for_selector("#check .card:has-text('60 rows')")
+    page.fill("#sheet", "second")
+    page.locator("#sheet").blur()
+    page.wait_for_selector("#check .card:has-text('40 rows')")
+    page.click("#calibrate")
+    page.wait_for_selector("#result:not([hidden])")
+    assert "--sheet second" in page.text_content("#result pre")
 
 
 @pytest.mark.slow
