@@ -55,6 +55,10 @@ _MAX_ROTATION = np.pi / 2
 # the characteristic length per radian [1] or as an angle [rad/rad].
 _NEAR_SINGULAR_TOL = 5e-3
 
+# A target on the edge of the workspace counts as reached if it is missed by less than this, as a fraction of
+# the characteristic length [1] or as an angle [rad]: a hundredth of the accuracy of calibrated arms.
+_NEGLIGIBLE_MISS = 1e-5
+
 # Number of random configurations, and of the best solutions of a round that are starts of the next one.
 _N_CONFIGURATIONS, _N_BEST = 8192, 4
 
@@ -107,9 +111,10 @@ def compensate(
 ) -> Compensation:
     """Solve targets on the calibrated robot and correct them for a controller with the nominal model.
 
-    Each solution is checked by forward kinematics to 1e-9 m and 1e-9 rad. A target is also "near singular" if
-    the inverse solution of the nominal model, continued from the target to the corrected target, ends in
-    another configuration. This check is omitted for redundant arms.
+    Each solution is checked by forward kinematics to 1e-9 m and 1e-9 rad. On the edge of the workspace it
+    may miss the target by 1e-5 rad and 1e-5 of a length typical of the arm, some micrometres. A target is
+    also "near singular" if the inverse solution of the nominal model, continued from the target to the
+    corrected target, ends in another configuration. This check is omitted for redundant arms.
 
     Args:
         nominal: Model of the controller with its base and tool.
@@ -174,7 +179,7 @@ def _with_conditions(
     q[solved], residual_error[solved] = corrected, _pose_error(poses, goals)
     within_limits = np.all((corrected >= chain.lower) & (corrected <= chain.upper), 1)
     status[solved[~within_limits]] = LIMITS
-    status[solved[np.any(residual_error[solved] > REACHED_TOL, 1)]] = OUT
+    status[solved[~_is_negligible(chain, residual_error[solved])]] = OUT
     return q, status, residual_error
 
 
@@ -259,9 +264,11 @@ class _Search:
             tried, _ = wrap_into_limits(self.chain, tried, near[open_targets, None])
             tried, norms = self.solve(self.chain, goals, tried, steps)
             distance = np.linalg.norm((tried - near[open_targets, None]) / scale, axis=2)
-            # Solutions come first, ordered by distance; then the others, ordered by error.
-            is_open = norms > REACHED_TOL
-            order = np.lexsort([np.where(is_open, norms, distance), is_open])[:, :_N_BEST]
+            # Solutions come first, then those with a negligible miss, both ordered by distance; then the
+            # others, ordered by error.
+            is_missed = norms > _NEGLIGIBLE_MISS * length
+            grade = is_missed.astype(int) + (norms > REACHED_TOL)
+            order = np.lexsort([np.where(is_missed, norms, distance), grade])[:, :_N_BEST]
             best[open_targets] = np.take_along_axis(tried, order[..., None], 1)
             best_norm[open_targets] = norms.min(1)
             chosen = best[open_targets, 0]
@@ -269,6 +276,8 @@ class _Search:
             within_limits = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
             accepted = np.all(residual_error[open_targets] <= REACHED_TOL, 1) & within_limits
             q[open_targets[accepted]], status[open_targets[accepted]] = chosen[accepted], OK
+        on_edge = (status == OUT) & _is_negligible(self.chain, residual_error)
+        q[on_edge], status[on_edge] = best[on_edge, 0], OK
         open_targets = np.flatnonzero(status == OUT)
         unlimited = without_rotary_limits(self.chain)
         _, norms = self.solve(unlimited, targets[open_targets], best[open_targets], _ROUNDS[-1][1])
@@ -287,6 +296,11 @@ def _search_points(poses: Array, with_rotations: bool, length: float) -> Array:
         return poses[:, :3, 3]
     # A small rotation by an angle changes a rotation matrix by √2 times the angle (Frobenius norm).
     return np.concatenate([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9) * length / np.sqrt(2)], 1)
+
+
+def _is_negligible(chain: Chain, errors: Array) -> Array:
+    """Return whether distances and angles (m, 2) of tools from targets are negligible, shape (m,)."""
+    return np.all(errors <= _NEGLIGIBLE_MISS * np.array([characteristic_length(chain), 1.0]), 1)
 
 
 def _tool_error(chain: Chain, q: Array, targets: Array) -> Array:
@@ -318,7 +332,8 @@ def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Arra
     uncorrected = replace(nominal, base=calibrated.base, tool=calibrated.tool)
     before, _ = solve_ik(uncorrected, _task_error(uncorrected, targets), q)
     commanded, _ = solve_ik(nominal, pose_task(nominal.poses(q), characteristic_length(nominal)), before)
-    return out | np.any(_tool_error(calibrated, commanded, targets) > REACHED_TOL, 1)
+    reached = calibrated.poses(q) if targets.ndim == 3 else calibrated.poses(q)[:, :3, 3]
+    return out | np.any(_tool_error(calibrated, commanded, reached) > REACHED_TOL, 1)
 
 
 def _min_singular_value(chain: Chain, q: Array, components: slice) -> Array:

@@ -229,6 +229,30 @@ def test_singular_targets_are_marked():
     assert found.status[10:].count("ok") >= 9
 
 
+@pytest.mark.parametrize(("miss", "is_reached"), [(1e-8, True), (1e-6, True), (1e-5, False), (1e-4, False)])
+def test_targets_on_the_edge_of_the_workspace_are_reached_up_to_some_micrometres(miss, is_reached):
+    """The stretched arm points at the targets, which are beyond its tool by the miss."""
+    arm = Chain.from_dh(paper("experiment"))
+    q = np.deg2rad([[-60, -20, 0], [10, 40, 0], [60, 60, 0]])
+    poses = arm.poses(q)
+    found = compensate(arm, arm, poses[:, :3, 3] + miss * poses[:, :3, 0], q)
+    assert found.reached.tolist() == [is_reached] * 3
+    assert found.residual_error[:, 0] == pytest.approx(miss, rel=1e-3)
+    if is_reached:
+        assert found.status == ("near singular",) * 3
+
+
+def test_targets_beyond_a_joint_limit_are_reached_up_to_some_micrometres():
+    table = paper("experiment")
+    upper = np.deg2rad([20.0, 30.0, -40.0])
+    arm = Chain.from_dh(replace(table, lower=-upper - np.pi / 2, upper=upper))
+    beyond = Chain.from_dh(table).poses((upper + np.array([2e-6, 0, 0]))[None])[:, :3, 3]
+    found = compensate(arm, arm, beyond, upper)
+    assert found.status == ("ok",)
+    assert np.all(found.q <= arm.upper)
+    assert 1e-9 < found.residual_error[0, 0] < 2e-6
+
+
 def test_status_distinguishes_limits_from_reach():
     table = replace(paper("experiment"), lower=np.deg2rad([-90, -90, -150]), upper=np.deg2rad([90, 90, -5]))
     arm = Chain.from_dh(table)

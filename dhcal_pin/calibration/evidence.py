@@ -272,7 +272,7 @@ class Evidence(FittedModel):
         if (region := self.measured_region) is not None:
             drawn = region.draw(np.random.default_rng(0), N_PREDICTED)
             q = np.clip(drawn, self.chain.lower, self.chain.upper)
-        return best_frames_std(self.uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
+        return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
 
     @property
     def measured_region(self) -> MeasuredRegion | None:

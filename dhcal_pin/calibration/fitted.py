@@ -33,8 +33,9 @@ from ..estimation.bare_geometry import BareGeometry
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.frame_gauge import separate_frames
 from ..estimation.information import Information, Samples
+from ..estimation.parameters import redundant
 from ..estimation.problem import Problem, UnfactoredSystem, linearize_and_factor
-from ..estimation.qr import TriangularSystem
+from ..estimation.qr import TriangularSystem, merge_r_factors
 from ..estimation.solver import SolverResult
 from ..estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, ModelFit, Prediction, Uncertainty
 from ..identifiability import observability
@@ -335,19 +336,23 @@ class FittedModel:
     @cached_property
     def _scaled_sqrt_covariance(self) -> tuple[Array, Array]:
         """As `_sqrt_covariance`, with the sigmas scaled and the error of shrinkage as a further column."""
-        root, unbounded = self._sqrt_covariance
-        scale, system = self._sigma_scale, self.solution.system
-        if np.isnan(scale) or scale == 1:
-            root = root * scale
-        else:
-            # Scale the measured rows only; priors are not measurements.
-            scaled = system.scaled(1 / max(scale, MIN_SCALE))
-            root, unbounded = scaled.sqrt_covariance(self.problem.weights)
-        # The variance of correlated residuals counts T times against the priors.
-        root = root * np.sqrt(self.problem.temperature)
+        root, unbounded = self._scaled_root(self.solution.system, self.problem.weights)
         # The part of the correction that was not applied is an error of its own.
         not_applied = (self.solution.x - self.x)[:, None]
         return (np.concatenate([root, not_applied], 1) if self.shrinkage_factor < 1 else root), unbounded
+
+    def _scaled_root(self, system: TriangularSystem, weights: Array) -> tuple[Array, Array]:
+        """Return the square root of the covariance with a system and priors, and unbounded directions."""
+        scale = self._sigma_scale
+        if np.isnan(scale) or scale == 1:
+            is_own = system is self.solution.system
+            root, unbounded = self._sqrt_covariance if is_own else system.sqrt_covariance(weights)
+            root = root * scale
+        else:
+            # Scale the measured rows only; priors are not measurements.
+            root, unbounded = system.scaled(1 / max(scale, MIN_SCALE)).sqrt_covariance(weights)
+        # The variance of correlated residuals counts T times against the priors.
+        return root * np.sqrt(self.problem.temperature), unbounded
 
     @cached_property
     def covariance(self) -> Array:
@@ -403,6 +408,49 @@ class FittedModel:
         undetermined = Uncertainty.from_errors(errors, x, self.chain, null_space, null_space[:, :0])
         q, _ = different_configurations(self.inliers)
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
+
+    @property
+    def _complete_uncertainty(self) -> Uncertainty:
+        """Uncertainty with the errors, too, that the minimal set leaves out because others imitate them.
+
+        Where nothing is measured, their variances add to those of the others.
+        """
+        errors = replace(self.errors, chain=self.chain)
+        left_out = redundant(errors)
+        if not left_out or len(self.x) > MAX_COLUMNS or errors.undetermined:
+            return self.uncertainty
+        robot, n, count = len(errors.parameters), len(self.x), len(left_out)
+        alone = ErrorModel(self.chain, ()).with_parameters(left_out)
+        imitated = Uncertainty.from_errors(
+            alone, np.zeros(count), self.chain, np.eye(count), np.empty((count, 0))
+        )
+        # Errors of the model with the same effects, (p, c).
+        same = np.zeros((n, count))
+        same[:robot] = errors.priors[:, None] * imitated.of_parameters(errors, errors.priors)[0]
+        # Priors that grew with the measurements contain these errors already.
+        weights = np.append(self.problem.weights, [self._prior_weight_like(p) for p in alone.parameters])
+        rows = self.solution.system.rows
+        columns = np.concatenate([rows[:, :-1], rows[:, :-1] @ same, rows[:, -1:]], 1)
+        system = TriangularSystem(merge_r_factors([columns, np.zeros((count, columns.shape[1]))]))
+        parts = (part[:n] + same @ part[n:] for part in self._scaled_root(system, weights))
+        root, unbounded = (part[:robot] for part in parts)
+        not_applied = (self.solution.x - self.x)[:robot, None]
+        scale = self.extension.prediction_scale if self.extension else 1.0
+        root = scale * np.concatenate([root, not_applied], 1)
+        return Uncertainty.from_errors(self.errors, self.x[:robot], self.chain, root, unbounded)
+
+    def _prior_weight_like(self, parameter: ErrorParameter) -> float:
+        """Return the prior weight of a further error: that of errors of its unit, at least their default."""
+        members = [
+            i
+            for i, p in enumerate(self.errors.parameters)
+            if p.unit == parameter.unit and p.coefficient_index is None and self.errors.is_of_arm[i]
+        ]
+        if not members:
+            return np.sqrt(self.problem.temperature) / parameter.prior
+        weight = float(np.median(self.problem.weights[members]))
+        default = np.sqrt(self.problem.temperature) / float(np.median(self.errors.priors[members]))
+        return max(weight, default) if weight else 0.0
 
     @property
     def _model_fit(self) -> ModelFit:

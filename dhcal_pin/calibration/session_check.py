@@ -45,6 +45,8 @@ MIN_GROSS_RATIO = 10.0
 MAX_GROWTH = 0.01
 # Largest step and drift of the zero of a joint that is believed if the robot does not fit otherwise [rad].
 MAX_ZERO_STEP, MAX_ZERO_DRIFT = np.deg2rad((30.0, 10.0))
+# Angles of zeros that differ by less are the same [rad].
+SAME_ZERO = np.deg2rad(3.0)
 # Largest errors of a robot that is not compared with mistakes, in default standard deviations.
 MAX_WIDTH = 8.0
 
@@ -142,10 +144,19 @@ def _compare_with_mistakes(
     if grows or (as_read.is_certain and _explains_better(as_read, Diagnosis(evidence))):
         return False, as_read
     changed = diagnose_mixups(chain, with_changes, sets, progress)
+    if _is_changed_zero(session, changed):
+        changed = Diagnosis(changed.before)
     if as_read.hypotheses and _explains_better(as_read, changed):
         return False, as_read
     is_impossible = leaves_residuals(evidence) and (turns or _fits_no_robot(chain, evidence))
     return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
+
+
+def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
+    """Return whether the zero of a joint is off by as much as it changed: the file has no mistake."""
+    sizes = [(session.chain.joint_names.index(e.of), e.size) for e in session.events if e.kind == "joint"]
+    offsets = [each.offsets for each in diagnosis.hypotheses]
+    return any(abs(abs(each.get(j, 0.0)) - size) < SAME_ZERO for each in offsets for j, size in sizes)
 
 
 def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:

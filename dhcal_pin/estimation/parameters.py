@@ -183,6 +183,34 @@ def minimal(chain: Chain) -> list[ErrorParameter]:
     return out
 
 
+def redundant(errors: ErrorModel) -> list[ErrorParameter]:
+    """Build the errors of joint origins that the set `minimal` leaves out; none if a model lacks that set.
+
+    Other errors imitate them: those along and about the axis of each joint, and all translations of the axis
+    of a prismatic joint.
+    """
+    chain = errors.chain
+    known = {
+        (p.error_frame, tuple(sign * v for v in p.twist)) for p in errors.parameters for sign in (1.0, -1.0)
+    }
+    if not {p.name for p in minimal(chain)} <= {p.name for p in errors.parameters}:
+        return []
+    out = []
+    for j, (name, axis) in enumerate(zip(chain.moving_joints, chain.axes.tolist(), strict=True)):
+        u, v = chain.axis_frames[j + 1][:3, :2].T.tolist()
+        twists = [
+            ("m", _joint_twist(axis, True), LENGTH_PRIOR),
+            ("rad", _joint_twist(axis, False), ANGLE_PRIOR),
+        ]
+        if chain.prismatic[j]:
+            twists += [("m", _joint_twist(across, True), LENGTH_PRIOR) for across in (u, v)]
+        out += [
+            ErrorParameter(f"{name}.redundant{i}", unit, 0.0, chain.origin_frame(j + 1), twist, prior)
+            for i, (unit, twist, prior) in enumerate(twists)
+        ]
+    return [parameter for parameter in out if (parameter.error_frame, parameter.twist) not in known]
+
+
 def offset(chain: Chain) -> list[ErrorParameter]:
     """Build the offset of each moving joint's zero position."""
     out = []

@@ -18,7 +18,8 @@ and `[tool]`; a CSV file has one row per joint, units in the header, and convent
     upper = 160.0
 
 Both can have `beta`, Hayati's angle. A limit has the unit of the joint: an angle, or a length if it is
-prismatic. Files are written in metres and radians with all digits and read back bit-identical.
+prismatic. The type `continuous` is a revolute joint that turns without end and has no limits. Files are
+written in metres and radians with all digits and read back bit-identical.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from .toml_table import Key, TomlTable
 _UNITS = {"theta": ANGLES, "d": LENGTHS, "a": LENGTHS, "alpha": ANGLES, "beta": ANGLES}
 _REQUIRED = ("theta", "d", "a", "alpha")
 _LIMITS = {"lower": -math.inf, "upper": math.inf}
-_JOINT_TYPES = ("revolute", "prismatic")
+_JOINT_TYPES = ("revolute", "prismatic", "continuous")
 # Header of a CSV file, as an example in messages.
 _CSV_HEADER = "joint,type,theta[deg],d[mm],a[mm],alpha[deg]"
 # Largest entry of a table [m or rad]; a larger one has the wrong unit.
@@ -231,14 +232,22 @@ def _build_table(
                 raise FileFormatError(
                     f"{where}: {key} is {value:g} m or rad, beyond ±{_MAX_ENTRY:g}; check its unit"
                 )
-        if columns["lower"][row] > columns["upper"][row]:
+        limits = columns["lower"][row], columns["upper"][row]
+        if limits[0] > limits[1]:
             raise FileFormatError(f"{where}: lower is above upper; swap them")
+        if columns["type"][row] == "continuous" and np.isfinite(limits).any():
+            raise FileFormatError(
+                f"{where}: a continuous joint has limits; leave them out, or write the type revolute"
+            )
     require_usable_names(columns["name"], source)
-    prismatic = np.array([joint_type == "prismatic" for joint_type in columns["type"]])
+    prismatic, continuous = (
+        np.array([joint_type == kind for joint_type in columns["type"]])
+        for kind in ("prismatic", "continuous")
+    )
     numbers = {key: np.array(columns[key], float) for key in (*_UNITS, *_LIMITS)}
     checked: Convention = "standard" if convention == "standard" else "modified"
     try:
-        return DHTable(checked, tuple(columns["name"]), prismatic, **numbers, **poses)
+        return DHTable(checked, tuple(columns["name"]), prismatic, **numbers, **poses, continuous=continuous)
     except DhcalError as error:
         raise FileFormatError(f"{source}: {error}") from None
 
@@ -258,8 +267,8 @@ def dh_text(table: DHTable, path: PathLike) -> str:
     keys += [key for key in _LIMITS if np.isfinite(getattr(table, key)).any()]
     numbers = np.stack([getattr(table, key) for key in keys], -1).tolist()
     rows: list[_Row] = [
-        (name, "prismatic" if is_prismatic else "revolute", dict(zip(keys, values, strict=True)))
-        for name, is_prismatic, values in zip(table.names, table.prismatic, numbers, strict=True)
+        (name, joint_type, dict(zip(keys, values, strict=True)))
+        for name, joint_type, values in zip(table.names, table.joint_types, numbers, strict=True)
     ]
     return (_csv_text if _is_csv(path) else _toml_text)(table.convention, poses, keys, rows)
 

@@ -351,6 +351,12 @@ class Hypothesis:
     description: str  #: What was mixed up, as a clause.
     change: Change  #: Change that undoes it.
 
+    @property
+    def offsets(self) -> dict[int, float]:
+        """Summands of the joints whose values are changed, by their numbers [rad or m]."""
+        change = self.change
+        return {j: change.offsets[j] for j in change.joints} if isinstance(change, JointChange) else {}
+
     def apply(self, data: Sequence[Measurement]) -> list[Measurement] | None:
         """Undo the mistake in measurements."""
         changed = [self.change.apply(item) for item in data]
@@ -429,13 +435,14 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
     """Undo a mistake in measurements, such as the wrong sign of a joint, or several with + between them."""
-    change = _change_of_size(key)
+    change = _change_of_size(key) or _change_of_zero(chain, key)
     if change is None:
         by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
         if key not in by_key:
-            ends = [at.start() for at in re.finditer(re.escape(_AND), key) if key[: at.start()] in by_key]
-            if ends:
-                return mend(chain, mend(chain, data, key[: ends[0]]), key[ends[0] + len(_AND) :])
+            for at in re.finditer(re.escape(_AND), key):
+                first, rest = key[: at.start()], key[at.end() :]
+                if first in by_key or _change_of_zero(chain, first):
+                    return mend(chain, mend(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
             raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
         change = by_key[key].change
@@ -465,6 +472,32 @@ def _change_of_size(key: str) -> Change | None:
     raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
 
 
+def _change_of_zero(chain: Chain, key: str) -> Change | None:
+    """Return the change `zero:JOINT:ANGLEdeg` of a revolute joint; None for other keys."""
+    found = re.fullmatch(r"zero:(.+):([-+]?[0-9.]+)deg", key)
+    revolute = [
+        name for name, slides in zip(chain.joint_names, chain.is_prismatic, strict=True) if not slides
+    ]
+    if found is None or found[1] not in revolute:
+        return None
+    with suppress(ValueError):
+        return zero_hypothesis(chain, chain.joint_names.index(found[1]), -float(found[2])).change
+    return None
+
+
+def zero_hypothesis(chain: Chain, joint: int, wrong: float) -> Hypothesis:
+    """Return the hypothesis that the zero of a revolute joint is off by an angle [deg]."""
+    name, n = chain.joint_names[joint], chain.n_joints
+    offsets = [np.deg2rad(-wrong) if i == joint else 0.0 for i in range(n)]
+    text = f"the zero of joint {name} is off by {wrong:g} deg"
+    return Hypothesis(f"zero:{name}:{-wrong:+g}deg", text, JointChange.of(n, offsets=offsets))
+
+
+def inner_revolute_joints(chain: Chain) -> list[int]:
+    """Return the numbers of the joints whose zeros base and tool cannot absorb."""
+    return [j for j in range(1, chain.n_joints - 1) if not chain.is_prismatic[j]]
+
+
 def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
     """Yield wrong signs and zeros."""
     n = chain.n_joints
@@ -473,11 +506,8 @@ def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         text = f"the sign of joint {name} is wrong"
         yield Hypothesis(f"sign:{name}", text, JointChange.of(n, signs=signs))
     yield Hypothesis("sign:all", "the signs of all joints are wrong", JointChange.of(n, signs=[-1] * n))
-    for j, name in enumerate(chain.joint_names[1:-1], 1):
-        for wrong in (90, -90, 180) if not chain.is_prismatic[j] else ():
-            offsets = [np.deg2rad(-wrong) if i == j else 0.0 for i in range(n)]
-            text = f"the zero of joint {name} is off by {wrong} deg"
-            yield Hypothesis(f"zero:{name}:{-wrong:+d}deg", text, JointChange.of(n, offsets=offsets))
+    for j, wrong in product(inner_revolute_joints(chain), (90, -90, 180)):
+        yield zero_hypothesis(chain, j, wrong)
 
 
 def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:

@@ -8,6 +8,11 @@ from the measured poses than another one does: undoing a mistake takes its error
 hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits
 the changed samples as it fits ordinary measurements, with errors of ordinary size.
 
+If none is, the angle by which the zero of each joint is off is measured, and each is a hypothesis, too: with
+zeros that are wrong by tens of degrees a robot fits the measurements after a wrong quarter turn as well. A
+measured angle that explains far more than the other hypotheses refutes them, but only a decisive one is
+reported.
+
 If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
 closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
 the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong hypothesis

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._typing import Progress
+from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import Diagnosis, leaves_residuals
@@ -24,7 +24,9 @@ from .hypotheses import (
     OtherNotation,
     RowShift,
     both,
+    inner_revolute_joints,
     list_hypotheses,
+    zero_hypothesis,
 )
 from .misfit import MAX_MISFIT, nominal_misfits
 
@@ -47,6 +49,9 @@ _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 _MIN_PARTS = 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
+# Smallest angle by which the zero of a joint is called wrong, and the steps in which the angle is searched
+# [deg]. Smaller ones are errors of the robot, which the calibration corrects.
+_MIN_ZERO, _ZERO_STEPS = 10.0, (20.0, 4.0, 1.0, 0.2)
 # Phases of the progress.
 SINGLES, PAIRS = "looking for mistakes in the measurements", "looking for pairs of mistakes"
 
@@ -61,6 +66,10 @@ class _Candidate(NamedTuple):
     hypothesis: Hypothesis
     changed: list[Measurement]
     misfit: float  # Misfit of the nominal robot after the change
+
+
+# Logarithm of the evidence with a hypothesis, the hypothesis, and the evidence.
+_Score = tuple[float, Hypothesis, Evidence]
 
 
 class Trial(NamedTuple):
@@ -87,7 +96,7 @@ class Trial(NamedTuple):
             is_new = not any(_are_equal(pair, other) for other in closest)
             if pair.misfit <= largest and len(closest) < _N_CLOSEST_PAIRS and is_new:
                 closest.append(pair)
-        found = _decisive(self, closest, PAIRS)
+        found = _decide(self, _scores(self, closest, PAIRS))
         if found.is_certain:
             return found
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
@@ -97,7 +106,7 @@ class Trial(NamedTuple):
         """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
         counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
         common = [each for each in self.candidates if counts[each.hypothesis.key] >= _MIN_PARTS]
-        return _decisive(self, common, SINGLES, is_partial=True)
+        return _decide(self, _scores(self, common, SINGLES), is_partial=True)
 
     def _changes_of_pairs(self) -> Iterator[_Change]:
         """Yield pairs of mistakes with the samples after both changes."""
@@ -120,9 +129,47 @@ def try_hypotheses(
     candidates = list(_candidates(chain, ((each, _apply(each, samples, neighbourhood)) for each in listed)))
     misfit = float(nominal_misfits(chain, [samples])[0])
     trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before), progress)
-    largest = _largest_misfit(trial)
-    found = _decisive(trial, [each for each in candidates if each.misfit <= largest], SINGLES)
+    scores = _scores(trial, _near(trial, candidates), SINGLES)
+    found = _decide(trial, scores)
+    # The zeros of a hand-built arm are unknown in any case.
+    if not found.is_certain and sets == MANUFACTURED:
+        changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
+        joints = [j for j in inner_revolute_joints(chain) if misfit or j in changed]
+        zeros = _measure_zeros(trial, joints)
+        measured = _decide(trial, [*scores, *_scores(trial, _near(trial, zeros), SINGLES)])
+        if measured.is_certain or set(measured.hypotheses).isdisjoint(found.hypotheses):
+            # An angle that fits far better refutes other hypotheses, even if it is not certain itself.
+            found = measured if measured.is_certain else Diagnosis(before)
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
+
+
+def _near(trial: Trial, candidates: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return the hypotheses that do not leave the nominal robot much farther away than others do."""
+    largest = _largest_misfit(trial, candidates)
+    return [each for each in candidates if each.misfit <= largest]
+
+
+def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
+    """Return, for the zero of each joint, the angle with which the robot fits the samples best."""
+    out, known = [], {each.hypothesis.key for each in trial.candidates}
+    for joint in joints:
+        best, reach = 0.0, 180.0
+        for step in _ZERO_STEPS:
+            angles = np.arange(best - reach, best + reach, step).round(1).tolist()
+            zeros = [zero_hypothesis(trial.chain, joint, angle) for angle in angles]
+            costs = _costs(trial, [zero.apply(trial.samples) or trial.samples for zero in zeros])
+            best, reach = angles[int(np.argmin(costs))], step
+        zero = zero_hypothesis(trial.chain, joint, best)
+        if abs(best) >= _MIN_ZERO and zero.key not in known:
+            out += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
+    return out
+
+
+def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
+    """Return the misfits of variants of the samples, or without positions their negative evidence."""
+    if trial.misfit:
+        return nominal_misfits(trial.chain, variants)
+    return np.array([-fit_evidence(trial.chain, each, trial.sets).log for each in variants])
 
 
 def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:
@@ -195,19 +242,22 @@ def _are_equal(first: _Candidate, second: _Candidate) -> bool:
     return all(a.shape == b.shape and np.allclose(a, b, 0, _TOLERANCE) for a, b in zip(one, two, strict=True))
 
 
-def _decisive(
-    trial: Trial, candidates: Sequence[_Candidate], phase: str, is_partial: bool = False
-) -> Diagnosis:
-    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change.
-
-    If something else is wrong, too (`is_partial`), no robot needs to fit.
-    """
+def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[_Score]:
+    """Compute the evidence of the samples after the change of each hypothesis."""
     scored = []
     for step, (hypothesis, changed, _) in enumerate(candidates, 1):
         trial.progress(phase, step, len(candidates))
         after = fit_evidence(trial.chain, changed, trial.sets)
         log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
         scored.append((log, hypothesis, after))
+    return scored
+
+
+def _decide(trial: Trial, scored: Sequence[_Score], is_partial: bool = False) -> Diagnosis:
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change.
+
+    If something else is wrong, too (`is_partial`), no robot needs to fit.
+    """
     best = max((log for log, _, _ in scored), default=-np.inf)
     ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
     ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]

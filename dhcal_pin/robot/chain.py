@@ -838,7 +838,7 @@ def extract_dh_table(chain: Chain, convention: Convention = "standard", hayati: 
         )
     from .dh_extraction import extract_dh  # lazy import: only for DH tables
 
-    return extract_dh(
+    extraction = extract_dh(
         chain.link_transforms,
         chain.joint_names,
         chain.prismatic,
@@ -847,3 +847,5 @@ def extract_dh_table(chain: Chain, convention: Convention = "standard", hayati: 
         convention,
         hayati,
     )
+    continuous = np.array([chain.urdf.joint(name).type == "continuous" for name in chain.joint_names])
+    return replace(extraction, table=replace(extraction.table, continuous=continuous))

@@ -64,6 +64,7 @@ class DHTable:
         upper: Upper joint limits, shape (n,) [rad or m]; inf if there is none.
         base: Pose of frame 0 of the table in the base frame of the robot, shape (4, 4) [m].
         tool: Pose of the tool in the last frame of the table, shape (4, 4) [m].
+        continuous: True for revolute joints that turn without end, shape (n,); by default none.
     """
 
     convention: Convention
@@ -78,6 +79,7 @@ class DHTable:
     upper: Array
     base: Array = field(default_factory=lambda: np.eye(4))
     tool: Array = field(default_factory=lambda: np.eye(4))
+    continuous: Array = field(default_factory=lambda: np.array(False))
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -91,6 +93,7 @@ class DHTable:
             raise InvalidArgumentError(
                 f"a joint name occurs twice in {', '.join(self.names)}; expected unique names"
             )
+        object.__setattr__(self, "continuous", np.broadcast_to(np.asarray(self.continuous, bool), n))
         for key in ("theta", "d", "a", "alpha", "beta", "lower", "upper", "prismatic"):
             value = np.asarray(getattr(self, key), bool if key == "prismatic" else float)
             if value.shape != (n,):
@@ -105,6 +108,13 @@ class DHTable:
     def n_joints(self) -> int:
         """Number of joints n."""
         return len(self.names)
+
+    @property
+    def joint_types(self) -> list[str]:
+        """Type of each joint as in a URDF: "revolute", "prismatic" or "continuous"."""
+        return np.where(
+            self.prismatic, "prismatic", np.where(self.continuous, "continuous", "revolute")
+        ).tolist()
 
     def rows(self, q: Array) -> Array:
         """Compute the link transforms A_i, shape (m, n, 4, 4) (equation 1 of the paper)."""

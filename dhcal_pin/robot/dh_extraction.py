@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -204,7 +204,8 @@ def normalize_offsets(table: DHTable) -> DHTable:
     before, after = (np.linalg.norm(chain[:, :3, 3], axis=1).sum() for chain in (origins, moved))
     if after > SHORTER_RATIO * before:
         return table
-    return extract_dh(moved, table.names, table.prismatic, table.lower, table.upper, table.convention).table
+    extraction = extract_dh(moved, table.names, table.prismatic, table.lower, table.upper, table.convention)
+    return replace(extraction.table, continuous=table.continuous)
 
 
 def _base_transform(

@@ -51,8 +51,8 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     The links are base_link, link_1 … link_n and tool0. Joint i is ``table.names[i-1]``, with parent
     link_{i-1}, child link_i, axis z and the origin ``table.origins()[i-1]``. A fixed joint `tool` (or tool_2,
     tool_3, … if the name is used) contains the last origin. Large offsets that only cancel each other are
-    removed first. Revolute joints without limits get ±2π and prismatic ones ±10 m. The drawing uses primitive
-    shapes only.
+    removed first. Continuous joints have no limits; other joints without limits get ±2π or, if prismatic,
+    ±10 m. The drawing uses primitive shapes only.
 
     Args:
         table: DH table.
@@ -68,9 +68,7 @@ def dh_to_urdf(table: DHTable, name: str) -> str:
     links = ["base_link", *(f"link_{i + 1}" for i in range(table.n_joints)), "tool0"]
     lines = ['<?xml version="1.0"?>', *_preamble(table), f"<robot name={xml_attribute(name)}>", ""]
     for i, joint in enumerate(table.names):
-        lines += _joint(
-            joint, "prismatic" if table.prismatic[i] else "revolute", origins[i], links[i : i + 2]
-        )
+        lines += _joint(joint, table.joint_types[i], origins[i], links[i : i + 2])
         lines += ['    <axis xyz="0 0 1"/>', f"    {_limit(table, i)}", "  </joint>", ""]
     lines += [*_joint(tool_joint, "fixed", origins[-1], links[-2:]), "  </joint>", ""]
     lines += ["  <!-- From here on: what the arm looks like, and token masses. -->", ""]
@@ -152,6 +150,8 @@ def _rpy(rotation: Array) -> Array:
 
 def _limit(table: DHTable, i: int) -> str:
     """Write the limits of joint i; a missing limit is one span beyond the other limit or zero."""
+    if table.continuous[i]:
+        return '<limit effort="100.0" velocity="3.0"/>'
     lower, upper = float(table.lower[i]), float(table.upper[i])
     span = PRISMATIC_SPAN if table.prismatic[i] else REVOLUTE_SPAN
     low = lower if np.isfinite(lower) else min(upper, 0.0) - span

@@ -9,11 +9,11 @@ import re
 
 import numpy as np
 import pytest
-from sessions import NOISE, Simulation
+from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
-from dhcal_pin.measurements import Pose, Position, PositionComponents, SphereContact
+from dhcal_pin.measurements import Inclination, Pose, Position, PositionComponents, SphereContact
 
 REASON = "The measurements show only a part of the position: errors of positions of about"
 
@@ -52,6 +52,13 @@ def touches(simulation, n_spheres=1):
     ]
 
 
+def inclinations(simulation):
+    """Return the directions of gravity in a sensor on the tip."""
+    up = np.array([pose.rotation[2] for pose in simulation.poses(simulation.q)])
+    up += simulation.rng.normal(0, ANGLE_NOISE, up.shape)
+    return [Inclination.from_acceleration(simulation.q, up)]
+
+
 @pytest.mark.parametrize("measure", [heights, touches])
 def test_errors_of_positions_that_residuals_do_not_show_are_stated(measure):
     simulation = Simulation("ur10", 100, 0)
@@ -78,7 +85,7 @@ def true_error(simulation, fit):
 def test_predicted_errors_are_those_of_many_arms(measure):
     """No position error is far above the residual without a caution."""
     ratios = []
-    for seed in range(8):
+    for seed in range(24):
         simulation = Simulation("ur10", 100, seed)
         fit = calibrate(simulation.chain, measure(simulation), extend="none", session="off")
         true = true_error(simulation, fit)
@@ -86,6 +93,29 @@ def test_predicted_errors_are_those_of_many_arms(measure):
         (after,) = fit.comparisons[0].after.groups.values()
         assert fit.verdict.status == "caution" or true < 2.5 * after.rms
     assert 0.5 < np.median(ratios) < 2.0
+
+
+@pytest.mark.parametrize("arm", some_slow(["ur10", "panda"], {0}))
+def test_predicted_errors_contain_those_that_the_minimal_set_leaves_out(arm):
+    """The set `placement` has all errors of the joint origins."""
+    found = []
+    for parameters in ("minimal,base,tool", "placement,base,tool"):
+        simulation = Simulation(arm, 100, 0)
+        fit = calibrate(simulation.chain, inclinations(simulation), parameters, extend="none", session="off")
+        found.append(fit.position_std)
+    assert found[0] == pytest.approx(found[1], rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm", ["ur10", "panda"])
+def test_predicted_errors_of_inclinations_are_those_of_many_arms(arm):
+    errors = []
+    for seed in range(16):
+        simulation = Simulation(arm, 100, seed)
+        fit = calibrate(simulation.chain, inclinations(simulation), extend="none", session="off")
+        errors.append((fit.position_std, true_error(simulation, fit)))
+    predicted, true = np.sqrt(np.mean(np.square(errors), 0))
+    assert 0.8 < predicted / true < 1.25
 
 
 SETUPS = {

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from command_line import assert_same_poses, stdout_of
 from robots import URDF
@@ -63,6 +64,22 @@ def test_conversion_to_the_same_convention_is_exact(run, robot_folder):
     table = read_dh("arm.dh.toml")
     stdout_of(run("convert", "arm.dh.toml", "s.dh.csv", "--convention", "standard"))
     assert read_dh("s.dh.csv").alpha.tolist() == table.alpha.tolist()
+
+
+@pytest.mark.parametrize("table", ["c.dh.toml", "c.dh.csv"])
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_joint_types_survive_a_dh_file(run, robot_folder, table, convention):
+    text = Path("arm.urdf").read_text()
+    Path("c.urdf").write_text(
+        re.sub("<limit.*?/>", "", text.replace('"revolute"', '"continuous"', 1), count=1)
+    )
+    stdout_of(run("convert", "c.urdf", table, "--convention", convention))
+    stdout_of(run("convert", table, "d.urdf"))
+    model = pin.buildModelFromUrdf("d.urdf")
+    assert [joint.shortname() for joint in model.joints][1:] == [
+        "JointModelRUBZ", "JointModelRZ", "JointModelRZ"
+    ]  # fmt: skip
+    assert_same_poses("c.urdf", "d.urdf")
 
 
 def test_sidecar_is_noted(run, robot_folder):

@@ -75,14 +75,19 @@ def tables():
         names = draw(st.lists(st.text(letters, min_size=1), min_size=n, max_size=n, unique=True))
         sides = [[draw(limit) for _ in range(n)] for _ in range(2)]
         frame = st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6).map(se3.exp6)
+        types = draw(
+            st.lists(st.sampled_from(("revolute", "prismatic", "continuous")), min_size=n, max_size=n)
+        )
+        is_continuous = np.array(types) == "continuous"
         return DHTable(
             draw(st.sampled_from(("standard", "modified"))),
             tuple(names),
-            np.array(draw(st.lists(st.booleans(), min_size=n, max_size=n))),
+            np.array(types) == "prismatic",
+            continuous=is_continuous,
             **{key: draw(column) for key in ("theta", "d", "a", "alpha")},
             beta=draw(st.one_of(st.just(np.zeros(n)), column)),
-            lower=np.array([-np.inf if x is None else -x for x in sides[0]]),
-            upper=np.array([np.inf if x is None else x for x in sides[1]]),
+            lower=np.where(is_continuous, -np.inf, [-np.inf if x is None else -x for x in sides[0]]),
+            upper=np.where(is_continuous, np.inf, [np.inf if x is None else x for x in sides[1]]),
             **{key: draw(st.one_of(st.just(np.eye(4)), frame)) for key in ("base", "tool")},
         )
 
@@ -96,7 +101,7 @@ def test_written_files_read_back_bit_identical(tmp_path_factory, table):
     for name in ("arm.dh.toml", "arm.dh.csv"):
         again = read_dh(write(folder, name, dh_text(table, folder / name)))
         assert (again.convention, again.names) == (table.convention, table.names)
-        assert again.prismatic.tolist() == table.prismatic.tolist()
+        assert again.joint_types == table.joint_types
         for key in TABLE:
             assert getattr(again, key).tolist() == getattr(table, key).tolist(), key
         for key in ("base", "tool"):
@@ -136,6 +141,7 @@ def change(old: str, new: str) -> tuple[str, str]:
         (change("upper = 0.0", "upper = nan"), ["'lift'", "upper = nan", "finite"]),
         (change("upper = 0.0", "upper = -300.0"), ["'lift'", "lower is above upper", "swap"]),
         (change('"prismatic"', '"linear"'), ["'lift'", "'linear'", '"revolute", "prismatic"']),
+        (change('"prismatic"', '"continuous"'), ["'lift'", "continuous joint has limits", "revolute"]),
         (change('name = "lift"', 'name = "shoulder"'), ["occurs twice", "shoulder"]),
         (change('name = "lift"', "name = 3"), ["3", "quotes"]),
         (change('name = "lift"', 'name = "a,b"'), ["'a,b'", "rename"]),

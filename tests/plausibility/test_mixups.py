@@ -12,6 +12,7 @@ from slow_cases import some_slow
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.exceptions import UnknownNameError
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
@@ -86,6 +87,33 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
     assert f"--mend {key}" in found.remedy
     np.testing.assert_allclose(mend(ur10, wrong, key).q, data.q, atol=1e-12)
     assert not diagnose_mixups(ur10, [data]).is_suspicious
+
+
+@pytest.mark.parametrize(
+    ("kind", "joint", "degrees"),
+    some_slow([(Pose, 2, -60), (Position, 3, 50), (Wires, 1, 75), (Pose, 4, 20), (Position, 1, -70)], {0, 2}),
+)
+def test_the_zero_of_a_joint_is_off_by_a_measured_angle(ur10, kind, joint, degrees):
+    """A robot with large errors fits the measurements after a wrong quarter turn, too."""
+    data = measured(kind)
+    wrong = with_joints(data, shifted(joint, degrees))
+    found = diagnose_mixups(ur10, [wrong])
+    (hypothesis,) = found.hypotheses
+    assert found.is_certain
+    mended = mend(ur10, wrong, hypothesis.key)
+    difference = np.rad2deg(mended.configurations() - data.configurations())
+    # The robot has errors of 4 mrad.
+    assert np.abs(difference).max() < 1.0
+    assert not np.delete(difference, joint, 1).any()
+
+
+def test_zeros_of_any_angle_are_mended_beside_other_mistakes(ur10):
+    data = measured(Pose)
+    wrong = with_joints(with_joints(data, flipped(0)), shifted(2, 12.5))
+    mended = mend(ur10, wrong, "zero:elbow_joint:-12.5deg+sign:shoulder_pan_joint")
+    np.testing.assert_allclose(mended.q, data.q, atol=1e-12)
+    with pytest.raises(UnknownNameError, match="unknown change"):
+        mend(ur10, wrong, "zero:elbow:-12.5deg")
 
 
 def with_rotations(data, change):

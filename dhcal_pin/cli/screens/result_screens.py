@@ -396,7 +396,7 @@ def compensation_screen(
     files: Iterable[object],
 ) -> Screen:
     """Describe how many targets have which status, and the lines of those that are not corrected exactly."""
-    from ...compensation import OTHER, SINGULAR  # lazy import: only this command needs it
+    from ...robot.inverse_kinematics import REACHED_TOL  # lazy import: only this command needs it
 
     counts, lines = [], []
     for status in dict.fromkeys(result.status):
@@ -412,7 +412,7 @@ def compensation_screen(
             continue
         items = [
             f"  line {targets.lines[row]}"
-            if status in (SINGULAR, OTHER)
+            if np.all(result.residual_error[row] <= REACHED_TOL)
             else f"  line {targets.lines[row]} ({_distance(result.residual_error[row])} away)"
             for row in rows
         ]
