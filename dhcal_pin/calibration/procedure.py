@@ -43,6 +43,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..formatting import join_names
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
+from ..measurements.camera import with_shown_entries
 from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import workspace_radius
@@ -196,6 +197,8 @@ def calibrate(
     }
     exchanges: Sequence[cameras.Exchange] = ()
     if has_images(data):
+        shown = with_shown_entries((*data, *holdout))
+        data, holdout = shown[: len(data)], shown[len(data) :]
         data, exchanges = cameras.exchange_axes(chain, data)
         holdout = cameras.reorder(holdout, exchanges)
     known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}

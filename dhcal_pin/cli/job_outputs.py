@@ -189,7 +189,8 @@ def _camera_frames(
     from ..robot.chain import Chain
     from ..robot.urdf import parse_urdf
 
-    assert fit.rig is not None
+    if fit.rig is None:
+        raise InvalidArgumentError("no camera has a known pose: no image was fitted; leave out its outputs")
     root, base = ("world", np.eye(4)) if has_world else (fit.chain.root, fit.chain.base)
     written = Chain.from_urdf(parse_urdf(urdf, output), fit.chain.tip, root)
     _, tool = joint_origins(fit.chain)

@@ -21,7 +21,7 @@ covariance is I + A·Aᵀ, and residuals and Jacobians are multiplied by its inv
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -282,9 +282,9 @@ class CameraCorners(Measurement):
             return kind
         return "intrinsics" if kind == "camera" else POINTS_SET
 
-    def solved_rig(self, values: Mapping[str, float]) -> MountedRig:
-        """Return the rig with estimated poses, lenses and corners."""
-        u = np.array([values[p.name] for p in self.instrument_parameters])
+    def solved_rig(self, values: Mapping[str, float]) -> MountedRig | None:
+        """Return the rig with estimated poses, lenses and corners, without entries that no image shows."""
+        u = np.array([values.get(p.name, p.nominal) for p in self.instrument_parameters])
         parts = self._split(u)
         poses = [[se3.transform(se3.exp3(part[3:6]), part[:3]) for part in group] for group in parts]
         lenses, points = self.lens_values(u), self.points(u)
@@ -301,7 +301,22 @@ class CameraCorners(Measurement):
             )
             for board, pose, corners in zip(self.rig.boards, poses[1], points, strict=True)
         )
-        return replace(self.rig, cameras=cameras, boards=boards)
+        shown = [
+            [i for i, entry in enumerate(entries) if f"{kind}_{entry.name}.x" in values]
+            for kind, entries in (("camera", cameras), ("board", boards))
+        ]
+        return replace(self.rig, cameras=cameras, boards=boards).take(*shown) if all(shown) else None
+
+    def with_entries(self, cameras: Collection[str], boards: Collection[str]) -> Self:
+        """Return a copy whose rig has some of its cameras and boards only; the images show no others."""
+        of_cameras, of_boards = (
+            [i for i, entry in enumerate(entries) if entry.name in names]
+            for entries, names in ((self.rig.cameras, cameras), (self.rig.boards, boards))
+        )
+        kept = self.with_rig(self.rig.take(of_cameras, of_boards))
+        return kept.replace(
+            camera=np.searchsorted(of_cameras, self.camera), board=np.searchsorted(of_boards, self.board)
+        )
 
     @property
     def has_jitter(self) -> bool:
@@ -686,12 +701,26 @@ def exp_and_jacobian(rotvec: Array) -> tuple[Array, Array]:
     return np.eye(3) + first * k + second * square, np.eye(3) + second * k + third * square
 
 
+def with_shown_entries(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
+    """Return measurements whose rigs have the cameras and boards that any of their images shows."""
+    images = [item for item in data if isinstance(item, CameraCorners)]
+    cameras = {item.rig.cameras[i].name for item in images for i in np.unique(item.camera)}
+    boards = {item.rig.boards[i].name for item in images for i in np.unique(item.board)}
+    return tuple(
+        item.with_entries(cameras, boards) if isinstance(item, CameraCorners) else item for item in data
+    )
+
+
 def _solve_symmetric(matrices: Array, right: Array) -> Array:
-    """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2)."""
+    """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2).
+
+    The solution is NaN for a matrix of zeros, such as that of a corner behind the camera.
+    """
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     determinant = np.maximum(a * c - b * b, np.finfo(float).eps * a * c)
     x, y = right.T
-    return np.stack([c * x - b * y, a * y - b * x], 1) / determinant[:, None]
+    numerators, is_known = np.stack([c * x - b * y, a * y - b * x], 1), determinant[:, None] > 0
+    return np.divide(numerators, determinant[:, None], np.full_like(numerators, np.nan), where=is_known)
 
 
 def _samples_of(numbers: Array, number: int) -> slice | Array:

@@ -6,6 +6,7 @@ them, directly or by a link that no joint moves against it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,16 @@ class MountedRig:
             self,
             camera_mounts=(board,) * len(self.cameras),
             board_mounts=(camera,) * len(self.boards),
+        )
+
+    def take(self, cameras: Sequence[int], boards: Sequence[int]) -> MountedRig:
+        """Return the rig with some of its cameras and boards, given by their numbers."""
+        return replace(
+            self,
+            cameras=tuple(self.cameras[i] for i in cameras),
+            boards=tuple(self.boards[i] for i in boards),
+            camera_mounts=tuple(self.camera_mounts[i] for i in cameras),
+            board_mounts=tuple(self.board_mounts[i] for i in boards),
         )
 
     def camera_in_end(self, camera: int) -> Array:

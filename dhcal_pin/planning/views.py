@@ -167,7 +167,15 @@ def with_measured_poses(rig: MountedRig, chain: Chain, data: Sequence[Measuremen
     if not images or (is_known and all(camera.has_intrinsics for camera in rig.cameras)):
         return rig
     fit = calibrate(chain, images, "camera,board,intrinsics", extend="none")
-    return fit.rig or rig
+    if fit.rig is None:
+        return rig
+    cameras = {entry.name: entry for entry in fit.rig.cameras}
+    boards = {entry.name: entry for entry in fit.rig.boards}
+    return replace(
+        rig,
+        cameras=tuple(cameras.get(entry.name, entry) for entry in rig.cameras),
+        boards=tuple(boards.get(entry.name, entry) for entry in rig.boards),
+    )
 
 
 def with_typical_lenses(rig: MountedRig) -> MountedRig:

@@ -52,8 +52,11 @@ def accuracy_figures(context: ReportContext) -> list[FigureGroup]:
         if data
     }
     for group in in_order(set().union(*(after for _, after in norms.values()))):
+        # Without a fitted image the pose of the camera is not known, nor the error at the board.
         roles = {
-            role: (before[group], after[group]) for role, (before, after) in norms.items() if group in after
+            role: (before[group], after[group])
+            for role, (before, after) in norms.items()
+            if group in after and np.isfinite(after[group]).all()
         }
         panels += histogram_panels(group, roles)
     legend = [LegendEntry(state, state, "area") for state in ("before", "after")]

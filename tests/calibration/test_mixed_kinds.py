@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from camera_setups import ARMS, simulate
 from scipy.stats import chi2, norm
 from slow_cases import some_slow
 
@@ -25,6 +26,7 @@ from dhcal_pin.estimation.initialization import make_problem, subsample
 from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
+from dhcal_pin.report import write_report
 from dhcal_pin.se3 import exp6
 
 # Known distances between points need contacts with these points: see `test_kinds`.
@@ -103,6 +105,48 @@ def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
     result = calibrate(sim_6dof, images, "camera,board")
     assert result.converged
     assert result.comparisons[-1].after["residual_rms"] < 0.3
+
+
+@pytest.mark.parametrize("has_pose", [False, True])
+def test_cameras_and_boards_that_no_image_shows_change_nothing(has_pose):
+    rng = np.random.default_rng(7)
+    chain = ARMS["paper"]()
+    images = simulate(chain, small_errors(chain, rng), rng, is_on_wrist=True, n_images=20, sigma=0.2).images
+    expected, rig = calibrate(chain, images), images.rig
+    place = exp6(np.full(6, 0.3)) if has_pose else None
+    spare = [replace(entry, name="spare", pose=place) for entry in (rig.cameras[0], rig.boards[0])]
+    more = replace(
+        rig,
+        cameras=(spare[0], *rig.cameras),
+        boards=(*rig.boards, spare[1]),
+        camera_mounts=(rig.camera_mounts[0], *rig.camera_mounts),
+        board_mounts=(*rig.board_mounts, rig.board_mounts[0]),
+    )
+    of_camera, of_board = [rig.cameras[0].name] * len(images.q), [rig.boards[0].name] * len(images.q)
+    parts = images.q, images.values, images.corner, more, of_camera, of_board
+    found = calibrate(chain, CameraCorners(*parts))
+    assert found.verdict == expected.verdict
+    assert found.hand_eye_std == pytest.approx(expected.hand_eye_std)
+    for name, value in expected.instruments.items():
+        assert found.instruments[name] == pytest.approx(value, abs=1e-6)
+    assert [entry.name for entry in (*found.rig.cameras, *found.rig.boards)] == [
+        entry.name for entry in (*rig.cameras, *rig.boards)
+    ]
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_of_positions_is_named_beside_images(tmp_path):
+    """The images do not fit the robot of these positions, so that no pose of the camera is known."""
+    rng = np.random.default_rng(8)
+    chain = ARMS["paper"]()
+    truth = small_errors(chain, rng)
+    images = simulate(chain, truth, rng, is_on_wrist=True, n_images=8, sigma=0.2).images
+    positions = KINDS["position"].simulate(truth, rng.uniform(-1.5, 1.5, (30, 6)), Noise(5e-5), rng)
+    q = positions.q * np.where(np.arange(6) == 2, -1, 1)
+    fit = calibrate(chain, [positions.replace(q=q), images], session="off")
+    assert fit.verdict.status == "refused"
+    assert "sign of joint joint_3 is wrong" in fit.verdict.reasons[0]
+    write_report(fit, tmp_path / "report.html")
 
 
 def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):
