@@ -14,7 +14,14 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence, find_shift
+from dhcal_pin.calibration.cameras.causes import (
+    Causes,
+    HandEyeData,
+    apply_causes,
+    file_sequence,
+    find_minimum,
+    find_shift,
+)
 from dhcal_pin.calibration.cameras.diagnosis import _lens_text, _without_rigid_motion
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
@@ -323,3 +330,18 @@ def test_a_rigid_motion_does_not_bend_a_board():
     stated = rng.uniform(-0.1, 0.1, (12, 3)) + np.array([0.3, 0.1, 0.2])
     moved = stated @ se3.exp3(np.array([0.2, -0.1, 0.4])).T + [0.5, -0.2, 0.1]
     np.testing.assert_allclose(_without_rigid_motion(moved, stated), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cost", "least"),
+    [
+        (lambda x: (x - 0.3) ** 2, 0.3),
+        (lambda x: (x + 0.02) ** 2, -0.02),
+        (lambda x: np.exp(x) - 1.2 * x, np.log(1.2)),
+        (lambda x: -np.cos(3 * (x - 0.25)), 0.25),
+        (lambda x: abs(x - 0.012), 0.012),
+        (lambda x: np.inf if x > 0.105 else (x - 0.1) ** 2, 0.1),
+    ],
+)
+def test_a_minimum_of_a_function_is_found(cost, least):
+    assert find_minimum(cost, 0.0, 0.01, 0.15) == pytest.approx(least, abs=1e-3)

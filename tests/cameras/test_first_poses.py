@@ -271,7 +271,8 @@ def test_a_flat_board_keeps_its_distances_in_its_plane():
 
 
 @pytest.mark.parametrize(
-    "values", [(0.01, 0.01, 0, 0), (1, 1e-2, 0, 0), (1, 10, 0, 0), (10, 1, 0, 0), (1, 1, 3, 0), (1, 1, 0, -3)]
+    "values",
+    [(0.01, 0.01, 0, 0), (1, 1e-2, 0, 0), (1, 10, 0, 0), (10, 1, 0, 0), (1, 1, 0.3, 0), (1, 1, 0, -0.2)],
 )
 def test_lenses_that_are_not_built_are_implausible(values):
     assert not _is_plausible(values, 1.0, 0.75)

@@ -201,6 +201,12 @@ def test_paths_of_joints_are_those_of_each_file():
     np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
 
 
+def test_a_thinned_timeline_has_samples_of_all_measurements():
+    data = Simulation("ur10", 30, 1).measure(Position)
+    timeline = order_samples([data.take(np.s_[a : a + 10]) for a in (0, 10, 20)], ())
+    np.testing.assert_array_equal(timeline.thinned(10).fitted_numbers, np.arange(0, 30, 3))
+
+
 @pytest.mark.parametrize("shape", [Drift(2.0, 6.0), Drift(2.0, 6.0, 1.0), FreeDrift(2.0, 6.0)])
 def test_nothing_drifts_before_and_after_a_session(shape):
     begin, before, end, after = shape.values(np.arange(4), np.array([2.0, 0.0, 6.0, 9.0]))
