@@ -222,18 +222,6 @@ def test_a_given_noise_replaces_that_of_the_measurements(kind):
     assert given.expected_rms == pytest.approx(np.sqrt(3) * 3e-4)
 
 
-def test_a_change_is_found_from_the_size_on_that_a_check_reveals():
-    chain, rng = nominal_arm("ur10"), np.random.default_rng(3)
-    q, step = rng.uniform(-2, 2, (10, 6)), 1e-6 * np.eye(6)[1]
-    points = chain.poses(q)[:, :3, 3]
-    lever = np.sqrt(np.mean(np.sum((chain.poses(q + step)[:, :3, 3] - points) ** 2, 1))) / 1e-6
-    found = recheck(chain, [Position(q, points, NOISE)]).hypotheses
-    zero = next(h for h in found if h.of == chain.joint_names[1]).revealed / lever * np.eye(6)[1]
-    for share in (0.3, 1.3):
-        values = chain.poses(q + share * zero)[:, :3, 3] + rng.normal(0, NOISE, points.shape)
-        assert (recheck(chain, [Position(q, values, NOISE)]).log_ratio > 0) == (share > 1)
-
-
 def test_hidden_joints_are_named():
     """The measured point is on the last axis of this arm."""
     chain = nominal_arm("ur10")
