@@ -22,7 +22,13 @@ from dhcal_pin.calibration.cameras.causes import (
     find_minimum,
     find_shift,
 )
-from dhcal_pin.calibration.cameras.diagnosis import _lens_text, _without_rigid_motion
+from dhcal_pin.calibration.cameras.diagnosis import (
+    HandEyeDiagnosis,
+    Trial,
+    _lens_text,
+    _without_rigid_motion,
+)
+from dhcal_pin.calibration.cameras.stages import ImageError
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
@@ -257,6 +263,19 @@ def test_four_images_cannot_be_left_out():
     chain, images, _ = faulty_setup("ur10", "nothing", 58, is_on_wrist=True, n_images=20)
     fit = dh.calibrate(chain, images.take(images.image < 4), "camera,board", loss="linear")
     assert fit.hand_eye is None
+
+
+def test_causes_are_stated_in_turn():
+    lens, size = (Trial(name, ImageError(e, 1e-4 * e, 99), f"the {name}", f"Measure the {name}.")
+                  for name, e in (("lens", 4.0), ("size", 0.6)))  # fmt: skip
+    error, noise = ImageError(9.0, 9e-4, 99), ImageError(0.5, 5e-5, 99)
+    found = HandEyeDiagnosis(error, noise, (lens, size), (), (lens,), 0.05, 1e-3, (), "joint values")
+    assert found.likely.startswith(" Likely cause: the lens.")
+    assert " In addition: the size." in found.likely
+    assert found.likely.endswith(" Measure the lens.")
+    assert "displaces the camera by up to 20 mm" in found.image_sentences[0]
+    assert "displaces the camera by metres" in replace(found, rotation=0.0).image_sentences[0]
+    assert replace(found, causes=()).likely.startswith(" No cause that was tried explains it")
 
 
 def test_document_names_the_cause():
