@@ -28,8 +28,11 @@ from dhcal_pin.calibration.cameras.diagnosis import (
     _lens_text,
     _without_rigid_motion,
 )
-from dhcal_pin.calibration.cameras.stages import ImageError
+from dhcal_pin.calibration.cameras.stages import ImageError, held_out_error
+from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
@@ -263,6 +266,22 @@ def test_four_images_cannot_be_left_out():
     chain, images, _ = faulty_setup("ur10", "nothing", 58, is_on_wrist=True, n_images=20)
     fit = dh.calibrate(chain, images.take(images.image < 4), "camera,board", loss="linear")
     assert fit.hand_eye is None
+
+
+def test_one_step_leads_to_the_fit_of_the_other_images():
+    chain, images, _ = faulty_setup("ur10", "nothing", 58, is_on_wrist=True, n_images=8)
+    hand_eye_fit = dh.calibrate(chain, images, "camera,board", loss="linear", session="off").hand_eye_fit
+    assert hand_eye_fit is not None
+    fit, squares = hand_eye_fit.fit, []
+    folds = k_fold(fit.data, 4)
+    for (is_left_out,) in folds:
+        others = fit.problem.with_data([fit.problem.data[0].take(~is_left_out)])
+        known = others.instruments(minimize(others, "lm", fit.solution.x, 30).x)
+        squares.append(compute_errors(chain, [fit.data[0].take(is_left_out)], known)[0]["pixels"] ** 2)
+    expected = np.sqrt(np.concatenate(squares).sum(1).mean())
+    error = held_out_error(fit, folds)
+    assert error is not None
+    assert error.pixels == pytest.approx(expected, rel=0.02)
 
 
 def test_causes_are_stated_in_turn():
