@@ -23,7 +23,7 @@ from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
-from dhcal_pin.session.causes import Drift, FreeDrift, Step
+from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
@@ -172,6 +172,15 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
     fit = search.first_fit
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+
+
+def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
+    search = search_of(Changes())
+    base, tool, *_ = search.layout.blocks
+    for shape, left in ((Drift(0.0, 59.0), {Step, FreeDrift}), (FreeDrift(0.0, 59.0), {Step})):
+        search.causes = [Cause(base, shape, np.zeros(6), np.zeros((6, 6)))]
+        assert {type(shapes[0]) for shapes in search._shapes(base)} == left
+        assert {type(shapes[0]) for shapes in search._shapes(tool)} == {Step, Drift, FreeDrift}
 
 
 @pytest.mark.parametrize("step", [4, 6, 8])
