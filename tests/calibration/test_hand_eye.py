@@ -70,6 +70,9 @@ def check_cause(fit, fault):
     (reason,) = (text for text in fit.verdict.reasons if "Likely cause" in text)
     assert found.causes[0].text in reason
     assert found.causes[0].remedy in reason
+    # A cause that contains the first one is no alternative to it.
+    containing = {"offsets": "arm geometry", "size": "board corners"}.get(fault)
+    assert containing not in [each.cause for each in found.alternatives]
     assert "mm at the board" in reason
 
 
@@ -332,7 +335,7 @@ def test_a_shift_of_flange_poses_is_named():
 def test_shifted_joint_values_lie_between_those_of_two_images():
     chain, images, _ = faulty_setup("ur10", "focal", 27, is_on_wrist=True, n_images=9)
     sequence = file_sequence([images])
-    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, sequence)
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, sequence, False)
     number = np.argmax((images.q[:, None] == sequence).all(-1), 1)
     for shift in (-1.25, -1.0, 0.4, 2.0):
         found = apply_causes(hand_eye, Causes(shift=shift), images)
@@ -348,7 +351,7 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
 def test_images_of_the_row_before_are_paired_again():
     """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
     chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
-    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
     assert find_shift(shifted, Causes()) == -1.0
 
@@ -359,7 +362,7 @@ def test_a_change_of_one_coefficient_is_one_of_the_distortion():
     found = dict(zip(camera.lens.names, camera.values, strict=True))
     found["k1"] += 0.1
     state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
-    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     assert "distortion of camera" in _lens_text(hand_eye, state)[0]
 
 

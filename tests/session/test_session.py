@@ -27,7 +27,7 @@ from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import WIDTHS, _Search
+from dhcal_pin.session.search import TIME_CONSTANTS, WIDTHS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -180,7 +180,9 @@ def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
     for shape, left in ((Drift(0.0, 59.0), {Step, FreeDrift}), (FreeDrift(0.0, 59.0), {Step})):
         search.causes = [Cause(base, shape, np.zeros(6), np.zeros((6, 6)))]
         assert {type(shapes[0]) for shapes in search._shapes(base)} == left
-        assert {type(shapes[0]) for shapes in search._shapes(tool)} == {Step, Drift, FreeDrift}
+        by_type = {type(shapes[0]): shapes for shapes in search._shapes(tool)}
+        assert set(by_type) == {Step, Drift, FreeDrift}
+        assert [each.time_constant / 59 for each in by_type[Drift]] == pytest.approx(TIME_CONSTANTS)
 
 
 @pytest.mark.parametrize("step", [4, 6, 8])
