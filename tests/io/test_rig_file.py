@@ -30,9 +30,9 @@ def test_values_of_the_file(tmp_path):
 
 def test_text_reads_back(tmp_path):
     points = '[board.p]\nlink = "world"\ntype = "points"\npoints_mm = [[0, 0, 1], [2, 0, 0]]\n'
-    one = '[board.o]\nlink = "tip"\ntype = "aprilgrid"\ncolumns = 1\nrows = 1\nmarker_mm = 40\nspacing_mm = 12\n'
     grid = '[board.g]\nlink = "tip"\ntype = "aprilgrid"\ncolumns = 2\nrows = 3\n'
     grid += "marker_mm = 40\nspacing_mm = 12\n"
+    one = grid.replace(".g]", ".o]").replace("= 2\n", "= 1\n").replace("= 3\n", "= 1\n")
     unknown = '[camera.c]\nlink = "world"\nmodel = "fisheye"\nwidth = 64\nheight = 48\n'
     first = read_rig(write(tmp_path / "r.toml", CAMERA + unknown + BOARD_TABLE + points + one + grid))
     text = rig_text(list(first.cameras.values()), list(first.boards.values()))

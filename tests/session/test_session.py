@@ -24,6 +24,7 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
+from dhcal_pin.session.facts import Scale
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
@@ -460,16 +461,20 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
-def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
-    """Computed on a grid of scales and of factors of the errors of the arm."""
+@pytest.mark.parametrize("factor", [1, 20])
+def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(factor):
+    """Computed on a grid of scales and of factors of the errors of the arm, also for noisy measurements."""
     simulation = Simulation("ur10", 100, 6)
     data = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015)))
     fit = calibrate(simulation.chain, data, extend="none", session="off")
     problem, x = fit.problem, fit.solution.x
     arm = [i for i, p in enumerate(problem.errors.parameters) if p.name[:4] not in ("base", "tool")]
+    if factor > 1:
+        problem = problem.with_data([each.with_scaled_sigma({"position": factor}) for each in problem.data])
     noise, change, *both = _responses(problem, x, np.array(arm))
-    root = fit.solution.system.sqrt_covariance(problem.weights)[0][arm]
-    np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
+    if factor == 1:
+        root = fit.solution.system.sqrt_covariance(problem.weights)[0][arm]
+        np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
     scale = find_scale(problem, x)
     assert scale is not None
     grid = scale.factor - 1 + scale.std * np.linspace(-8, 8, 81)
@@ -484,6 +489,11 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
     assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
     assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
+
+
+def test_a_scale_is_stated_in_percent():
+    assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
+    assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
 
 
 def test_a_small_scale_is_found_with_an_accurate_arm():
