@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,12 +120,13 @@ def test_changes_need_images_alone_and_of_one_board():
 def test_images_are_evidence_relative_to_their_noise(monkeypatch, variance):
     """Twenty worse images are, four are not, and one image counts no more than an outlier does."""
     monkeypatch.setattr(image_session, "_image_squares", lambda squares: variance * squares)
+    explains_better: Any = image_session._explains_better
     for worse, is_evidence in (
         (np.full(20, 2.0), True),
         (np.full(4, 2.0), False),
         (np.r_[1e6, np.ones(19)], False),
     ):
-        assert image_session._explains_better(np.ones(len(worse)), worse) == is_evidence
+        assert explains_better(np.ones(len(worse)), worse) == is_evidence
 
 
 def test_play_is_no_change_of_a_joint():
