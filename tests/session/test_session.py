@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -173,6 +174,17 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
     fit = search.first_fit
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+
+
+@pytest.mark.parametrize("changes", [Changes("base", 3e-4), Changes("base", 1e-3, at=None)])
+def test_coefficients_of_the_score_test_are_those_of_a_fit(changes):
+    search = search_of(changes)
+    cause = search.best_cause(search.first_fit)
+    assert cause is not None
+    fit = search.solve(search.rows, [replace(cause, values=0 * cause.values)])
+    expected = fit.step[len(search.x) :]
+    assert cause.block.kind == "base"
+    np.testing.assert_allclose(cause.values, expected, atol=0.2 * np.abs(expected).max())
 
 
 def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
