@@ -354,6 +354,11 @@ def test_images_of_the_row_before_are_paired_again():
     right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
     assert find_shift(shifted, Causes()) == -1.0
+    # Three images are too few to show one.
+    (later,) = shifted.data
+    assert isinstance(later, CameraCorners)
+    few = later.take(np.isin(later.image, np.unique(later.image)[:3]))
+    assert find_shift(replace(shifted, data=(few,), sequence=file_sequence([few])), Causes()) == 0.0
 
 
 def test_a_change_of_one_coefficient_is_one_of_the_distortion():

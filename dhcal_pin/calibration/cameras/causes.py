@@ -216,6 +216,8 @@ def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
 
 def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
     """Find the shift of the joint values that fits the images best."""
+    if len(hand_eye.sequence) < 4:
+        return 0.0
 
     @cache
     def cost(shift: float) -> float:
