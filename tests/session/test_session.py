@@ -503,6 +503,20 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(fact
     assert find_scale(problem, 0.1 * x) is None
 
 
+def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():
+    simulation = Simulation("ur10", 100, 6)
+    data, found = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015))), []
+    for fit in (
+        calibrate(simulation.chain, data, extend="none", session="off"),
+        calibrate(simulation.chain, data, "placement,base,tool", priors="none", extend="none", session="off"),
+    ):
+        scale = find_scale(fit.problem, fit.solution.x)
+        assert scale is not None
+        found.append((scale.factor, scale.std))
+    np.testing.assert_allclose(*found, rtol=1e-2, atol=0)
+    assert found[0][0] == pytest.approx(found[1][0], abs=1e-5)
+
+
 def test_a_scale_is_stated_in_percent():
     assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
     assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
