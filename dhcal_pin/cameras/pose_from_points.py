@@ -99,13 +99,12 @@ def agreeing_points(points: Array, image: Array) -> Array:
     everything = np.ones(len(points), bool)
     if len(points) <= 2 * MIN_POINTS:
         return everything
-    centre = points.mean(0)
-    _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
+    _, extent, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     is_flat = extent[2] <= NEAR_FLATNESS * extent[0]
     least = MIN_POINTS if is_flat else MIN_PROJECTION_POINTS
     if extent[1] <= FLATNESS * extent[0] or len(points) <= 2 * least:
         return everything
-    source = ((points - centre) @ axes.T)[:, : 2 if is_flat else 3]
+    source = (points @ axes.T)[:, : 2 if is_flat else 3]
     ratio = _GOOD_RATIO + (extent[2] / extent[0] if is_flat else 0.0)
     limit = ratio * float(np.median(np.linalg.norm(image - np.median(image, 0), axis=1)))
     if np.sqrt(np.mean(_transfer_distances(source, image, np.arange(len(points))) ** 2)) <= limit:

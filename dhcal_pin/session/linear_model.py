@@ -190,11 +190,8 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         apply_observation_matrix(motions, observation, rows)
         block[: len(bodies)] = rows[: len(bodies)]
         block[layout.joints[0] : layout.lag] = rows[len(bodies) :]
-        for parameter, part in zip(
-            item.instrument_parameters,
-            item.instrument_jacobian(frames, u) if item.instrument_parameters else (),
-            strict=True,
-        ):
+        parts = zip(item.instrument_parameters, item.instrument_jacobian(frames, u), strict=True)
+        for parameter, part in parts:
             if parameter.name in instrument_columns:
                 block[instrument_columns[parameter.name]] = part
     out[layout.lag] = np.einsum("nkm,mn->km", out[layout.joints], rates)

@@ -168,10 +168,8 @@ class _Search:
         n = len(self.numbers)
         edges = np.linspace(0, n, min(n, self.n_cells) + 1).astype(int)
         width = int(np.diff(edges).max())
-        if width > 1:
-            single = [np.arange(max(0, s - 2 * width), min(n, s + 2 * width)) for s in near]
-            edges = np.unique(np.concatenate([edges, *single]))
-        return edges
+        single = [np.arange(max(0, s - 2 * width), min(n, s + 2 * width)) for s in near]
+        return np.unique(np.concatenate([edges, *single]))
 
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:

@@ -14,9 +14,25 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, apply_causes, file_sequence, find_shift
-from dhcal_pin.calibration.cameras.diagnosis import _lens_text, _without_rigid_motion
+from dhcal_pin.calibration.cameras.causes import (
+    Causes,
+    HandEyeData,
+    apply_causes,
+    file_sequence,
+    find_minimum,
+    find_shift,
+)
+from dhcal_pin.calibration.cameras.diagnosis import (
+    HandEyeDiagnosis,
+    Trial,
+    _lens_text,
+    _without_rigid_motion,
+)
+from dhcal_pin.calibration.cameras.stages import ImageError, held_out_error
+from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
@@ -54,6 +70,9 @@ def check_cause(fit, fault):
     (reason,) = (text for text in fit.verdict.reasons if "Likely cause" in text)
     assert found.causes[0].text in reason
     assert found.causes[0].remedy in reason
+    # A cause that contains the first one is no alternative to it.
+    containing = {"offsets": "arm geometry", "size": "board corners"}.get(fault)
+    assert containing not in [each.cause for each in found.alternatives]
     assert "mm at the board" in reason
 
 
@@ -252,6 +271,35 @@ def test_four_images_cannot_be_left_out():
     assert fit.hand_eye is None
 
 
+def test_one_step_leads_to_the_fit_of_the_other_images():
+    chain, images, _ = faulty_setup("ur10", "nothing", 58, is_on_wrist=True, n_images=8)
+    hand_eye_fit = dh.calibrate(chain, images, "camera,board", loss="linear", session="off").hand_eye_fit
+    assert hand_eye_fit is not None
+    fit, squares = hand_eye_fit.fit, []
+    folds = k_fold(fit.data, 4)
+    for (is_left_out,) in folds:
+        others = fit.problem.with_data([fit.problem.data[0].take(~is_left_out)])
+        known = others.instruments(minimize(others, "lm", fit.solution.x, 30).x)
+        squares.append(compute_errors(chain, [fit.data[0].take(is_left_out)], known)[0]["pixels"] ** 2)
+    expected = np.sqrt(np.concatenate(squares).sum(1).mean())
+    error = held_out_error(fit, folds)
+    assert error is not None
+    assert error.pixels == pytest.approx(expected, rel=0.02)
+
+
+def test_causes_are_stated_in_turn():
+    lens, size = (Trial(name, ImageError(e, 1e-4 * e, 99), f"the {name}", f"Measure the {name}.")
+                  for name, e in (("lens", 4.0), ("size", 0.6)))  # fmt: skip
+    error, noise = ImageError(9.0, 9e-4, 99), ImageError(0.5, 5e-5, 99)
+    found = HandEyeDiagnosis(error, noise, (lens, size), (), (lens,), 0.05, 1e-3, (), "joint values")
+    assert found.likely.startswith(" Likely cause: the lens.")
+    assert " In addition: the size." in found.likely
+    assert found.likely.endswith(" Measure the lens.")
+    assert "displaces the camera by up to 20 mm" in found.image_sentences[0]
+    assert "displaces the camera by metres" in replace(found, rotation=0.0).image_sentences[0]
+    assert replace(found, causes=()).likely.startswith(" No cause that was tried explains it")
+
+
 def test_document_names_the_cause():
     fit = hand_eye("ur10", "focal", 59, True, n_images=20)
     document = result_to_dict(fit, {}, {})["hand_eye"]
@@ -287,7 +335,7 @@ def test_a_shift_of_flange_poses_is_named():
 def test_shifted_joint_values_lie_between_those_of_two_images():
     chain, images, _ = faulty_setup("ur10", "focal", 27, is_on_wrist=True, n_images=9)
     sequence = file_sequence([images])
-    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, sequence)
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, sequence, False)
     number = np.argmax((images.q[:, None] == sequence).all(-1), 1)
     for shift in (-1.25, -1.0, 0.4, 2.0):
         found = apply_causes(hand_eye, Causes(shift=shift), images)
@@ -303,9 +351,14 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
 def test_images_of_the_row_before_are_paired_again():
     """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
     chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
-    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
     assert find_shift(shifted, Causes()) == -1.0
+    # Three images are too few to show one.
+    (later,) = shifted.data
+    assert isinstance(later, CameraCorners)
+    few = later.take(np.isin(later.image, np.unique(later.image)[:3]))
+    assert find_shift(replace(shifted, data=(few,), sequence=file_sequence([few])), Causes()) == 0.0
 
 
 def test_a_change_of_one_coefficient_is_one_of_the_distortion():
@@ -314,7 +367,7 @@ def test_a_change_of_one_coefficient_is_one_of_the_distortion():
     found = dict(zip(camera.lens.names, camera.values, strict=True))
     found["k1"] += 0.1
     state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
-    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]))
+    hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     assert "distortion of camera" in _lens_text(hand_eye, state)[0]
 
 
@@ -323,3 +376,18 @@ def test_a_rigid_motion_does_not_bend_a_board():
     stated = rng.uniform(-0.1, 0.1, (12, 3)) + np.array([0.3, 0.1, 0.2])
     moved = stated @ se3.exp3(np.array([0.2, -0.1, 0.4])).T + [0.5, -0.2, 0.1]
     np.testing.assert_allclose(_without_rigid_motion(moved, stated), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cost", "least"),
+    [
+        (lambda x: (x - 0.3) ** 2, 0.3),
+        (lambda x: (x + 0.02) ** 2, -0.02),
+        (lambda x: np.exp(x) - 1.2 * x, np.log(1.2)),
+        (lambda x: -np.cos(3 * (x - 0.25)), 0.25),
+        (lambda x: abs(x - 0.012), 0.012),
+        (lambda x: np.inf if x > 0.105 else (x - 0.1) ** 2, 0.1),
+    ],
+)
+def test_a_minimum_of_a_function_is_found(cost, least):
+    assert find_minimum(cost, 0.0, 0.01, 0.15) == pytest.approx(least, abs=1e-3)

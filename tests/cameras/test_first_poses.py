@@ -15,6 +15,7 @@ from dhcal_pin.cameras.pose_from_points import (
     agreeing_points,
     determines_homography,
     direct_linear_transform,
+    estimate_poses,
 )
 from dhcal_pin.exceptions import NotObservableError
 from dhcal_pin.measurements.images.camera_start import _well_fitting
@@ -99,6 +100,17 @@ def test_five_points_that_are_not_flat_have_a_pose():
     estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
     assert estimate is not None
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
+def test_a_far_flat_board_has_two_poses_that_mirror_each_other():
+    points = CHECKERBOARD - CHECKERBOARD.mean(0)
+    pose = se3.transform(se3.exp3(np.array([0.5, 0.2, 0.1])), [0.1, -0.2, 4.0])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    (first, _), (second, rms) = estimate_poses([(points, local[:, :2] / local[:, 2:])])[0]
+    np.testing.assert_allclose(first, pose, atol=1e-6)
+    sight, normal = pose[:3, 3] / np.linalg.norm(pose[:3, 3]), pose[:3, 2]
+    np.testing.assert_allclose(second[:3, 2], 2 * (normal @ sight) * sight - normal, atol=0.05)
+    assert rms < 1e-3
 
 
 def test_too_few_points_or_points_in_a_line_have_no_pose():
@@ -271,7 +283,8 @@ def test_a_flat_board_keeps_its_distances_in_its_plane():
 
 
 @pytest.mark.parametrize(
-    "values", [(0.01, 0.01, 0, 0), (1, 1e-2, 0, 0), (1, 10, 0, 0), (10, 1, 0, 0), (1, 1, 3, 0), (1, 1, 0, -3)]
+    "values",
+    [(0.01, 0.01, 0, 0), (1, 1e-2, 0, 0), (1, 10, 0, 0), (10, 1, 0, 0), (1, 1, 0.3, 0), (1, 1, 0, -0.2)],
 )
 def test_lenses_that_are_not_built_are_implausible(values):
     assert not _is_plausible(values, 1.0, 0.75)

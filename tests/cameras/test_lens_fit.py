@@ -7,7 +7,7 @@ import pytest
 from slow_cases import some_slow
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import LENSES, Board, Camera, pose_from_points
+from dhcal_pin.cameras import LENSES, Board, Camera, lens_fit, pose_from_points
 from dhcal_pin.cameras.lens_fit import _LensProblem, fit_camera, fit_lens, fit_unknown_lens
 from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
 from dhcal_pin.exceptions import NotObservableError
@@ -152,6 +152,15 @@ def test_unknown_lenses_are_found_with_their_distortion(seed, model):
     np.testing.assert_allclose(fit.values[:4], TRUE[model][:4], atol=15)
     assert np.all(np.abs(fit.values - TRUE[model])[:4] < 4 * fit.std[:4])
     assert angles(fit.poses, poses).max() < 0.05
+
+
+def test_three_images_determine_a_lens_without_closed_forms(monkeypatch):
+    _, views = images(np.random.default_rng(0), "pinhole", count=3, tilt=0.2)
+    # The closed forms give nothing for these images, and take long.
+    monkeypatch.setattr(lens_fit, "intrinsics_candidates", lambda *_: [])
+    monkeypatch.setattr(lens_fit, "_FOCAL_LENGTHS", (0.7,))
+    fit = fit_unknown_lens(views, *without_focal_lengths("pinhole"), repeats_errors=False)
+    np.testing.assert_allclose(fit.values[:2], TRUE["pinhole"][:2], rtol=0.05)
 
 
 def test_images_without_tilt_do_not_determine_an_unknown_lens():

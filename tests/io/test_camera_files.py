@@ -81,6 +81,7 @@ def test_easy_handeye_publishes_the_pose_of_the_camera(link, parent, moves):
     assert published(text)[:2] == (parent, "eye")
     parameters = yaml.safe_load(text)["parameters"]
     assert parameters["eye_on_hand"] is moves
+    assert parameters["namespace"].endswith("_eye_on_hand/" if moves else "_eye_on_base/")
     assert parameters["tracking_marker_frame"] == "far"
     assert parameters["robot_base_frame" if moves else "robot_effector_frame"] == (
         "world" if moves else "tool0"

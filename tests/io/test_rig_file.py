@@ -32,13 +32,15 @@ def test_text_reads_back(tmp_path):
     points = '[board.p]\nlink = "world"\ntype = "points"\npoints_mm = [[0, 0, 1], [2, 0, 0]]\n'
     grid = '[board.g]\nlink = "tip"\ntype = "aprilgrid"\ncolumns = 2\nrows = 3\n'
     grid += "marker_mm = 40\nspacing_mm = 12\n"
+    one = grid.replace(".g]", ".o]").replace("= 2\n", "= 1\n").replace("= 3\n", "= 1\n")
     unknown = '[camera.c]\nlink = "world"\nmodel = "fisheye"\nwidth = 64\nheight = 48\n'
-    first = read_rig(write(tmp_path / "r.toml", CAMERA + unknown + BOARD_TABLE + points + grid))
+    first = read_rig(write(tmp_path / "r.toml", CAMERA + unknown + BOARD_TABLE + points + one + grid))
     text = rig_text(list(first.cameras.values()), list(first.boards.values()))
     again = read_rig(write(tmp_path / "s.toml", text))
     assert text == rig_text(list(again.cameras.values()), list(again.boards.values()))
     np.testing.assert_allclose(again.boards["g"].points[[0, 1, 2, 3, 4]] * 1e3,
                                [[0, 0, 0], [40, 0, 0], [40, 40, 0], [0, 40, 0], [52, 0, 0]])  # fmt: skip
+    assert again.boards["o"].points.shape == (4, 3)
     assert not again.cameras["c"].has_intrinsics
 
 
@@ -49,7 +51,8 @@ def test_text_reads_back(tmp_path):
         (CAMERA, r"no \[board.NAME\] table"),
         (CAMERA.replace("fy = 641.0\n", "") + BOARD_TABLE, "without fy; expected all of fx, fy, cx, cy"),
         (CAMERA.replace("fx = 640.0", "fx = -1.0") + BOARD_TABLE, "fx = -1.0; expected a number above 0"),
-        (CAMERA + BOARD_TABLE.replace("22.0", "33.0"), "marker_mm = 33.0; expected less than square_mm = 30"),
+        (CAMERA + BOARD_TABLE.replace("22.0", "30.0"), "marker_mm = 30.0; expected less than square_mm = 30"),
+        (CAMERA + BOARD_TABLE.replace("rows = 5", "rows = 1"), "expected at least 2 each"),
         (
             CAMERA + BOARD_TABLE.replace("22.0", "2e5"),
             "expected a length in millimetres above 0 and up",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
+from dhcal_pin.calibration.cameras import image_session
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
 from dhcal_pin.calibration.cameras.gate import Gate, open_fit
 from dhcal_pin.calibration.cameras.image_session import find_image_session
@@ -112,6 +114,19 @@ def test_changes_need_images_alone_and_of_one_board():
 
     for data in ([images, Pose(images.q, nominal.poses(images.q))], [two]):
         assert find_image_session(nominal, data, (), calibrated, INDUSTRIAL) is None
+
+
+@pytest.mark.parametrize("variance", [1e-2, 1.0, 1e2])
+def test_images_are_evidence_relative_to_their_noise(monkeypatch, variance):
+    """Twenty worse images are, four are not, and one image counts no more than an outlier does."""
+    monkeypatch.setattr(image_session, "_image_squares", lambda squares: variance * squares)
+    explains_better: Any = image_session._explains_better
+    for worse, is_evidence in (
+        (np.full(20, 2.0), True),
+        (np.full(4, 2.0), False),
+        (np.r_[1e6, np.ones(19)], False),
+    ):
+        assert explains_better(np.ones(len(worse)), worse) == is_evidence
 
 
 def test_play_is_no_change_of_a_joint():

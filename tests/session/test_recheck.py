@@ -211,6 +211,17 @@ def test_command(tmp_path: Path, capsys):
     assert "no sidecar" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_a_given_noise_replaces_that_of_the_measurements(kind):
+    chain, q = nominal_arm("ur10"), np.random.default_rng(0).uniform(-2, 2, (10, 6))
+    poses = chain.poses(q)
+    values, noise = (poses, (3e-4, 2e-3)) if kind is Pose else (poses[:, :3, 3], (3e-4,))
+    stated = recheck(chain, [kind(q, values, *noise)])
+    given = recheck(chain, [kind(q, values, *(0.1 * n for n in noise))], noise=Noise(3e-4, 2e-3))
+    assert given.to_dict() == stated.to_dict()
+    assert given.expected_rms == pytest.approx(np.sqrt(3) * 3e-4)
+
+
 def test_hidden_joints_are_named():
     """The measured point is on the last axis of this arm."""
     chain = nominal_arm("ur10")

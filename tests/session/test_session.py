@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -23,11 +24,12 @@ from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
-from dhcal_pin.session.causes import Drift, FreeDrift, Step
+from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
+from dhcal_pin.session.facts import Scale
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import WIDTHS, _Search
+from dhcal_pin.session.search import TIME_CONSTANTS, WIDTHS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -174,6 +176,28 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
 
 
+@pytest.mark.parametrize("changes", [Changes("base", 3e-4), Changes("base", 1e-3, at=None)])
+def test_coefficients_of_the_score_test_are_those_of_a_fit(changes):
+    search = search_of(changes)
+    cause = search.best_cause(search.first_fit)
+    assert cause is not None
+    fit = search.solve(search.rows, [replace(cause, values=0 * cause.values)])
+    expected = fit.step[len(search.x) :]
+    assert cause.block.kind == "base"
+    np.testing.assert_allclose(cause.values, expected, atol=0.2 * np.abs(expected).max())
+
+
+def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
+    search = search_of(Changes())
+    base, tool, *_ = search.layout.blocks
+    for shape, left in ((Drift(0.0, 59.0), {Step, FreeDrift}), (FreeDrift(0.0, 59.0), {Step})):
+        search.causes = [Cause(base, shape, np.zeros(6), np.zeros((6, 6)))]
+        assert {type(shapes[0]) for shapes in search._shapes(base)} == left
+        by_type = {type(shapes[0]): shapes for shapes in search._shapes(tool)}
+        assert set(by_type) == {Step, Drift, FreeDrift}
+        assert [each.time_constant / 59 for each in by_type[Drift]] == pytest.approx(TIME_CONSTANTS)
+
+
 @pytest.mark.parametrize("step", [4, 6, 8])
 def test_a_further_step_changes_no_pose(step):
     motion = Motion((5,), motions(np.random.default_rng(0), 2, 0.1))
@@ -199,6 +223,12 @@ def test_paths_of_joints_are_those_of_each_file():
     assert RobotChanges().is_empty
     # Times are no numbers of samples.
     np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
+
+
+def test_a_thinned_timeline_has_samples_of_all_measurements():
+    data = Simulation("ur10", 30, 1).measure(Position)
+    timeline = order_samples([data.take(np.s_[a : a + 10]) for a in (0, 10, 20)], ())
+    np.testing.assert_array_equal(timeline.thinned(10).fitted_numbers, np.arange(0, 30, 3))
 
 
 @pytest.mark.parametrize("shape", [Drift(2.0, 6.0), Drift(2.0, 6.0, 1.0), FreeDrift(2.0, 6.0)])
@@ -443,16 +473,20 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
-def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
-    """Computed on a grid of scales and of factors of the errors of the arm."""
+@pytest.mark.parametrize("factor", [1, 20])
+def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(factor):
+    """Computed on a grid of scales and of factors of the errors of the arm, also for noisy measurements."""
     simulation = Simulation("ur10", 100, 6)
     data = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015)))
     fit = calibrate(simulation.chain, data, extend="none", session="off")
     problem, x = fit.problem, fit.solution.x
     arm = [i for i, p in enumerate(problem.errors.parameters) if p.name[:4] not in ("base", "tool")]
+    if factor > 1:
+        problem = problem.with_data([each.with_scaled_sigma({"position": factor}) for each in problem.data])
     noise, change, *both = _responses(problem, x, np.array(arm))
-    root = fit.solution.system.sqrt_covariance(problem.weights)[0][arm]
-    np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
+    if factor == 1:
+        root = fit.solution.system.sqrt_covariance(problem.weights)[0][arm]
+        np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
     scale = find_scale(problem, x)
     assert scale is not None
     grid = scale.factor - 1 + scale.std * np.linspace(-8, 8, 81)
@@ -467,6 +501,25 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution():
     assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
     assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
+
+
+def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():
+    simulation = Simulation("ur10", 100, 6)
+    data, found = simulation.measure(Position, Changes(scales=(1.015, 1.015, 1.015))), []
+    for fit in (
+        calibrate(simulation.chain, data, extend="none", session="off"),
+        calibrate(simulation.chain, data, "placement,base,tool", priors="none", extend="none", session="off"),
+    ):
+        scale = find_scale(fit.problem, fit.solution.x)
+        assert scale is not None
+        found.append((scale.factor, scale.std))
+    np.testing.assert_allclose(*found, rtol=1e-2, atol=0)
+    assert found[0][0] == pytest.approx(found[1][0], abs=1e-5)
+
+
+def test_a_scale_is_stated_in_percent():
+    assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
+    assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
 
 
 def test_a_small_scale_is_found_with_an_accurate_arm():

@@ -87,7 +87,7 @@ class HandEyeData:
     data: tuple[Measurement, ...]
     known: Mapping[str, float]  # Values of parameters that the calibration holds, by name [m, rad, px or 1]
     sequence: Array  # Joint values of all images in the order of the file, held-out ones included, (k, n)
-    is_arm_tried: bool = False  # Whether the calibration estimated errors of the arm, too
+    is_arm_tried: bool  # Whether the calibration estimated errors of the arm, too
 
 
 def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:
