@@ -22,6 +22,7 @@ from ..estimation.parameters import select_parameters
 from ..formatting import capitalized, format_below, format_quantity, join_names
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
+from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.diagnosis import Diagnosis
@@ -32,6 +33,7 @@ from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .model_selection import FULL_SET
 from .partition import configuration_groups
+from .reweighting import Fit
 from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
 
 Status = Literal["ok", "caution", "refused"]
@@ -70,10 +72,14 @@ MAX_CHANCE = 0.025
 MAX_SPOILED_RATIO = 1.5
 # Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
+# Largest share of hold-out samples that may be equal to fitted ones.
+MAX_FITTED_SHARE = 0.1
 # Largest error of the zero of a servo that needs no caution [rad].
 MAX_ZERO = np.deg2rad(40.0)
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
+# Largest share of outliers of one of several measurements that needs no caution.
+MAX_FILE_OUTLIER_SHARE = 0.5
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.
@@ -159,9 +165,11 @@ def judge(fit: Evidence) -> Verdict:
         found = [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_session(fit),
+            *_contradictions(fit),
             *_convergence(fit),
             *_hand_eye_images(fit),
             *(_weak_positions(fit) or _hidden_position_errors(fit)),
+            *_fitted_holdout(fit),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
             *_regional_errors(fit),
@@ -396,6 +404,23 @@ def _hand_eye_images(fit: Evidence) -> list[Finding]:
     return [Finding("caution", text)]
 
 
+def _contradictions(fit: Evidence) -> list[Finding]:
+    """Advise caution if measurements contradict others: a file of outliers, or images that are displaced."""
+    if len(fit.data) < 2 or (fit.hand_eye and not fit.hand_eye.is_noise):
+        return []
+    texts = [
+        f"{int(np.sum(~mask))} of {len(mask)} samples of {item.source or item.kind} are outliers: they "
+        "contradict the other measurements. Check the units, the zeros and signs of the joints and the scale "
+        "of both, and calibrate them by themselves."
+        for item, mask in zip(fit.data, fit.is_counted, strict=True)
+        if np.mean(~mask) > MAX_FILE_OUTLIER_SHARE
+    ]
+    if not texts and fit.camera_stages:
+        solved = Fit(fit.data, fit.problem, fit.solution, tuple(fit.weights))
+        texts = [cameras.describe_contradiction(solved, fit.comparisons[-1].after)]
+    return [Finding("caution", text) for text in texts if text]
+
+
 def _weak_positions(fit: Evidence) -> list[Finding]:
     """Advise caution if images of a calibrated arm do not determine the positions of cameras and boards."""
     board = fit.comparisons[-1].after.groups.get("board")
@@ -517,6 +542,19 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
+
+
+def _fitted_holdout(fit: Evidence) -> list[Finding]:
+    """Advise caution if hold-out samples are fitted ones."""
+    digests, count = fitted_row_digests(fit.data), sum(len(item.rows) for item in fit.holdout)
+    n_fitted = sum(count_fitted_rows(item, digests) for item in fit.holdout)
+    if n_fitted <= MAX_FITTED_SHARE * count:
+        return []
+    text = (
+        f"{n_fitted} of {count} hold-out samples are fitted, too, and say nothing about other samples. Hold "
+        "out samples that are not fitted."
+    )
+    return [Finding("caution", text)]
 
 
 def _unexplained_holdout(fit: Evidence) -> list[Finding]:

@@ -307,7 +307,7 @@ class CameraCorners(Measurement):
         ]
         return replace(self.rig, cameras=cameras, boards=boards).take(*shown) if all(shown) else None
 
-    def with_entries(self, cameras: Collection[str], boards: Collection[str]) -> Self:
+    def _with_entries(self, cameras: Collection[str], boards: Collection[str]) -> Self:
         """Return a copy whose rig has some of its cameras and boards only; the images show no others."""
         of_cameras, of_boards = (
             [i for i, entry in enumerate(entries) if entry.name in names]
@@ -707,7 +707,7 @@ def with_shown_entries(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
     cameras = {item.rig.cameras[i].name for item in images for i in np.unique(item.camera)}
     boards = {item.rig.boards[i].name for item in images for i in np.unique(item.board)}
     return tuple(
-        item.with_entries(cameras, boards) if isinstance(item, CameraCorners) else item for item in data
+        item._with_entries(cameras, boards) if isinstance(item, CameraCorners) else item for item in data
     )
 
 

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, simulate
+from camera_setups import ARMS, simulate, wrong_arm
 from scipy.stats import chi2, norm
 from slow_cases import some_slow
 
@@ -147,6 +147,50 @@ def test_a_wrong_sign_of_positions_is_named_beside_images(tmp_path):
     assert fit.verdict.status == "refused"
     assert "sign of joint joint_3 is wrong" in fit.verdict.reasons[0]
     write_report(fit, tmp_path / "report.html")
+
+
+def images_and_positions(seed, is_on_wrist):
+    """Return a UR10, images and positions of one with errors, and exact positions to test with."""
+    rng, chain = np.random.default_rng(seed), ARMS["ur10"]()
+    truth = wrong_arm(chain, 1e-3, rng)
+    images = simulate(chain, truth, rng, is_on_wrist=is_on_wrist, n_images=20, sigma=0.2).images
+    truth = placed(truth)
+    positions, exact = (
+        KINDS["position"].simulate(truth, rng.uniform(-2, 2, (m, 6)), Noise(sigma), rng)
+        for m, sigma in ((40, 5e-5), (200, 0.0))
+    )
+    return chain, images, positions, exact
+
+
+def other_zero(images):
+    """Return images with another zero of the third joint."""
+    return images.replace(q=images.q + np.deg2rad([0, 0, 1.0, 0, 0, 0]))
+
+
+CASES = [
+    (0, False, lambda p, i: (p, i), "ok"),
+    (1, True, lambda p, i: (p.replace(values=1.03 * p.positions()), i), "caution"),
+    (2, False, lambda p, i: (p, other_zero(i)), "caution"),
+    (3, True, lambda p, i: (p, i), "ok"),
+    (4, False, lambda p, i: (p.replace(values=1.03 * p.positions()), i), "caution"),
+    (5, True, lambda p, i: (p, other_zero(i)), "caution"),
+]
+
+
+@pytest.mark.parametrize(("seed", "is_on_wrist", "change", "status"), some_slow(CASES, {0, 1}))
+def test_images_that_contradict_positions_need_caution(seed, is_on_wrist, change, status):
+    chain, images, positions, exact = images_and_positions(seed, is_on_wrist)
+    changed = change(positions, images)
+    fit = calibrate(chain, changed)
+    assert fit.verdict.status == status
+    if status == "ok":
+        assert fit.validate(exact)["position_rms_m"] < 1e-4
+        return
+    assert any("contradict" in text or "Likely cause" in text for text in fit.verdict.reasons)
+    if changed[0] is not positions:
+        # The advice: the positions by themselves show their scale.
+        alone = calibrate(chain, changed[0])
+        assert any("3.0 % longer" in text or "scale" in text for text in alone.verdict.reasons)
 
 
 def images_that_keep_the_orientation_of_the_tool(truth, noise, rng):

@@ -38,6 +38,14 @@ def test_refused_robot_is_not_written(run, robot_folder, undrawn):
     assert text.split("\n\n")[1:3] == ["**Verdict: refused**", reason]
 
 
+def test_a_copy_of_the_fitted_file_is_no_holdout(run, robot_folder):
+    Path("copy.csv").write_bytes(Path("data.csv").read_bytes())
+    status, _, err = run(*CALIBRATE, "--holdout", "copy.csv")
+    assert status == 0
+    assert "verdict: caution" in err
+    assert "hold-out samples are fitted, too" in unfolded(err)
+
+
 @pytest.mark.parametrize(("words", "expected"), [((), 0), (("--strict",), 3)])
 def test_force_writes_a_refused_robot(run, robot_folder, undrawn, words, expected):
     status, _, _ = run(*CALIBRATE, *OUTPUTS, *UNFINISHED, "--force", *words)

@@ -52,7 +52,8 @@ def test_an_arm_without_a_calibration_stays_as_it_is(tmp_path):
 WRONG = [
     (arm(d="0.3"), "8: <DH>: d is 0.3; expected 0: only theta is read"),
     (arm(beta="-1e-3"), "8: <DH>: beta is -1e-3; expected 0"),
-    (arm(b=None), "8: <DH>: no b; expected index, theta"),
+    (arm(b=None), "8: <DH>: b is missing; expected a number"),
+    (arm().replace('Offset" value="0"', 'Offset"'), "15: <Float>: value is missing; expected a number"),
     (arm(alpha="x"), "8: <DH>: alpha has 'x'; expected a finite number"),
     (arm([0.0, 20.0]), "9: <DH>: theta is 20; expected degrees up to ±10"),
     (arm().replace('index="1"', 'index="3"'), "9: <DH>: index is 3; expected 1"),

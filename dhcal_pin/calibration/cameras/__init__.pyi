@@ -10,6 +10,7 @@ from .board_size import find_board_size as find_board_size
 from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
+from .diagnosis import describe_contradiction as describe_contradiction
 from .gate import apply_gate as apply_gate
 from .gate import judge_stages as judge_stages
 from .gate import judge_target_points as judge_target_points

@@ -32,6 +32,7 @@ from ...measurements.camera import CameraCorners
 from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
 from ...subsampling import evenly_spaced_indices
+from ..evaluation import Accuracy
 from ..partition import configuration_groups, k_fold
 from ..reweighting import Fit
 from .arm_types import INDUSTRIAL
@@ -61,6 +62,8 @@ from .stages import ImageError, fitted_error, held_out_error, held_out_predictio
 DISPLACEMENT = "displaced images"
 # An error of left-out images above this multiple of the noise is not noise.
 MAX_NOISE_RATIO = 1.5
+# Displacement of the board above which images contradict measured lengths, as a multiple of their errors.
+MAX_LENGTH_RATIO = 2.0
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
 # up to this ratio of their errors.
 MAX_ERROR_SHARE, MAX_TIE_RATIO = 0.8, 1.15
@@ -318,6 +321,31 @@ def _search(
     if base.error.pixels > MAX_LEFT_OUT_RATIO * fitted.pixels:
         base = replace(base, error=fitted, noise=base.scatter)
     return _Search(hand_eye, base, *_find_causes(hand_eye, base))
+
+
+def describe_contradiction(fit: Fit, errors: Accuracy) -> str:
+    """Say that images contradict measured lengths of the same fit, with its errors; empty if they do not.
+
+    Errors that both share, such as play, displace the images as much as they change the lengths.
+    """
+    board, pixels = errors.groups.get("board"), errors.groups.get("pixels")
+    lengths = [group.rms for name, group in errors.groups.items() if group.unit == "m" and name != "board"]
+    if board is None or pixels is None or not lengths:
+        return ""
+    jitter = residual_jitter(fit)
+    sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
+    noise = jitter.noise * se3.rms_length(sigma)
+    if not jitter.is_significant or pixels.rms <= MAX_NOISE_RATIO * noise:
+        return ""
+    displacement = board.rms * np.sqrt(1 - (noise / pixels.rms) ** 2)
+    if displacement <= MAX_LENGTH_RATIO * max(lengths):
+        return ""
+    return (
+        f"The images contradict the other measurements: they leave {_mm(board.rms)} at the board "
+        f"({_px(pixels.rms)}), of which noise of the corners explains {_px(noise)}; the others leave "
+        f"{_mm(max(lengths))}. A zero of a joint, the size of the board or the scale of the other instrument "
+        "differs. Calibrate images and other measurements by themselves, and compare."
+    )
 
 
 def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, weights: Array) -> list[str]:

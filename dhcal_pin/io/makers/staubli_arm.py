@@ -27,9 +27,8 @@ from ...exceptions import InvalidArgumentError
 from ...robot.chain import Chain
 from ...robot.formats.xml_tags import XmlTag, parse_numbers, read_xml, scan
 
-# Attributes of a row that are read, and those that must be zero.
-_KEYS = ("index", "theta", "d", "a", "b", "alpha", "beta")
-_UNKNOWN_ORDER = _KEYS[2:]
+# Attributes of a row that must be zero.
+_UNKNOWN_ORDER = ("d", "a", "b", "alpha", "beta")
 # Largest offset of a joint [°]; larger ones are not of a calibration.
 _MAX_OFFSET = 10.0
 
@@ -51,8 +50,6 @@ def read_joint_offsets(path: PathLike) -> list[float]:
             if tag.attributes.get("name") == "flangeLengthOffset":
                 _require_zero(tag, "value")
         elif depth == 3 and array == "dhOffset":
-            if missing := [key for key in _KEYS if key not in tag.attributes]:
-                raise tag.error(f"no {missing[0]}; expected {', '.join(_KEYS)}")
             if parse_numbers(tag, "index", 1)[0] != len(offsets):
                 raise tag.error(f"index is {tag.attributes['index']}; expected {len(offsets)}")
             for key in _UNKNOWN_ORDER:

@@ -145,8 +145,10 @@ def scan(
 def parse_numbers(tag: XmlTag, key: str, count: int) -> list[float]:
     """Parse the finite numbers of an attribute.
 
-    A wrong number raises a `FileFormatError` with the line.
+    A missing attribute and a wrong number raise a `FileFormatError` with the line.
     """
+    if key not in tag.attributes:
+        raise tag.error(f"{key} is missing; expected {'a number' if count == 1 else f'{count} numbers'}")
     # Expat replaces white space by spaces, except for character references such as &#9;, which do not
     # separate.
     words = [word for word in tag.attributes[key].split(" ") if word]
