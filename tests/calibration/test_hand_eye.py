@@ -391,3 +391,11 @@ def test_a_rigid_motion_does_not_bend_a_board():
 )
 def test_a_minimum_of_a_function_is_found(cost, least):
     assert find_minimum(cost, 0.0, 0.01, 0.15) == pytest.approx(least, abs=1e-3)
+
+
+@pytest.mark.parametrize(("pixels", "has_noise"), [(4.0, True), (254.0, False)])
+def test_large_errors_say_nothing_about_noise(pixels, has_noise):
+    """Displacements of hundreds of pixels are not linear, and their rest within an image is not noise."""
+    errors = ImageError(pixels, 0.01 * pixels, 100), ImageError(0.2 * pixels, 0.002 * pixels, 100)
+    diagnosis = HandEyeDiagnosis(*errors, (), (), (), 1.0, 0.0, (), "joint values")
+    assert ("noise" in diagnosis.error_sentence) == has_noise

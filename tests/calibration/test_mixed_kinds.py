@@ -129,6 +129,7 @@ def test_cameras_and_boards_that_no_image_shows_change_nothing(has_pose):
     assert found.hand_eye_std == pytest.approx(expected.hand_eye_std)
     for name, value in expected.instruments.items():
         assert found.instruments[name] == pytest.approx(value, abs=1e-6)
+    assert found.rig is not None
     assert [entry.name for entry in (*found.rig.cameras, *found.rig.boards)] == [
         entry.name for entry in (*rig.cameras, *rig.boards)
     ]

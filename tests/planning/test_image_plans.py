@@ -187,6 +187,7 @@ def test_displacements_are_derivatives(name, is_free):
 
     def point(chain, changed):
         solved = instrument.template(arm, q).solved_rig(changed)
+        assert solved is not None
         board = solved.boards[0]
         moved = board.pose @ frame_of(rig.boards[0].points, board.points)
         solved = with_points(solved, pose=moved, listed_points=rig.boards[0].points)
@@ -329,6 +330,7 @@ def test_predicted_error_is_that_of_the_solver():
         for _ in range(80):
             drawn_x = 0.1 * np.linalg.solve(r, rng.standard_normal(len(x)))
             solved = data.solved_rig(problem.instruments(drawn_x))
+            assert solved is not None
             moved = solved.board_in_camera(0, 0, errors.at(drawn_x[: len(errors.parameters)]).poses(task))
             squares.append(np.mean(np.sum(((moved - nominal) @ middle) ** 2, 1)))
         measured.append(10 * np.sqrt(np.mean(squares)))

@@ -62,6 +62,8 @@ from .stages import ImageError, fitted_error, held_out_error, held_out_predictio
 DISPLACEMENT = "displaced images"
 # An error of left-out images above this multiple of the noise is not noise.
 MAX_NOISE_RATIO = 1.5
+# Error above which the scatter within an image is not noise, as displacements are not linear [px].
+MAX_LINEAR_ERROR = 50.0
 # Displacement of the board above which images contradict measured lengths, as a multiple of their errors.
 MAX_LENGTH_RATIO = 2.0
 # A cause is likely if it reduces the error of left-out images below this share, and as likely as the best one
@@ -186,10 +188,11 @@ class HandEyeDiagnosis:
     @property
     def error_sentence(self) -> str:
         """Error of left-out images and noise, in millimetres and in pixels."""
-        return (
-            f"Error of left-out images: {_mm(self.error.distance)} at the board ({_px(self.error.pixels)}); "
-            f"noise of the corners explains {_mm(self.noise.distance)} ({_px(self.noise.pixels)})."
-        )
+        text = f"Error of left-out images: {_mm(self.error.distance)} at the board ({_px(self.error.pixels)})"
+        if self.error.pixels > MAX_LINEAR_ERROR:
+            return f"{text}."
+        noise = f"{_mm(self.noise.distance)} ({_px(self.noise.pixels)})"
+        return f"{text}; noise of the corners explains {noise}."
 
     @property
     def likely(self) -> str:
@@ -335,7 +338,8 @@ def describe_contradiction(fit: Fit, errors: Accuracy) -> str:
     jitter = residual_jitter(fit)
     sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
     noise = jitter.noise * se3.rms_length(sigma)
-    if not jitter.is_significant or pixels.rms <= MAX_NOISE_RATIO * noise:
+    # Larger errors are refused.
+    if not jitter.is_significant or not MAX_NOISE_RATIO * noise < pixels.rms <= MAX_LINEAR_ERROR:
         return ""
     displacement = board.rms * np.sqrt(1 - (noise / pixels.rms) ** 2)
     if displacement <= MAX_LENGTH_RATIO * max(lengths):
@@ -569,7 +573,7 @@ def _lens_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     item = _images(hand_eye.data)
     for number, camera in enumerate(item.rig.cameras):
         found = np.array([values[f"camera_{camera.name}.{name}"] for name in camera.lens.names])
-        if not camera.has_intrinsics:
+        if not camera.has_intrinsics or found[:2].min() <= 0:
             continue
         rays = camera.lens.normalize(item.values[item.camera == number].T, found)
         parts = []
