@@ -128,8 +128,9 @@ def _require_finite(tag: MjcfTag, values: Array) -> Array:
 
 def _unit(tag: MjcfTag, key: str, vector: Array) -> Array:
     """Return a vector with length 1."""
-    if (norm := np.linalg.norm(vector)) < _MIN_NORM:
-        raise tag.error(f"{key} has length 0; expected a direction")
+    # Unlike np.linalg.norm, the squares of large values are no overflow.
+    if not _MIN_NORM <= (norm := math.hypot(*vector)) < math.inf:
+        raise tag.error(f"{key} has length {norm:g}; expected a direction")
     return vector / norm
 
 
