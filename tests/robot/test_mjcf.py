@@ -180,7 +180,7 @@ WRONG = [
     ("", '<body><joint class="k"/></body>', "<joint>: unknown default class 'k'; the file has none"),
     ("", '<body><joint type="helix"/></body>', "<joint>: unknown type 'helix'"),
     ("", '<body><joint axis="0 0 0"/></body>', "<joint>: axis has length 0"),
-    ("", '<body><joint axis="1e308 1e308 1e308"/></body>', "<joint>: axis has length inf"),
+    ("", '<body><joint axis="1.7e308 1.7e308 0"/></body>', "<joint>: axis has length inf"),
     ("", '<body><joint range="2 1"/></body>', "<joint>: range: lower 2 is above"),
     ("", '<body name="b" pos="1 x 0"/>', "body 'b': pos has 'x'; expected a finite"),
     ("", '<body quat="1 0 0"/>', "<body>: quat has 3 numbers; expected 4"),
