@@ -52,7 +52,9 @@ from ..plausibility.mixups import has_enough_rows
 from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
-from ..session import can_have_session, find_scale
+from ..session import Session, can_have_session, find_scale
+from ..session.linear_model import measures_positions
+from ..session.timeline import order_samples
 from . import cameras, model_selection
 from .cameras import (
     arm_type,
@@ -249,6 +251,14 @@ def calibrate(
     if has_images(data) and priors != "none":
         fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)
         images = cameras.calibrate_images(fitting, fit, chain, holdout, exchanges, families)
+        others = tuple(item for item in data if item.rig is None)
+        if finds_session and measures_positions(others) and has_enough_rows(others):
+            alone = start(others, errors)
+            alone = reweight(alone, stages, _prior_groups(alone, priors), max_iterations, progress)
+            # Images beside them do not show a scale: the corners of a board can take part of it.
+            if scale := find_scale(alone.problem, alone.solution.x):
+                found = found or Session(order_samples(others, ()), chain, session == "auto")
+                found = replace(found, scales=(scale,))
         return replace(images, session=found, **settings)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):

@@ -156,7 +156,7 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
     """Return whether the zero of a joint is off by as much as it changed: the file has no mistake."""
     sizes = [(session.chain.joint_names.index(e.of), e.size) for e in session.events if e.kind == "joint"]
     offsets = [each.offsets for each in diagnosis.hypotheses]
-    return any(abs(abs(each.get(j, 0.0)) - size) < SAME_ZERO for each in offsets for j, size in sizes)
+    return any(abs(abs(each[j]) - size) < SAME_ZERO for each in offsets for j, size in sizes if j in each)
 
 
 def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:

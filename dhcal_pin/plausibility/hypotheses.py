@@ -353,9 +353,9 @@ class Hypothesis:
 
     @property
     def offsets(self) -> dict[int, float]:
-        """Summands of the joints whose values are changed, by their numbers [rad or m]."""
-        change = self.change
-        return {j: change.offsets[j] for j in change.joints} if isinstance(change, JointChange) else {}
+        """Summands of the joints whose zeros are changed, by their numbers [rad or m]."""
+        offsets = self.change.offsets if isinstance(self.change, JointChange) else ()
+        return {j: offset for j, offset in enumerate(offsets) if offset}
 
     def apply(self, data: Sequence[Measurement]) -> list[Measurement] | None:
         """Undo the mistake in measurements."""
