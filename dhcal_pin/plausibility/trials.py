@@ -52,6 +52,8 @@ _MIN_SHIFTED_SHARE = 0.25
 # Smallest angle by which the zero of a joint is called wrong, and the steps in which the angle is searched
 # [deg]. Smaller ones are errors of the robot, which the calibration corrects.
 _MIN_ZERO, _ZERO_STEPS = 10.0, (20.0, 4.0, 1.0, 0.2)
+# Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
+_MIN_TURN_DIFFERENCE = 5.0
 # Phases of the progress.
 SINGLES, PAIRS = "looking for mistakes in the measurements", "looking for pairs of mistakes"
 
@@ -137,8 +139,9 @@ def try_hypotheses(
         joints = [j for j in inner_revolute_joints(chain) if misfit or j in changed]
         zeros = _measure_zeros(trial, joints)
         measured = _decide(trial, [*scores, *_scores(trial, _near(trial, zeros), SINGLES)])
-        if measured.is_certain or set(measured.hypotheses).isdisjoint(found.hypotheses):
-            # An angle that fits far better refutes other hypotheses, even if it is not certain itself.
+        is_refuted = changed and set(measured.hypotheses).isdisjoint(found.hypotheses)
+        if measured.is_certain or is_refuted:
+            # An angle that fits far better refutes other zeros, even if it is not certain itself.
             found = measured if measured.is_certain else Diagnosis(before)
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
@@ -151,7 +154,7 @@ def _near(trial: Trial, candidates: Sequence[_Candidate]) -> list[_Candidate]:
 
 def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
     """Return, for the zero of each joint, the angle with which the robot fits the samples best."""
-    out, known = [], {each.hypothesis.key for each in trial.candidates}
+    out = []
     for joint in joints:
         best, reach = 0.0, 180.0
         for step in _ZERO_STEPS:
@@ -160,7 +163,8 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
             costs = _costs(trial, [zero.apply(trial.samples) or trial.samples for zero in zeros])
             best, reach = angles[int(np.argmin(costs))], step
         zero = zero_hypothesis(trial.chain, joint, best)
-        if abs(best) >= _MIN_ZERO and zero.key not in known:
+        is_quarter_turn = abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
+        if abs(best) >= _MIN_ZERO and not is_quarter_turn:
             out += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
     return out
 
