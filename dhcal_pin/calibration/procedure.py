@@ -258,7 +258,8 @@ def calibrate(
             # Images beside them do not show a scale: the corners of a board can take part of it.
             if scale := find_scale(alone.problem, alone.solution.x):
                 found = found or Session(order_samples(others, ()), chain, session == "auto")
-                found = replace(found, scales=(scale,))
+                files = tuple(dict.fromkeys(item.source for item in others if item.source))
+                found = replace(found, scales=(replace(scale, files=files),))
         return replace(images, session=found, **settings)
     fit = reweighted(fit, stages)
     if found and (scale := find_scale(fit.problem, fit.solution.x)):

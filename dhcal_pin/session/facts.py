@@ -184,11 +184,13 @@ class Scale:
         factor: Measured over true length.
         std: Standard deviation of the factor.
         axis: "x", "y" or "z" of the measuring frame; empty for all.
+        files: Measurement files with this scale; empty for all.
     """
 
     factor: float
     std: float
     axis: str
+    files: tuple[str, ...] = ()
 
     @property
     def finding(self) -> str:
@@ -205,9 +207,11 @@ class Scale:
         """What to do."""
         if self.axis:
             return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
+        key = f"--mend scale:{self.factor:.6g}"
+        mends = " ".join(f"{key}@{file}" for file in self.files) or key
         return (
             "Check the scale of the instrument: measurements alone do not distinguish it from the size of "
-            f"the robot. If the instrument is wrong, add --mend scale:{self.factor:.6g}."
+            f"the robot. If the instrument is wrong, add {mends}."
         )
 
 

@@ -520,6 +520,9 @@ def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():
 def test_a_scale_is_stated_in_percent():
     assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
     assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
+    assert Scale(0.985, 1e-4, "", ("a.csv", "b.csv")).consequence.endswith(
+        "add --mend scale:0.985@a.csv --mend scale:0.985@b.csv."
+    )
 
 
 def test_a_small_scale_is_found_with_an_accurate_arm():
