@@ -45,7 +45,6 @@ from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..measurements.camera import with_shown_entries
 from ..parallel import SERIAL, TaskExecutor
-from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import has_enough_rows
@@ -152,120 +151,166 @@ def calibrate(
         Calibrated chain with uncertainty and accuracy.
     """
     require_chain(chain)
-    recalibrate = partial(
-        calibrate,
-        chain,
-        parameters=parameters,
-        method=method,
-        priors=priors,
-        fix=fix,
-        free=free,
-        known=known,
-        loss=loss,
-        extend=extend,
-        bounds=bounds,
-        max_iterations=max_iterations,
-        session=session,
-        executor=executor,
+    options = _Options(
+        parameters, method, priors, fix, free, known, loss, extend, bounds, max_iterations, session, executor
     )
+    recalibrate = partial(calibrate, chain, **vars(options))
     if isinstance(holdout, str) and holdout == "region":
         result = recalibrate(data, turned=turned, progress=progress)
         again = partial(recalibrate, turned=result.signs.turned if result.signs else turned)
         return replace(result, region_comparison=leave_regions_out(result, again, progress))
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
-    _check_options(data, parameters, method, loss, bounds, session, max_iterations)
+    _check_options(options, data)
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
     again = partial(recalibrate, data, holdout=holdout, turned=turned)
+    setup = _set_up(_at_measured_temperature(chain, data), data, holdout, turned, options, progress)
+    settings: dict[str, Any] = {
+        "with_auto": None if method == "lm" and loss == "auto" else partial(again, method="lm", loss="auto"),
+        "with_full_set": partial(again, **_full_set(setup)) if _suggests_full_set(setup) else None,
+        "has_default_sets": parameters is None,
+        "signs": setup.signs,
+    }
+    begun = _begin(setup)
+    # The confirmation of changes and the calibration itself often need the same fits.
+    groups = _prior_groups(begun.fit, setup.priors)
+    reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
+    extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
+    if setup.finds_session and can_have_session((*setup.data, *setup.holdout)):
+        models = SessionModels(
+            setup.errors,
+            partial(_first_fit, setup),
+            lambda fit: reweighted(fit, AUTO),
+            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS)[0],
+            HAND_BUILT if setup.signs else MANUFACTURED,
+        )
+        begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
+    if method != "lm":
+        result = make_result(begun.fit, 1.0, begun.holdout, method)
+    elif has_images(setup.data) and setup.priors != "none":
+        result = _calibrate_images(setup, begun, groups)
+    else:
+        fit, found = reweighted(begun.fit, robust.LOSSES[loss].stages), begun.session
+        if found and (scale := find_scale(fit.problem, fit.solution.x)):
+            found = replace(found, scales=(*found.scales, scale))
+        result = _calibrate_samples(setup, replace(begun, fit=fit), groups, extended)
+        result = replace(result, session=found)
+    return replace(result, **settings)
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Options of `calibrate`."""
+
+    parameters: str | Iterable[str] | None
+    method: Method
+    priors: Priors | None
+    fix: Sequence[str]
+    free: Sequence[str]
+    known: Mapping[str, float] | None
+    loss: str
+    extend: str | Sequence[str] | None
+    bounds: Mapping[str, tuple[float, float]] | None
+    max_iterations: int
+    session: SessionOption
+    executor: TaskExecutor
+
+
+@dataclass(frozen=True, eq=False)
+class _Setup:
+    """Robot, measurements and unknowns of a calibration, which its options determine."""
+
+    chain: Chain  # Nominal robot, its joints turned as decided
+    data: tuple[Measurement, ...]
+    holdout: tuple[Measurement, ...]
+    robot_sets: tuple[str, ...]  # Names of the parameter sets of the robot
+    rig_sets: tuple[str, ...]  # Names of those of cameras and boards
+    options: _Options
+    priors: Priors  # Priors of the options, or those of the method
+    progress: Progress | None
+    signs: plausibility.SignDecision | None  # Signs of the joints; None if they are those of the URDF
+    exchanges: Sequence[cameras.Exchange]  # Exchanged axes of images
+    known: Mapping[str, float]  # Values of the instrument parameters that are held
+    errors: ErrorModel  # Unknown errors of the robot
+    first: Mapping[str, float]  # Errors at which a low-cost arm starts, by name
+    families: tuple[str, ...]  # Families of joint errors that may be added
+
+    @property
+    def finds_session(self) -> bool:
+        """Whether what happened during the measurement is looked for."""
+        return self.options.session != "off" and self.options.method == "lm"
+
+
+def _set_up(
+    chain: Chain,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    turned: str | Sequence[str],
+    options: _Options,
+    progress: Progress | None,
+) -> _Setup:
+    """Decide the signs of the joints, prepare images, and select the unknown errors."""
+    method, priors, free, extend = options.method, options.priors, options.free, options.extend
     priors = priors if priors is not None else ("none" if method == "gn" else "default")
-    chain = _at_measured_temperature(chain, data)
-    robot_sets, rig_sets = split_sets(parameters if parameters is not None else default_sets(chain, data))
+    chosen = options.parameters if options.parameters is not None else default_sets(chain, data)
+    robot_sets, rig_sets = split_sets(chosen)
     is_low_cost = LOW_COST in robot_sets
     if is_low_cost:
         chain = replace(chain, parameters=HAND_BUILT)
     require_joint_values((*data, *holdout), [*robot_sets, *free])
-    is_deliberate = method != "lm" or bool(fix or free or bounds) or not has_joint_values((*data, *holdout))
-    can_suggest = not is_deliberate and model_selection.is_restricted([*robot_sets, *rig_sets])
-    full_set: dict[str, Any] = {
-        "parameters": model_selection.FULL_SET, "priors": _full_set_priors(chain, priors), "extend": "none",
-    }  # fmt: skip
     signs = _joint_signs(chain, data, turned, is_low_cost, progress)
     chain = signs.apply(chain) if signs else chain
-    settings: dict[str, Any] = {
-        "with_auto": None if method == "lm" and loss == "auto" else partial(again, method="lm", loss="auto"),
-        "with_full_set": partial(again, **full_set) if can_suggest else None,
-        "has_default_sets": parameters is None,
-        "signs": signs,
-    }
     exchanges: Sequence[cameras.Exchange] = ()
     if has_images(data):
         shown = with_shown_entries((*data, *holdout))
         data, holdout = shown[: len(data)], shown[len(data) :]
         data, exchanges = cameras.exchange_axes(chain, data)
         holdout = cameras.reorder(holdout, exchanges)
-    known = {**held_values(data, rig_sets), **_validated_known(data, known or {})}
-    errors = select_parameters(chain, robot_sets, fix, free) if robot_sets or free else ErrorModel(chain, ())
+    known = {**held_values(data, rig_sets), **_validated_known(data, options.known or {})}
+    errors = (
+        select_parameters(chain, robot_sets, options.fix, free)
+        if robot_sets or free
+        else ErrorModel(chain, ())
+    )
     families = _extension_families(extend, errors, method, priors)
     _require_conditions([*robot_sets, *(families if extend not in (None, "auto") else ())], data)
     if has_images(data):
         cameras.require_shown_families(extend, families)
-    solver = _SolverOptions(method, method == "lm" and loss != "linear", max_iterations, progress, executor)
-    first = plausibility.first_errors(chain, data) if is_low_cost else {}
-    start = partial(_first_fit, first=first, priors=priors, known=known, bounds=bounds, options=solver)
-    arm = arm_type(robot_sets)
-    finds_session = session != "off" and method == "lm"
-    if finds_session and has_images(data):
+    return _Setup(
+        chain, data, holdout, tuple(robot_sets), tuple(rig_sets), options, priors, progress, signs, exchanges,
+        known, errors, plausibility.first_errors(chain, data) if is_low_cost else {}, families,
+    )  # fmt: skip
+
+
+def _begin(setup: _Setup) -> SessionFit:
+    """Fit for the first time; before that, find what happened while images were taken."""
+    start = partial(_first_fit, setup)
+    if not has_images(setup.data):
+        return SessionFit(start(setup.data, setup.errors), setup.holdout)
+    if setup.finds_session:
         of_poses = partial(
             calibrate,
-            chain,
-            parameters=list(dict.fromkeys([*robot_sets, "base", "tool"])),
-            priors=priors,
+            setup.chain,
+            parameters=list(dict.fromkeys([*setup.robot_sets, "base", "tool"])),
+            priors=setup.priors,
             extend="none",
-            max_iterations=max_iterations,
-            session=session,
+            max_iterations=setup.options.max_iterations,
+            session=setup.options.session,
             turned="none",
-            executor=executor,
+            executor=setup.options.executor,
         )
-        begun = cameras.fit_image_session(chain, data, holdout, of_poses, partial(start, errors=errors), arm)
+        begun = cameras.fit_image_session(
+            setup.chain,
+            setup.data,
+            setup.holdout,
+            of_poses,
+            partial(start, errors=setup.errors),
+            arm_type(setup.robot_sets),
+        )
     else:
-        begun = SessionFit(start(data, errors), holdout)
-    if has_images(data):
-        _require_frames(begun.fit, [*robot_sets, *rig_sets])
-    # The confirmation of changes and the calibration itself often need the same fits.
-    groups = _prior_groups(begun.fit, priors)
-    reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
-    extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
-    if finds_session and can_have_session((*data, *holdout)):
-        models = SessionModels(
-            errors,
-            start,
-            lambda fit: reweighted(fit, AUTO),
-            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS)[0],
-            HAND_BUILT if signs else MANUFACTURED,
-        )
-        begun = fit_session(begun.fit, data, holdout, models, session == "auto", progress)
-    fit, holdout, found = begun.fit, begun.holdout, begun.session
-    if method != "lm":
-        return replace(make_result(fit, 1.0, holdout, method), **settings)
-    stages = robust.LOSSES[loss].stages
-    if has_images(data) and priors != "none":
-        fitting = cameras.ImageFitting(groups, stages, max_iterations, progress, arm)
-        images = cameras.calibrate_images(fitting, fit, chain, holdout, exchanges, families)
-        others = tuple(item for item in data if item.rig is None)
-        if finds_session and measures_positions(others) and has_enough_rows(others):
-            alone = start(others, errors)
-            alone = reweight(alone, stages, _prior_groups(alone, priors), max_iterations, progress)
-            # Images beside them do not show a scale: the corners of a board can take part of it.
-            if scale := find_scale(alone.problem, alone.solution.x):
-                found = found or Session(order_samples(others, ()), chain, session == "auto")
-                files = tuple(dict.fromkeys(item.source for item in others if item.source))
-                found = replace(found, scales=(replace(scale, files=files),))
-        return replace(images, session=found, **settings)
-    fit = reweighted(fit, stages)
-    if found and (scale := find_scale(fit.problem, fit.solution.x)):
-        found = replace(found, scales=(*found.scales, scale))
-    result = _calibrate_samples(fit, groups, families, holdout, extended, signs, begun.diagnosis, progress)
-    return replace(result, session=found, **settings)
+        begun = SessionFit(start(setup.data, setup.errors), setup.holdout)
+    _require_frames(begun.fit, [*setup.robot_sets, *setup.rig_sets])
+    return begun
 
 
 def _joint_signs(
@@ -286,12 +331,22 @@ def _joint_signs(
     return plausibility.decide_signs(chain, data)
 
 
-def _full_set_priors(chain: Chain, priors: Priors) -> Priors:
-    """Return the priors for all parameters of the arm, without those of other parameters."""
-    if not isinstance(priors, Mapping):
-        return priors
-    names = [p.name for p in select_parameters(chain, model_selection.FULL_SET).parameters]
-    return {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
+def _suggests_full_set(setup: _Setup) -> bool:
+    """Return whether all errors of the arm may be suggested in place of the chosen parameters."""
+    options = setup.options
+    is_deliberate = options.method != "lm" or bool(options.fix or options.free or options.bounds)
+    if is_deliberate or not has_joint_values((*setup.data, *setup.holdout)):
+        return False
+    return model_selection.is_restricted([*setup.robot_sets, *setup.rig_sets])
+
+
+def _full_set(setup: _Setup) -> dict[str, Any]:
+    """Return the options that estimate all errors of the arm, without the priors of other parameters."""
+    priors = setup.priors
+    if isinstance(priors, Mapping):
+        names = [p.name for p in select_parameters(setup.chain, model_selection.FULL_SET).parameters]
+        priors = {key: std for key, std in priors.items() if fnmatch.filter(names, key)}
+    return {"parameters": model_selection.FULL_SET, "priors": priors, "extend": "none"}
 
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
@@ -327,44 +382,26 @@ def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:
     return PriorGroups.from_expected(errors, fit.problem.weights, has_default_prior(errors, priors))
 
 
-@dataclass(frozen=True)
-class _SolverOptions:
-    """Options of the solver."""
-
-    method: Method
-    is_robust: bool
-    max_iterations: int
-    progress: Progress | None
-    executor: TaskExecutor
-
-
-def _first_fit(
-    data: tuple[Measurement, ...],
-    errors: ErrorModel,
-    first: Mapping[str, float],
-    priors: Priors,
-    known: Mapping[str, float],
-    bounds: Mapping[str, tuple[float, float]] | None,
-    options: _SolverOptions,
-) -> Fit:
+def _first_fit(setup: _Setup, data: tuple[Measurement, ...], errors: ErrorModel) -> Fit:
     """Initialize base, tool and instruments, and solve for the first time, from first errors of the robot."""
+    options, first = setup.options, setup.first
     started = replace(errors, chain=errors.at(_start(errors, first))) if first else errors
     if has_images(data):
         data = cameras.with_common_start(errors.chain, data)
-    started, data, weights = _initialize(started, data, known, options.max_iterations, options.is_robust)
+    started, data, weights = _initialize(started, data, setup.known, options)
     if not first:
         errors = started
     distortion: Mapping[str, float] = {}
     if has_images(data):
         data, distortion = cameras.with_stated_distortion(data)
-    problem = make_problem(errors, data, prior_weights(errors, priors), known)
+    problem = make_problem(errors, data, prior_weights(errors, setup.priors), setup.known)
     problem = replace(problem, executor=options.executor)
-    if priors == "none":
+    if setup.priors == "none":
         problem = problem.with_prior_weights(np.zeros(len(problem.weights)))
-    if bounds:
-        problem = replace(problem, bounds=_bounds(problem, bounds))
+    if options.bounds:
+        problem = replace(problem, bounds=_bounds(problem, options.bounds))
     start = np.concatenate([_start(errors, first), problem.instrument_start(distortion)])
-    return _solve(problem, start, weights, options.method, options.max_iterations, options.progress)
+    return _solve(problem, start, weights, options, setup.progress)
 
 
 def _at_measured_temperature(chain: Chain, data: Sequence[Measurement]) -> Chain:
@@ -396,42 +433,63 @@ def _start(errors: ErrorModel, first: Mapping[str, float]) -> Array:
 
 
 def _calibrate_samples(
-    fit: Fit,
+    setup: _Setup,
+    begun: SessionFit,
     groups: PriorGroups,
-    families: Sequence[str],
-    holdout: tuple[Measurement, ...],
     extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
-    signs: plausibility.SignDecision | None,
-    diagnosis: Diagnosis | None,
-    progress: Progress | None,
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
+    fit, holdout, families = begun.fit, begun.holdout, setup.families
     inliers = fit.without_rejected().problem
     shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
     result = make_result(fit, shrinkage_factor, holdout, "lm")
-    result = replace(result, signs=signs, earlier_diagnosis=diagnosis)
+    result = replace(result, signs=setup.signs, earlier_diagnosis=begun.diagnosis)
     # Residuals of mixed-up measurements say nothing about other errors.
     if families and shrinkage_factor == 1:
-        result = replace(result, earlier_diagnosis=diagnose(result, progress))
+        result = replace(result, earlier_diagnosis=diagnose(result, setup.progress))
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
     fit, extension = extended(fit, families)
     result_with_families = make_result(fit, shrinkage_factor, holdout, "lm")
-    return replace(result_with_families, signs=signs, extension=extension, earlier_diagnosis=result.diagnosis)
+    return replace(
+        result_with_families, signs=setup.signs, extension=extension, earlier_diagnosis=result.diagnosis
+    )
+
+
+def _calibrate_images(setup: _Setup, begun: SessionFit, groups: PriorGroups) -> Result:
+    """Calibrate from images, and look for the scale of the positions beside them."""
+    options, found = setup.options, begun.session
+    stages = robust.LOSSES[options.loss].stages
+    fitting = cameras.ImageFitting(
+        groups, stages, options.max_iterations, setup.progress, arm_type(setup.robot_sets)
+    )
+    result = cameras.calibrate_images(
+        fitting, begun.fit, setup.chain, begun.holdout, setup.exchanges, setup.families
+    )
+    others = tuple(item for item in setup.data if item.rig is None)
+    if setup.finds_session and measures_positions(others) and has_enough_rows(others):
+        alone = _first_fit(setup, others, setup.errors)
+        groups = _prior_groups(alone, setup.priors)
+        alone = reweight(alone, stages, groups, options.max_iterations, setup.progress)
+        # Images beside them do not show a scale: the corners of a board can take part of it.
+        if scale := find_scale(alone.problem, alone.solution.x):
+            found = found or Session(order_samples(others, ()), setup.chain, options.session == "auto")
+            files = tuple(dict.fromkeys(item.source for item in others if item.source))
+            found = replace(found, scales=(replace(scale, files=files),))
+    return replace(result, session=found)
 
 
 def _initialize(
     errors: ErrorModel,
     data: tuple[Measurement, ...],
     known: Mapping[str, float],
-    max_iterations: int,
-    is_robust: bool,
+    options: _Options,
 ) -> tuple[ErrorModel, tuple[Measurement, ...], list[Array]]:
     """Initialize base, tool and instruments."""
-    started = initialize_frames(errors, data, known, max_iterations)
+    started = initialize_frames(errors, data, known, options.max_iterations)
     items = tuple(item.initialized(started.chain) for item in data)
     weights = [np.ones(len(item.rows)) for item in data]
-    if not is_robust:
+    if options.method != "lm" or options.loss == "linear":
         return started, items, weights
     if all(len(item.positions()) == len(item.rows) for item in data):
         is_gross = gross_outliers(started.chain, data)
@@ -440,23 +498,16 @@ def _initialize(
         is_gross = find_initial_outliers(started if has_positions else errors, data, known)
         if any(each.any() for each in is_gross):
             kept = tuple(item.take(~each) for item, each in zip(data, is_gross, strict=True))
-            started = initialize_frames(errors, kept, known, max_iterations)
+            started = initialize_frames(errors, kept, known, options.max_iterations)
             items = tuple(
                 item.initialized_from(started.chain, ~each) for item, each in zip(data, is_gross, strict=True)
             )
     return started, items, [np.where(each, robust.ZERO_WEIGHT, 1.0) for each in is_gross]
 
 
-def _check_options(
-    data: Sequence[Measurement],
-    parameters: str | Iterable[str] | None,
-    method: str,
-    loss: str,
-    bounds: Mapping[str, tuple[float, float]] | None,
-    session: str,
-    max_iterations: int,
-) -> None:
+def _check_options(options: _Options, data: Sequence[Measurement]) -> None:
     """Raise an error if there are no data, an option is unknown, or options contradict each other."""
+    parameters, method, loss = options.parameters, options.method, options.loss
     if not sum(len(item.rows) for item in data):
         raise InvalidArgumentError("no measurements to fit; expected at least one sample")
     if not isinstance(parameters, Iterable | None):
@@ -467,16 +518,16 @@ def _check_options(
         raise UnknownNameError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
     if loss not in robust.LOSSES:
         raise UnknownNameError(f"unknown loss {loss!r}; choose from {', '.join(robust.LOSSES)}")
-    if session not in get_args(SessionOption):
+    if options.session not in get_args(SessionOption):
         choices = ", ".join(get_args(SessionOption))
-        raise UnknownNameError(f"unknown session option {session!r}; choose from {choices}")
-    if max_iterations < 1:
-        raise InvalidArgumentError(f"max_iterations is {max_iterations}; expected at least 1")
+        raise UnknownNameError(f"unknown session option {options.session!r}; choose from {choices}")
+    if options.max_iterations < 1:
+        raise InvalidArgumentError(f"max_iterations is {options.max_iterations}; expected at least 1")
     if loss not in ("auto", "linear") and method != "lm":
         raise InvalidArgumentError(
             f"loss {loss!r} requires method 'lm'; method {method!r} weights all samples equally"
         )
-    if bounds and method != "lm":
+    if options.bounds and method != "lm":
         raise InvalidArgumentError(f"bounds require method 'lm'; method {method!r} does not support bounds")
 
 
@@ -538,23 +589,23 @@ def _solve(
     problem: Problem,
     start: Array,
     weights: Sequence[Array],
-    method: Method,
-    max_iterations: int,
+    options: _Options,
     progress: Progress | None,
 ) -> Fit:
     """Solve a problem with given weights; `reweight` iterates method "lm" to full convergence later."""
     data = problem.data
     if any((w != 1).any() for w in weights):
         problem = problem.with_data([item.with_weights(w) for item, w in zip(data, weights, strict=True)])
-    options: dict[str, Any] = {"loose": True} if method == "lm" else {}
+    method, max_iterations = options.method, options.max_iterations
+    further: dict[str, Any] = {"loose": True} if method == "lm" else {}
     if progress:
-        options["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
-    solution = minimize(problem, method, start, max_iterations, **options)
+        further["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
+    solution = minimize(problem, method, start, max_iterations, **further)
     fit = Fit(data, problem, solution, tuple(weights))
     errors = problem.errors
     if not errors.has_transmission:
         return fit
     # Gravity torques depend on the identified robot: solve again with those of the solution.
     problem = replace(problem, errors=errors.with_current_loads(solution.x[: len(errors.parameters)]))
-    second = minimize(problem, method, solution.x, max_iterations, **options)
+    second = minimize(problem, method, solution.x, max_iterations, **further)
     return replace(fit, problem=problem, solution=second, previous_iterations=solution.iterations)
