@@ -130,7 +130,8 @@ def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
     """
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
-        return next_iterate(problem, minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True))
+        loose = minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True)
+        return next_iterate(problem, loose, MAX_REFIT_ITERATIONS)
     if not fit.converged:
         with suppress(DhcalError):  # method "gn" may diverge on few samples
             return minimize(problem, fit.method, nominal, min(fit.iterations, MAX_REFIT_ITERATIONS)).x

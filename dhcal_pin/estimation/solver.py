@@ -21,8 +21,13 @@ In a narrow curved valley damped steps downhill become tiny, while undamped Gaus
 uphill and then arrive at the minimum. From time to time, and when only damped steps have become negligible,
 a series of undamped steps is tried, and kept if the cost falls.
 
+Where such a series fails, rotations make the valley curved, such as those of a tool and of a board on it that
+turns back: no row changes, but the board moves along a circle. Translations are linear. From then on D counts
+rotations more, so that steps in directions that several unknowns share are translations.
+
 The iteration has converged if a step changes the rows by less than 1e-8 of their norm, or by less than
-rounding, at small damping.
+rounding, at small damping. In a curved valley it has converged, too, if the undamped step no longer shrinks
+and is short against the standard deviations of the unknowns.
 
 **Gauss-Newton** is the iteration of the paper, equations (36) to (39): x ← x + R⁺·z with a pseudo-inverse of
 fixed rank cut, without damping.
@@ -116,10 +121,13 @@ def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
     return np.clip(scaled, low, high) / scale
 
 
-def next_iterate(problem: Problem, solution: SolverResult) -> Array:
-    """Compute the point that one undamped step reaches from a loose solution."""
+def next_iterate(problem: Problem, solution: SolverResult, max_iterations: int = 100) -> Array:
+    """Compute the point that one undamped step reaches from a loose solution, or iterate if the cost rises."""
     system = solution.system.with_priors(problem.weights, solution.x)
-    return solution.x + bounded_step(problem, system, solution.x)
+    end = solution.x + bounded_step(problem, system, solution.x)
+    if problem.cost(end) <= _cost(problem, solution.system, solution.x):
+        return end
+    return minimize(problem, "lm", solution.x, max_iterations, warm_start=solution).x
 
 
 def _undamped_change(problem: Problem, data: TriangularSystem, x: Array) -> float:
@@ -241,6 +249,9 @@ def levenberg_marquardt(
     damping, scale, last_change = state.damping, state.scale, state.last_change
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
     growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
+    is_rotation = np.array([parameter.unit == "rad" for parameter in problem.parameters], bool)
+    # Whether a series of undamped steps has failed, and the change of the rows by one undamped step since then.
+    is_curved, remaining = False, math.inf
     last_step = state.last_step
     system = warm_start.system if warm_start else linear_system(problem, x)
     cost = _cost(problem, system, x)
@@ -248,6 +259,11 @@ def levenberg_marquardt(
         start, accepted_system = x, None
         undamped = system.with_priors(problem.weights, x)
         roundoff, residual_norm = undamped.roundoff, math.sqrt(cost)
+        if is_curved:
+            last_remaining, remaining = remaining, _undamped_change(problem, system, x)
+            if rules.is_slow_and_short(remaining, last_remaining):
+                converged = True
+                break
         if (
             loose
             and damping < rules.MAX_CONVERGED_DAMPING
@@ -257,6 +273,8 @@ def levenberg_marquardt(
             return SolverResult(x, system, iteration, False, np.array(iterates), state)
         scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
         damping_scale = np.where(scale > 0, scale, 1.0)
+        if is_curved:
+            damping_scale[is_rotation] *= rules.CURVED_ROTATION_FACTOR
         # Whether steps have become negligible although the undamped step is not.
         stalled = False
         iteration += 1
@@ -311,10 +329,12 @@ def levenberg_marquardt(
             and not _is_stationary(problem, undamped, start, cost, last_change, roundoff)
         ):
             stalled, converged = True, False
+        if converged and is_curved:
+            converged = remaining <= rules.MAX_DEVIATION
         if not converged and (stalled or rules.undamped_steps_are_due(iteration, last_undamped)):
-            last_undamped = iteration
+            last_undamped, damped_end = iteration, x
             x, cost = _undamped_steps(problem, x, cost)
-            accepted_system = None
+            is_curved, accepted_system = x is damped_end, None
         # Unknown if x did not move, or only by undamped steps after a rejection.
         has_moved = x is not start and growth == rules.INITIAL_GROWTH
         last_change = change if has_moved else 0.0

@@ -75,6 +75,12 @@ EXTRAPOLATED_SHARES = 1.0, 0.5, 0.25
 UNDAMPED_INTERVAL = 8
 N_UNDAMPED_STEPS = 6
 
+# Factor on the column scales of rotations after a series of undamped steps has failed.
+CURVED_ROTATION_FACTOR = 1000.0
+# Largest ratio of an undamped step to its standard deviation, in any direction, that means convergence in a
+# curved valley. The cost falls by the square of it.
+MAX_DEVIATION = 0.1
+
 # Absolute value of a parameter error [m or rad] above which an iteration has diverged.
 DIVERGENCE_LIMIT = 1e6
 
@@ -177,6 +183,15 @@ def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
     that of the last.
     """
     return (iteration >= UNDAMPED_INTERVAL) & (iteration >= 2 * last_undamped)
+
+
+def is_slow_and_short(remaining: float, last_remaining: float) -> bool:
+    """Decide whether undamped steps are short against the standard deviations, and hardly become shorter.
+
+    The arguments are the changes of the whitened rows by an undamped step, now and one iteration before. Each is
+    the largest ratio of the step to its standard deviation in any direction.
+    """
+    return remaining <= MAX_DEVIATION and remaining > MIN_SLOW_RATIO * last_remaining
 
 
 def has_diverged(x: Array) -> Any:
