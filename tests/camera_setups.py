@@ -10,10 +10,10 @@ from robots import paper
 from dhcal_pin import Chain, read_robot, select_parameters
 from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.estimation.error_model import ErrorModel
-from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise
 from dhcal_pin.measurements.mounting import MountedRig, mount_rig
 from dhcal_pin.robot.inverse_kinematics import pose_task, solve_ik
-from dhcal_pin.se3 import exp3, inverse, transform
+from dhcal_pin.se3 import exp3, exp6, inverse, transform
 
 ARMS = {
     "ur10": lambda: read_robot("example:ur10", tip="tool0"),
@@ -310,6 +310,40 @@ def turned_configurations(
     start = np.clip(home + rng.normal(0, 0.3, (count, chain.n_joints)), chain.lower, chain.upper)
     q, errors = solve_ik(chain, pose_task(targets, 0.3), start)
     return q[errors < 1e-6]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedSetup:
+    """Positions by a tracker, and images by two fixed cameras of an arm that keeps the orientation of its tool.
+
+    Attributes:
+        nominal: Nominal robot.
+        truth: Robot that was measured, with base and tool.
+        data: Positions and images, with the true poses of the cameras in the rig.
+    """
+
+    nominal: Chain
+    truth: Chain
+    data: tuple[Measurement, ...]
+
+
+def tracked_setup(name: str, size: float, seed: int, sigma: float = 0.2) -> TrackedSetup:
+    """Simulate an arm with errors of a size [m], and images with noise of sigma [px]."""
+    rng, chain = np.random.default_rng(seed), ARMS[name]()
+    truth = wrong_arm(chain, size, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=False, n_images=10, sigma=sigma, n_cameras=2)
+    home = np.clip(setup.images.q.mean(0), chain.lower, chain.upper)
+    q = turned_configurations(truth, home, rng, np.zeros((1, 3)))
+    rows = visible_corners(truth, setup.exact.rig, q)[: rng.integers(20, 41)]
+    base, tool = (exp6(np.r_[rng.uniform(-v, v, 3), rng.uniform(-1, 1, 3)]) for v in (2, 0.15))
+    true_poses = [base @ camera.pose for camera in setup.exact.rig.cameras]
+    rig = replace(setup.images.rig, cameras=tuple(map(located, setup.images.rig.cameras, true_poses)))
+    q, camera, board, corner, pixels = (np.concatenate(each) for each in zip(*rows, strict=True))
+    names = [f"camera{i}" for i in camera], [f"board{i}" for i in board]
+    images = CameraCorners(q, pixels + sigma * rng.standard_normal(pixels.shape), corner, rig, *names)
+    placed = truth.with_base_and_tool(base, tool)
+    q = rng.uniform(np.maximum(chain.lower, -2.2), np.minimum(chain.upper, 2.2), (40, chain.n_joints))
+    return TrackedSetup(chain, placed, (KINDS["position"].simulate(placed, q, Noise(5e-5), rng), images))
 
 
 def photograph(setup: Setup, q: np.ndarray, rng: np.random.Generator, n_images: int) -> CameraCorners:

@@ -10,7 +10,9 @@ The limits separate simulated mistakes from honest measurements of robots with e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -19,6 +21,8 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
+from ..estimation.solver import minimize
+from ..exceptions import ConvergenceError
 from ..formatting import capitalized, format_below, format_quantity, join_names
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
@@ -63,6 +67,8 @@ MAX_HIDDEN_RATIO = 2.0
 PART_OF_POSITION = "the measurements show only a part of the position"
 # Largest number of iterations of such a fit.
 MAX_FRAME_ITERATIONS = 20
+# Largest number of further iterations that are tried where a fit did not converge.
+MAX_CONTINUED = 500
 # A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
 # standard errors, and by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
@@ -345,13 +351,31 @@ def _convergence(fit: Evidence) -> list[Finding]:
     """Refuse a fit that did not converge: its values are those of an arbitrary last step."""
     if fit.converged:
         return []
-    return [
-        Finding(
-            "refused",
-            f"The fit did not converge in {fit.iterations} iterations. Identify fewer parameters, measure "
-            "more poses, or allow more iterations (--max-iterations).",
-        )
-    ]
+    remedy = _remedy(fit) or f"It did not in {MAX_CONTINUED} more, either."
+    return [Finding("refused", f"The fit did not converge in {fit.iterations} iterations. {remedy}")]
+
+
+def _remedy(fit: Evidence) -> str:
+    """Name options with which the fit converges; empty if none is known."""
+    if limit := _sufficient_iterations(fit):
+        return f"Allow more (--max-iterations {limit})."
+    if fit.method == "lm" or fit.with_auto is None:
+        return ""
+    other, option = fit.with_auto(), AUTO_OPTIONS[fit.method]
+    if other.converged:
+        return f"Use {option}."
+    limit = _sufficient_iterations(other)
+    return f"Use {option} --max-iterations {limit}." if limit else ""
+
+
+def _sufficient_iterations(fit: Evidence) -> int | None:
+    """Return a limit of iterations, in hundreds, with which the last solution converges; None without one."""
+    limit = 100 * math.ceil((fit.solution.iterations + MAX_CONTINUED) / 100)
+    options = {"warm_start": fit.solution} if fit.method == "lm" else {}
+    with suppress(ConvergenceError):
+        if minimize(fit.problem, fit.method, fit.solution.x, limit, **options).converged:
+            return limit
+    return None
 
 
 def _implausible_correction(fit: Evidence) -> list[Finding]:

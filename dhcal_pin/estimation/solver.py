@@ -122,7 +122,7 @@ def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
 
 
 def next_iterate(problem: Problem, solution: SolverResult, max_iterations: int = 100) -> Array:
-    """Compute the point that one undamped step reaches from a loose solution, or iterate if the cost rises."""
+    """Compute the point that an undamped step reaches from a loose solution; iterate if the cost rises."""
     system = solution.system.with_priors(problem.weights, solution.x)
     end = solution.x + bounded_step(problem, system, solution.x)
     if problem.cost(end) <= _cost(problem, solution.system, solution.x):
@@ -187,7 +187,7 @@ def gauss_newton(
             progress(iteration, cost)
         if has_diverged(x):
             raise ConvergenceError(
-                "method gn: the iteration diverged; use --method lm, more poses, or fix parameters"
+                "method gn: the iteration diverged; use --method lm, or fix parameters"
             )
     system = linearize_and_factor(problem, x, small_angle=False)
     return SolverResult(x, system, iteration, converged, np.array(iterates))
@@ -250,7 +250,7 @@ def levenberg_marquardt(
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
     growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
     is_rotation = np.array([parameter.unit == "rad" for parameter in problem.parameters], bool)
-    # Whether a series of undamped steps has failed, and the change of the rows by one undamped step since then.
+    # Whether a series of undamped steps has failed, and the change of the rows by one undamped step.
     is_curved, remaining = False, math.inf
     last_step = state.last_step
     system = warm_start.system if warm_start else linear_system(problem, x)

@@ -80,6 +80,8 @@ CURVED_ROTATION_FACTOR = 1000.0
 # Largest ratio of an undamped step to its standard deviation, in any direction, that means convergence in a
 # curved valley. The cost falls by the square of it.
 MAX_DEVIATION = 0.1
+# Undamped steps that are longer than this fraction of the one before do not converge.
+MIN_CREEPING_RATIO = 0.9
 
 # Absolute value of a parameter error [m or rad] above which an iteration has diverged.
 DIVERGENCE_LIMIT = 1e6
@@ -188,10 +190,10 @@ def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
 def is_slow_and_short(remaining: float, last_remaining: float) -> bool:
     """Decide whether undamped steps are short against the standard deviations, and hardly become shorter.
 
-    The arguments are the changes of the whitened rows by an undamped step, now and one iteration before. Each is
-    the largest ratio of the step to its standard deviation in any direction.
+    The arguments are the changes of the whitened rows by an undamped step, now and one iteration before. Each
+    is the largest ratio of the step to its standard deviation in any direction.
     """
-    return remaining <= MAX_DEVIATION and remaining > MIN_SLOW_RATIO * last_remaining
+    return remaining <= MAX_DEVIATION and remaining > MIN_CREEPING_RATIO * last_remaining
 
 
 def has_diverged(x: Array) -> Any:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from camera_setups import tracked_setup
 from robots import joint_sample, measured_arm, robot_file
 from scipy.optimize import least_squares
 
@@ -16,7 +19,8 @@ from dhcal_pin.estimation import (
     select_parameters,
 )
 from dhcal_pin.estimation import solver_rules as rules
-from dhcal_pin.estimation.initialization import make_problem
+from dhcal_pin.estimation.initialization import initialize_frames, make_problem
+from dhcal_pin.estimation.solver import next_iterate, remaining_change
 from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
 from dhcal_pin.measurements import Noise, Position, SphereContact
 from dhcal_pin.robot import Chain
@@ -56,6 +60,48 @@ def test_a_loose_solution_is_not_a_step_that_damping_shortened(seed):
     start = np.zeros(len(problem.weights))
     full, loose = (levenberg_marquardt(problem, start, 100, loose=loose) for loose in (False, True))
     assert problem.cost(loose.x) <= 1.0001 * problem.cost(full.x)
+
+
+@pytest.fixture(scope="module")
+def curved_valley():
+    """Return the problem of a tracker, which does not show the rotation of the tool, and a board on the tool.
+
+    A board that turns back takes up that rotation, but moves along a circle. Images of a tool that keeps its
+    orientation hardly determine the displacement of board and cameras together.
+    """
+    setup = tracked_setup("panda", 1e-3, 3)
+    errors = initialize_frames(select_parameters(setup.nominal, "minimal,base,tool"), setup.data, {}, 100)
+    positions, images = (item.initialized(errors.chain) for item in setup.data)
+    images = images.with_scaled_sigma({"pixels": 0.2})
+    return make_problem(errors, (positions, images), 1 / errors.priors, {})
+
+
+def test_the_minimum_of_a_curved_valley_is_found(curved_valley):
+    """Without the rotation of the tool, which no row needs, the minimum has the same cost."""
+    start = np.zeros(len(curved_valley.weights))
+    found = levenberg_marquardt(curved_valley, start, 100)
+    is_rotation = np.array([p.name in ("tool.rx", "tool.ry", "tool.rz") for p in curved_valley.parameters])
+    without = curved_valley.with_prior_weights(np.where(is_rotation, 1e9, curved_valley.weights))
+    held = levenberg_marquardt(without, start, 100)
+    assert found.converged
+    assert held.converged
+    assert remaining_change(curved_valley, found.x) < 0.1
+    assert curved_valley.cost(found.x) == pytest.approx(curved_valley.cost(held.x), abs=0.1**2)
+
+
+def test_an_undamped_step_that_raises_the_cost_is_not_taken(curved_valley):
+    loose = levenberg_marquardt(curved_valley, np.zeros(len(curved_valley.weights)), 100, loose=True)
+    step = loose.system.with_priors(curved_valley.weights, loose.x).best_step()
+    assert curved_valley.cost(loose.x + step) > curved_valley.cost(loose.x)
+    assert curved_valley.cost(next_iterate(curved_valley, loose)) < curved_valley.cost(loose.x)
+
+
+@pytest.mark.parametrize(
+    ("remaining", "last_remaining", "expected"),
+    [(0.095, 0.1, True), (0.09, math.inf, False), (0.02, 0.1, False), (0.11, 0.12, False)],
+)
+def test_slow_steps_end_within_a_tenth_of_the_standard_deviations(remaining, last_remaining, expected):
+    assert rules.is_slow_and_short(remaining, last_remaining) == expected
 
 
 def test_steps_with_curved_rows_converge():
