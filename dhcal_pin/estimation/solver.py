@@ -186,9 +186,7 @@ def gauss_newton(
         if progress:
             progress(iteration, cost)
         if has_diverged(x):
-            raise ConvergenceError(
-                "method gn: the iteration diverged; use --method lm, or fix parameters"
-            )
+            raise ConvergenceError("method gn: the iteration diverged; use --method lm, or fix parameters")
     system = linearize_and_factor(problem, x, small_angle=False)
     return SolverResult(x, system, iteration, converged, np.array(iterates))
 

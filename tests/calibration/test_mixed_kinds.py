@@ -226,6 +226,23 @@ def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_t
     assert result.validate(images)["residual_rms"] < 1.2 * np.sqrt(2) * 1e3 * image_noise
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seed"), [("xarm7", 6211), ("panda", 3), ("ur10", 2)])
+def test_wrong_arms_beside_a_tracker_converge_where_the_tool_keeps_its_orientation(name, seed):
+    """The position of board and cameras is hardly known, and the rotation of the tool is not."""
+    setup = tracked_setup(name, 1e-3, seed)
+    result = calibrate(setup.nominal, setup.data)
+    low, high = np.maximum(setup.nominal.lower, -2.2), np.minimum(setup.nominal.upper, 2.2)
+    rng = np.random.default_rng(0)
+    left_out = KINDS["position"].simulate(setup.truth, rng.uniform(low, high, (300, len(low))), Noise(), rng)
+    assert result.converged
+    assert result.verdict.status == "ok"
+    assert result.validate(left_out)["position_rms_m"] < 8e-5
+    validation = result.generalization.cross_validated
+    assert validation is not None
+    assert validation.after.groups["pixels"].rms < 1.2 * np.sqrt(2) * 0.2
+
+
 @pytest.mark.parametrize(
     ("sets", "missing"),
     [("camera,board", "base,tool"), ("minimal,camera,board", "base,tool"), ("base,camera,board", "tool")],
