@@ -314,7 +314,7 @@ def turned_configurations(
 
 @dataclass(frozen=True, eq=False)
 class TrackedSetup:
-    """Positions by a tracker, and images by two fixed cameras of an arm that keeps the orientation of its tool.
+    """Positions by a tracker, and images by two fixed cameras; the arm keeps the orientation of its tool.
 
     Attributes:
         nominal: Nominal robot.

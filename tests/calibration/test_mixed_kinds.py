@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, simulate, wrong_arm
+from camera_setups import ARMS, simulate, tracked_setup, wrong_arm
 from scipy.stats import chi2, norm
 from slow_cases import some_slow
 
@@ -240,7 +240,7 @@ def test_wrong_arms_beside_a_tracker_converge_where_the_tool_keeps_its_orientati
     assert result.validate(left_out)["position_rms_m"] < 8e-5
     validation = result.generalization.cross_validated
     assert validation is not None
-    assert validation.after.groups["pixels"].rms < 1.2 * np.sqrt(2) * 0.2
+    assert validation.after.groups["pixels"].rms < 1.5 * np.sqrt(2) * 0.2
 
 
 @pytest.mark.parametrize(
