@@ -29,7 +29,7 @@ from dhcal_pin.session.facts import Scale
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import TIME_CONSTANTS, WIDTHS, _Search
+from dhcal_pin.session.search import TIME_CONSTANTS, _Search
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -144,7 +144,7 @@ def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
         squares = np.sum((target - q @ (q.T @ target)) ** 2)
         return -np.sum(np.log(np.abs(np.diag(r)))) - 0.5 * squares
 
-    gain = max(map(log_likelihood, WIDTHS)) - log_likelihood(0.0)
+    gain = max(map(log_likelihood, np.geomspace(1e-6, 1, 100))) - log_likelihood(0.0)
     n_steps, n_causes = len(search.edges), len(search.layout.blocks)
     expected = gain - np.log(n_steps * n_causes)
     assert cause.log_evidence == pytest.approx(expected, abs=0.25 * len(cause.values))
@@ -440,6 +440,19 @@ def test_a_lag_is_found_and_mended():
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
     assert session_of(mended).lag is None
     assert simulation.true_error(mended.chain) <= 1.5 * clean.true_error(expected.chain)
+
+
+def test_a_lag_is_tried_as_the_only_cause():
+    with_lag, without = (search_of(Changes("base", 2e-3, lag=lag)) for lag in (0.4, 0.0))
+    for search in (with_lag, without):
+        search.run()
+        assert "base" in [cause.block.kind for cause in search.causes]
+    alone = with_lag.with_lag_alone()
+    assert alone is not None
+    (cause,) = alone.causes
+    assert cause.block.kind == "lag"
+    assert cause.values == pytest.approx([0.4], abs=0.01)
+    assert without.with_lag_alone() is None
 
 
 @pytest.mark.parametrize(
