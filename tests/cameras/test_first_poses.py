@@ -211,8 +211,8 @@ def test_wrong_points_near_a_plane_do_not_agree(depth):
         np.testing.assert_array_equal(agreeing_points(points, image + np.array([3.0, 2.0])), agrees)
 
 
-def views(rng, count, points=CHECKERBOARD):
-    values = np.array([640.0, 660.0, 650.0, 350.0, 0, 0, 0, 0, 0])
+def views(rng, count, points=CHECKERBOARD, centre=(650.0, 350.0)):
+    values = np.array([640.0, 660.0, *centre, 0, 0, 0, 0, 0])
     out = []
     for _ in range(count):
         pose = random_pose(rng)
@@ -224,6 +224,13 @@ def views(rng, count, points=CHECKERBOARD):
 def test_intrinsics_from_views_of_a_board():
     values, seen = views(np.random.default_rng(1), 6)
     np.testing.assert_allclose(intrinsics_candidates(seen, CAMERA)[0], values[:4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("centre", [(1100.0, 350.0), (200.0, 350.0), (650.0, 650.0), (650.0, 100.0)])
+def test_the_centre_of_a_lens_is_near_the_middle_of_the_image(centre):
+    _, seen = views(np.random.default_rng(1), 6, centre=centre)
+    for found in intrinsics_candidates(seen, CAMERA):
+        np.testing.assert_array_equal(found[2:], CAMERA.image_centre)
 
 
 @pytest.mark.parametrize("depth", [1e-3, 2e-2, 0.2])
