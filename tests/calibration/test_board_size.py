@@ -10,6 +10,7 @@ from camera_setups import ARMS, simulate, wrong_arm
 from slow_cases import some_slow
 
 import dhcal_pin as dh
+from dhcal_pin.calibration.cameras.board_size import _scaled
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -74,3 +75,13 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
     if fit.board_size:
         assert "size of the boards may be wrong" in fit.verdict.reasons[0]
         assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)
+
+
+def test_estimated_corners_have_the_size_of_their_board():
+    arm, images = photograph(3, 5e-4)
+    (board,) = images.rig.boards
+    images = with_rig(images, boards=(replace(board, has_free_points=True),)).initialized(arm)
+    larger = _scaled(images, 1.1)
+    assert isinstance(larger, CameraCorners)
+    (points,) = larger.points(np.array([p.nominal for p in larger.instrument_parameters]))
+    np.testing.assert_allclose(points, 1.1 * board.points, atol=1e-12)

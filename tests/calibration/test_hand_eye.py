@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_setups import ARMS
 from hand_eye_setups import SIGMA, faulty_setup
 from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.causes import (
+    ARM_SETS,
+    GEOMETRY,
     Causes,
     HandEyeData,
     apply_causes,
@@ -25,6 +28,7 @@ from dhcal_pin.calibration.cameras.causes import (
 from dhcal_pin.calibration.cameras.diagnosis import (
     HandEyeDiagnosis,
     Trial,
+    _arm_text,
     _lens_text,
     _without_rigid_motion,
 )
@@ -369,6 +373,20 @@ def test_a_change_of_one_coefficient_is_one_of_the_distortion():
     state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
     hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
     assert "distortion of camera" in _lens_text(hand_eye, state)[0]
+
+
+@pytest.mark.parametrize(
+    ("parameter", "moved"),
+    [("shoulder_pan_joint.x", "the axis of shoulder_pan_joint"), ("wrist_3_joint.y", "the tool")],
+)
+def test_the_part_of_the_arm_that_moves_is_named(parameter, moved):
+    """The last axis of a UR10 is the y axis of its frame: a shift along it moves the tool only."""
+    errors = select_parameters(ARMS["ur10"](), ARM_SETS[GEOMETRY])
+    x = np.array([1e-3 * (p.name == parameter) for p in errors.parameters])
+    fit = SimpleNamespace(problem=SimpleNamespace(errors=errors), solution=SimpleNamespace(x=x))
+    state: Any = SimpleNamespace(fit=fit, causes=Causes(arm=ARM_SETS[GEOMETRY]))
+    hand_eye: Any = SimpleNamespace(is_arm_tried=False)
+    assert f"move {moved} by 1.000 mm" in _arm_text(hand_eye, state)[0]
 
 
 def test_a_rigid_motion_does_not_bend_a_board():
