@@ -16,7 +16,7 @@ from slow_cases import some_slow
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
 from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, _images_of, exchange_axes, reorder
-from dhcal_pin.calibration.cameras.gate import cluster_folds
+from dhcal_pin.calibration.cameras.gate import _far_points, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.cameras import Board
 from dhcal_pin.exceptions import DhcalError
@@ -481,6 +481,15 @@ def test_clusters_hold_out_every_image_once(arm):
     np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), 1)
     for (mask,) in folds:
         assert all(len(set(mask[data.image == number])) == 1 for number in range(data.n_images))
+
+
+def test_clusters_start_in_the_middle_and_far_from_it():
+    points = np.random.default_rng(5).uniform(-0.3, 0.3, (40, 2))
+    points[7] = 0
+    points[[3, 11, 20, 38]] = [[2, 2], [-2, 2], [2, -2], [-2, -2]]
+    first, *others = _far_points(points)
+    assert first == 7
+    assert sorted(others) == [3, 11, 20, 38]
 
 
 def test_clusters_are_regions_of_joint_space(arm):
