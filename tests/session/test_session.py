@@ -191,7 +191,9 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
 
 
-@pytest.mark.parametrize("changes", [Changes("base", 3e-4), Changes("base", 1e-3, at=None)])
+@pytest.mark.parametrize(
+    "changes", [Changes("base", 3e-4), Changes("base", 1e-3, at=None), Changes("base", 1e-3, n_outliers=3)]
+)
 def test_coefficients_of_the_score_test_are_those_of_a_fit(changes):
     search = search_of(changes)
     cause = search.best_cause(search.first_fit)
