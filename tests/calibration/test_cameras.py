@@ -266,7 +266,10 @@ def test_stages_show_a_board_that_is_not_as_stated(choice):
     data = dh.CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig)
     fit = dh.calibrate(chain, data, loss="linear")
     assert [stage.name for stage in fit.camera_stages] == ["frames", "intrinsics", "target points", "arm"]
-    _, stated_points, free_points, arm = fit.camera_stages
+    frames, stated_points, free_points, arm = fit.camera_stages
+    # The rig does not fix poses and lens.
+    assert frames.is_kept
+    assert stated_points.is_kept
     assert free_points.is_kept == has_free_points
     assert stated_points.by_region is not None
     assert free_points.by_region is not None

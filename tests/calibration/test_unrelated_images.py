@@ -24,6 +24,8 @@ def require_refusal(fit):
     (reason,) = fit.verdict.reasons
     assert re.search(MESSAGE, reason)
     assert fit.hand_eye is None
+    # A correction is made smaller, if at all.
+    assert 0 <= fit.shrinkage_factor <= 1
 
 
 @pytest.mark.parametrize(("seed", "n_images"), some_slow([(2, 8), (1, 6), (0, 12), (1, 12)], {0}))
