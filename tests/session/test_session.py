@@ -191,6 +191,15 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     assert search._best_place(fit, fit.rows[..., -1], 40) == 40
 
 
+@pytest.mark.parametrize(("place", "found"), [(2, 3), (20, 20), (58, 57)])
+def test_a_step_has_three_samples_on_either_side(place, found):
+    """The samples show a step at one place; the fit has it at another one."""
+    search, change, number = search_of(Changes()), np.ones((60, 6)), np.arange(60)[:, None]
+    residual = change * ((number >= place) * 1.0 - (number >= 40))
+    fit = replace(search.first_fit, rows=residual[..., None])
+    assert search._best_place(fit, change, 40) == found
+
+
 @pytest.mark.parametrize(
     "changes", [Changes("base", 3e-4), Changes("base", 1e-3, at=None), Changes("base", 1e-3, n_outliers=3)]
 )
