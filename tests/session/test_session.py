@@ -121,17 +121,20 @@ def search_of(changes, n_cells=60, is_ordered=True, prior_factor=1.0):
     return _Search(problem, start, timeline, is_ordered, 60, n_cells)
 
 
-def log_evidence_of(search, cause, noise, applied):
+def log_evidence_of(search, cause, noise, applied, others=()):
     """Return the logarithm of the ratio of the marginal likelihoods with and without a step.
 
     Those of Gaussian data with a noise, whose coefficients have a prior of the best width. The measurements
-    are those without the changes `applied` of the step.
+    are those without the changes `applied` of the step. Other causes belong to the model, with wide priors.
     """
     rows = search.linearize() / noise[..., None]
     model = rows[..., search.layout.model].reshape(rows[..., 0].size, -1)
     step = cause.columns_of(rows, search.numbers, search.times).reshape(len(model), -1)
     values = rows[..., -1].ravel() + model @ search.x + step @ applied
     factor = model / search.layout.weights
+    for other in others:
+        columns = other.columns_of(rows, search.numbers, search.times).reshape(len(model), -1)
+        values, factor = values + columns @ other.values, np.hstack([factor, columns * other.sizes])
 
     def log_likelihood(width):
         # With Q·R = [F; I], the covariance I + F·Fᵀ has the determinant of RᵀR. Its own condition is 1e11.
@@ -163,6 +166,16 @@ def test_evidence_is_the_ratio_of_marginal_likelihoods(changes):
     noise = search.solve(search.linearize(), [cause]).noise
     expected = log_evidence_of(search, cause, noise, cause.values)
     assert cause.log_evidence == pytest.approx(expected, abs=tolerance)
+
+
+def test_evidence_of_each_of_two_causes_is_that_beside_the_other_one():
+    search = search_of(Changes("base", 2e-4, joint=(4, 0.015 * DEGREE), at=0.3))
+    search.run()
+    noise = search.solve(search.linearize(), search.causes).noise
+    assert {cause.block.kind for cause in search.causes} == {"base", "joint"}
+    for cause, other in (search.causes, search.causes[::-1]):
+        expected = log_evidence_of(search, cause, noise, cause.values, [other])
+        assert cause.log_evidence == pytest.approx(expected, abs=1)
 
 
 def test_no_derivative_remains_at_the_fit_even_with_narrow_priors():
