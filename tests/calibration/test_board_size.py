@@ -10,7 +10,7 @@ from camera_setups import ARMS, simulate, wrong_arm
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras.board_size import _scaled
+from dhcal_pin.calibration.cameras.board_size import _rms_correction, _scaled
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -75,6 +75,11 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
     if fit.board_size:
         assert "size of the boards may be wrong" in fit.verdict.reasons[0]
         assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)
+
+
+def test_an_arm_without_unknown_lengths_has_no_correction_of_lengths():
+    errors = dh.select_parameters(ARMS["ur10"](), "offset")
+    assert _rms_correction(errors, np.ones(len(errors.parameters))) == 0
 
 
 def test_estimated_corners_have_the_size_of_their_board():

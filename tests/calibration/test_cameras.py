@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import camera_setups
 import numpy as np
@@ -15,10 +17,17 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import seen_ranges_warning
-from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, _images_of, exchange_axes, reorder
+from dhcal_pin.calibration.cameras.axis_order import (
+    ORDERS,
+    Exchange,
+    _images_of,
+    _is_size_exchanged,
+    exchange_axes,
+    reorder,
+)
 from dhcal_pin.calibration.cameras.gate import _far_points, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
-from dhcal_pin.cameras import Board
+from dhcal_pin.cameras import Board, Camera
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
@@ -233,6 +242,13 @@ def test_images_with_wrong_joint_values_are_not_exchanged(seed):
     """No order explains them; the least wrong one is chance."""
     chain, images, _ = faulty_setup("panda", "rows", seed, is_on_wrist=True)
     assert exchange_axes(chain, [images])[1] == ()
+
+
+@pytest.mark.parametrize(("corner", "is_exchanged"), [((1200, 900), True), ((1200, 1100), False)])
+def test_width_and_height_are_exchanged_if_all_corners_lie_in_the_turned_image(corner, is_exchanged):
+    camera = Camera("c", "world", 960, 1280, np.zeros(9))
+    part: Any = SimpleNamespace(values=np.array([corner]), rig=SimpleNamespace(cameras=(camera,)))
+    assert _is_size_exchanged([part], "c") == is_exchanged
 
 
 def test_exchanged_width_and_height_are_named():
@@ -493,6 +509,13 @@ def test_clusters_start_in_the_middle_and_far_from_it():
     first, *others = _far_points(points)
     assert first == 7
     assert sorted(others) == [3, 11, 20, 38]
+
+
+def test_clusters_do_not_depend_on_the_unit_of_a_joint():
+    q = np.random.default_rng(6).uniform(-1, 1, (40, 6)) * [1, 2, 1, 1, 1, 1]
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    first, second = (cluster_folds([dh.Pose(q * [1, 1, unit, 1, 1, 1], poses)]) for unit in (1, 1e-3))
+    np.testing.assert_array_equal(first, second)
 
 
 def test_clusters_are_regions_of_joint_space(arm):

@@ -18,6 +18,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.causes import (
     ARM_SETS,
     GEOMETRY,
+    OFFSETS,
     Causes,
     HandEyeData,
     apply_causes,
@@ -365,28 +366,36 @@ def test_images_of_the_row_before_are_paired_again():
     assert find_shift(replace(shifted, data=(few,), sequence=file_sequence([few])), Causes()) == 0.0
 
 
-def test_a_change_of_one_coefficient_is_one_of_the_distortion():
+@pytest.mark.parametrize(
+    ("name", "change", "text"),
+    [("k1", 0.1, "distortion of camera"), ("cy", 50.0, "cx, cy of camera"), ("fy", 90.0, "fx, fy of camera")],
+)
+def test_the_values_of_the_lens_that_change_are_named(name, change, text):
     chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=5)
     camera = images.rig.cameras[0]
     found = dict(zip(camera.lens.names, camera.values, strict=True))
-    found["k1"] += 0.1
+    found[name] += change
     state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
     hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
-    assert "distortion of camera" in _lens_text(hand_eye, state)[0]
+    assert text in _lens_text(hand_eye, state)[0]
 
 
 @pytest.mark.parametrize(
-    ("parameter", "moved"),
-    [("shoulder_pan_joint.x", "the axis of shoulder_pan_joint"), ("wrist_3_joint.y", "the tool")],
+    ("sets", "parameter", "text"),
+    [
+        (GEOMETRY, "shoulder_pan_joint.x", "move the axis of shoulder_pan_joint by 1.000 mm"),
+        (GEOMETRY, "wrist_3_joint.y", "move the tool by 1.000 mm"),
+        (OFFSETS, "elbow_joint.offset", "its joint offsets, elbow_joint.offset 0.0573°"),
+    ],
 )
-def test_the_part_of_the_arm_that_moves_is_named(parameter, moved):
+def test_the_largest_error_of_the_arm_is_named(sets, parameter, text):
     """The last axis of a UR10 is the y axis of its frame: a shift along it moves the tool only."""
-    errors = select_parameters(ARMS["ur10"](), ARM_SETS[GEOMETRY])
+    errors = select_parameters(ARMS["ur10"](), ARM_SETS[sets])
     x = np.array([1e-3 * (p.name == parameter) for p in errors.parameters])
     fit = SimpleNamespace(problem=SimpleNamespace(errors=errors), solution=SimpleNamespace(x=x))
-    state: Any = SimpleNamespace(fit=fit, causes=Causes(arm=ARM_SETS[GEOMETRY]))
+    state: Any = SimpleNamespace(fit=fit, causes=Causes(arm=ARM_SETS[sets]))
     hand_eye: Any = SimpleNamespace(is_arm_tried=False)
-    assert f"move {moved} by 1.000 mm" in _arm_text(hand_eye, state)[0]
+    assert text in _arm_text(hand_eye, state)[0]
 
 
 def test_a_rigid_motion_does_not_bend_a_board():

@@ -93,6 +93,15 @@ def test_pose_of_a_small_body_far_from_the_camera(count, error):
     assert np.mean(np.array(angles) > 0.5) <= (0.1 if error else 0.0)
 
 
+def test_a_tag_of_four_corners_has_a_pose():
+    points = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    pose = se3.transform(se3.exp3(np.array([0.6, -0.4, 1.0])), [0.02, -0.03, 0.2])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+
+
 def test_five_points_that_are_not_flat_have_a_pose():
     points = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.5]])
     pose = se3.transform(se3.exp3(np.array([0.4, -0.3, 1.0])), [0.1, -0.05, 0.8])
@@ -149,6 +158,8 @@ def test_a_line_and_one_more_point_determine_no_homography():
     assert not determines_homography(np.vstack([row, [[0.1, 0.2]]]))
     assert not determines_homography(np.vstack([[[0.2, 0.3]], row]))
     assert determines_homography(np.vstack([row, [[0.1, 0.2], [0.1, 0.3]]]))
+    # The origin of the plane does not matter.
+    assert not determines_homography(np.vstack([row, [[0.1, 0.2]]]) + np.array([0.4, -0.7]))
     points = np.pad(np.vstack([row, [[0.1, 0.2]]]), ((0, 0), (0, 1)))
     assert estimate_pose(points, points[:, :2] + [0.1, 0.1]) is None
 

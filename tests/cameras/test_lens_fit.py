@@ -76,6 +76,16 @@ def test_exact_images_give_the_true_lens(model):
     assert angles(fit.poses, poses).max() < 1e-4
 
 
+def test_a_target_that_is_not_flat_gives_the_lens():
+    rng, views = np.random.default_rng(0), []
+    points = rng.uniform(-0.1, 0.1, (25, 3))
+    for _ in range(8):
+        local = points @ se3.exp3(rng.uniform(-1, 1, 3)).T + [*rng.uniform(-0.1, 0.1, 2), 0.6]
+        views.append((points, LENSES["pinhole"].project(local.T, TRUE["pinhole"])[0].T))
+    fit = fit_lens(views, LENSES["pinhole"], *stated_lens("pinhole", "free"))
+    np.testing.assert_allclose(fit.values[:4], TRUE["pinhole"][:4], atol=0.5)
+
+
 @pytest.mark.parametrize("model", LENSES)
 def test_a_focal_length_that_is_half_too_long_is_corrected(model):
     """The first steps are too large."""

@@ -20,6 +20,11 @@ OPTIONS = ("--extend", "none", "--session", "off")
 OUTPUTS = ("out.urdf", "out.calibration.toml", "residuals.csv")
 
 
+# Manifest without files.
+MANIFEST = {"format": "dhcal bundle", "version": 1, "options": {}, "versions": {}, "joints": [], "tip": "",
+            "sha256": {}}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
     """Calibrate a simulated arm in a folder, with paths outside of it; return the folder."""
@@ -93,12 +98,19 @@ def changed(source, target, name, data):
         ("manifest.json", b"[" * 10**5, "no manifest"),
         ("manifest.json", b"[]", "no manifest"),
         ("manifest.json", b"[1]", "no manifest"),
+        ("manifest.json", json.dumps(MANIFEST | {"format": "zip"}).encode(), "no manifest"),
+        ("manifest.json", json.dumps(MANIFEST | {"joints": "j1"}).encode(), "no manifest"),
+        (
+            "manifest.json",
+            json.dumps(MANIFEST | {"version": 2}).encode(),
+            "version '2' of the format; expected 1",
+        ),
         ("inputs/more.csv", b"x", "was changed"),
         ("../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("/tmp/out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("inputs/../../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
     ],
-    ids=range(9),
+    ids=range(12),
 )
 def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, data, message):
     path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, data)

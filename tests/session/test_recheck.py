@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.stats import multivariate_normal
 from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 
 from dhcal_pin import Result, calibrate
@@ -20,6 +21,7 @@ from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_u
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
 from dhcal_pin.planning import change_options, plan
 from dhcal_pin.session import Recheck, recheck
+from dhcal_pin.session.check import WIDTHS, _CheckModel
 
 STILL = pin.SE3.Identity()
 LENGTH, ANGLE = 5e-4, np.deg2rad(0.05)
@@ -240,6 +242,29 @@ def test_residuals_have_the_size_of_a_motion_of_all_points():
     assert result.verdict == "ok"
     shifted = data.replace(values=data.positions() + np.array([0.003, 0.004, 0.0]))
     assert recheck(chain, [shifted]).residual_rms == pytest.approx(5e-3)
+
+
+def test_likelihoods_of_a_change_are_those_of_the_normal_distribution():
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (4, 6))
+    model = _CheckModel(chain, (Position(q, chain.poses(q)[:, :3, 3], NOISE),), None, {})
+    columns, residual = rng.normal(size=(12, 2)), rng.normal(size=12)
+    sets = model.scaled_sets(residual[:, None])
+    found = model.log_likelihoods(columns, sets, model.null_likelihoods(sets))[0, :, 0]
+    for width, value in zip(WIDTHS, found, strict=True):
+        wanted = multivariate_normal(np.zeros(12), np.eye(12) + width**2 * columns @ columns.T)
+        nothing = multivariate_normal(np.zeros(12), np.eye(12))
+        expected = wanted.logpdf(residual) - nothing.logpdf(residual)
+        assert value - model.null_likelihoods(sets)[0, 0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_limit_of_the_evidence_grows_with_the_prior_probability():
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (4, 6))
+    model = _CheckModel(chain, (Position(q, chain.poses(q)[:, :3, 3], NOISE),), None, {})
+    columns, log_priors = [rng.normal(size=(12, 1)) for _ in range(2)], np.log([0.3, 0.1])
+    more, less = (model.limit(columns, log_priors + shift) for shift in (np.log(2), 0.0))
+    assert more - less == pytest.approx(np.log(2))
 
 
 def test_only_single_changes_have_a_size():

@@ -25,7 +25,7 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
-from dhcal_pin.session.facts import Scale
+from dhcal_pin.session.facts import Scale, SlowChange
 from dhcal_pin.session.linear_model import Layout, whitened_rows
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
@@ -235,6 +235,7 @@ def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
         by_type = {type(shapes[0]): shapes for shapes in search._shapes(tool)}
         assert set(by_type) == {Step, Drift, FreeDrift}
         assert [each.time_constant / 59 for each in by_type[Drift]] == pytest.approx(TIME_CONSTANTS)
+        assert {(each.begin, each.end) for each in by_type[Drift]} == {(0.0, 59.0)}
 
 
 @pytest.mark.parametrize("step", [4, 6, 8])
@@ -569,7 +570,15 @@ def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():
     assert found[0][0] == pytest.approx(found[1][0], abs=1e-5)
 
 
+@pytest.mark.parametrize(("shape", "by"), [("linear", "by 0.300 mm"), ("free", "by up to 0.300 mm")])
+def test_only_an_irregular_drift_has_a_largest_size(shape, by):
+    for kind in ("base", "links"):
+        drift = SlowChange(kind, kind, 3e-4, 2e-5, "m", shape, None, "row")
+        assert by in drift.finding
+
+
 def test_a_scale_is_stated_in_percent():
+    assert Scale(1.003, 1e-4, "").finding == "The correction makes the whole robot 0.3 % longer."
     assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
     assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
     assert Scale(0.985, 1e-4, "", ("a.csv", "b.csv")).consequence.endswith(
