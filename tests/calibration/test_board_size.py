@@ -72,6 +72,8 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
     assert fit.camera_stages[-1].is_kept
     assert fit.verdict.status == status
     assert (fit.board_size is not None) == (status == "caution")
+    # The estimated arm explains the images.
+    assert fit.problem.temperature == 1
     if fit.board_size:
         assert "size of the boards may be wrong" in fit.verdict.reasons[0]
         assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate
@@ -67,6 +69,16 @@ def test_derivative_by_the_corner_agrees_with_differences():
             shifted.append(-images.errors(frames, moved)["pixels"])
         difference = (shifted[0] - shifted[1]) / 2e-5
         np.testing.assert_allclose(slopes[:, :, axis], difference, atol=1e-6 * np.abs(slopes).max())
+
+
+def test_a_stated_noise_is_the_least_one(sim_6dof):
+    rng = np.random.default_rng(3)
+    images = KINDS["camera"].simulate(sim_6dof, rng.uniform(-2, 2, (30, 6)), Noise(3e-4), rng)
+    fit = calibrate(sim_6dof, images.replace(sigma=2 * images.sigma), "camera,board").hand_eye_fit
+    assert fit is not None
+    (found,) = _with_corner_noise(replace(fit.fit, data=(images.replace(sigma=2 * images.sigma),)))
+    assert isinstance(found, CameraCorners)
+    assert np.all(found.sigma >= 0.6 - 1e-9)
 
 
 @pytest.mark.parametrize("is_stated", [True, False])

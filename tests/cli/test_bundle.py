@@ -59,6 +59,9 @@ def test_a_bundle_repeats_the_calibration_with_equal_bytes(first, tmp_path, monk
     assert main(["calibrate", "--from", bundle, "-o", "out.urdf", "--bundle", "arm.dhcal.zip"]) == 0
     for name in (*OUTPUTS, "r.json", "arm.dhcal.zip"):
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+    with zipfile.ZipFile(bundle) as archive:
+        # No time is earlier in a zip file.
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     assert set(json.loads((tmp_path / "r.json").read_text())["inputs"]) == {"sim_6dof.dh.toml", "laser.csv"}
 
 

@@ -27,9 +27,10 @@ from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
 from dhcal_pin.session.facts import Scale, SlowChange
 from dhcal_pin.session.linear_model import Layout, whitened_rows
+from dhcal_pin.session.refinement import refine_changes
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import TIME_CONSTANTS, _Search
+from dhcal_pin.session.search import TIME_CONSTANTS, _Search, find_session
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -269,6 +270,11 @@ def test_a_thinned_timeline_has_samples_of_all_measurements():
     data = Simulation("ur10", 30, 1).measure(Position)
     timeline = order_samples([data.take(np.s_[a : a + 10]) for a in (0, 10, 20)], ())
     np.testing.assert_array_equal(timeline.thinned(10).fitted_numbers, np.arange(0, 30, 3))
+
+
+def test_a_session_of_one_time_has_no_drift():
+    for shape in (Drift(2.0, 2.0), FreeDrift(2.0, 2.0)):
+        assert np.isfinite(shape.values(np.arange(3), np.full(3, 2.0))).all()
 
 
 @pytest.mark.parametrize("shape", [Drift(2.0, 6.0), Drift(2.0, 6.0, 1.0), FreeDrift(2.0, 6.0)])
@@ -584,6 +590,25 @@ def test_a_scale_is_stated_in_percent():
     assert Scale(0.985, 1e-4, "", ("a.csv", "b.csv")).consequence.endswith(
         "add --mend scale:0.985@a.csv --mend scale:0.985@b.csv."
     )
+
+
+@pytest.mark.parametrize("n_outliers", [0, 6])
+def test_changes_are_refined_in_spite_of_outliers(n_outliers):
+    """The same samples as those of the search show the same change, about as uncertain as it was."""
+    simulation = Simulation("ur10", 60, 3)
+    data = simulation.measure(Pose, Changes("base", 1e-3, n_outliers=n_outliers))
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors = select_parameters(chain, "minimal,base,tool")
+    problem = make_problem(errors, (data,), 1 / errors.priors, {})
+    x = np.zeros(len(errors.parameters))
+    session = find_session(problem, x, (), is_ordered=True)
+    refined = refine_changes(session, problem, x)
+    (before,), (after,) = session.causes, refined.causes
+    std = np.sqrt(np.diag(before.covariance))
+    assert np.all(np.abs(after.values - before.values) < 2 * std)
+    # The search has one noise for positions and one for rotations.
+    ratio = np.sqrt(np.diag(after.covariance)) / std
+    assert 0.8 < ratio.min() <= ratio.max() < 1.6
 
 
 def test_a_small_scale_is_found_with_an_accurate_arm():
