@@ -413,6 +413,7 @@ def test_a_rigid_motion_does_not_bend_a_board():
         (lambda x: np.exp(x) - 1.2 * x, np.log(1.2)),
         (lambda x: -np.cos(3 * (x - 0.25)), 0.25),
         (lambda x: abs(x - 0.012), 0.012),
+        (lambda x: max(x - 0.0137, 3 * (0.0137 - x)), 0.0137),
         (lambda x: np.inf if x > 0.105 else (x - 0.1) ** 2, 0.1),
     ],
 )

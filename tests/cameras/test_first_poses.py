@@ -53,6 +53,18 @@ def test_pose_of_points_that_are_not_flat(seed):
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
 
 
+@pytest.mark.parametrize(("count", "seed"), [(8, 20), (20, 117)])
+def test_pose_of_points_from_nearer_than_their_extent(count, seed):
+    """The view is far from an orthographic one."""
+    rng = np.random.default_rng(seed)
+    points, turn = rng.uniform(-0.1, 0.1, (count, 3)), se3.exp3(rng.normal(0, 2, 3))
+    position = np.array([*rng.uniform(-0.1, 0.1, 2), 0.15])
+    local = points @ turn.T + position
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], se3.transform(turn, position), atol=1e-6)
+
+
 def test_a_small_body_has_an_orthographic_image():
     """The errors are those of second order: of the depth by the square of size over depth."""
     rng = np.random.default_rng(3)
