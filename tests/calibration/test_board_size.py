@@ -10,7 +10,7 @@ from camera_setups import ARMS, simulate, wrong_arm
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras.board_size import _rms_correction, _scaled
+from dhcal_pin.calibration.cameras.board_size import BoardSize, _rms_correction, _scaled
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -77,6 +77,11 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
     if fit.board_size:
         assert "size of the boards may be wrong" in fit.verdict.reasons[0]
         assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)
+
+
+@pytest.mark.parametrize(("log_ratio", "is_decisive"), [(6.0, False), (20.0, True)])
+def test_strong_evidence_of_another_size_is_decisive(log_ratio, is_decisive):
+    assert BoardSize(1.1, 0.03, 2.0, 0.3, log_ratio).is_decisive == is_decisive
 
 
 def test_an_arm_without_unknown_lengths_has_no_correction_of_lengths():

@@ -353,12 +353,13 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
     np.testing.assert_array_equal(board.points, images.rig.boards[0].points)
 
 
-def test_images_of_the_row_before_are_paired_again():
-    """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
-    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
+@pytest.mark.parametrize("shift", [1.0, 2.0])
+def test_images_of_the_rows_before_are_paired_again(shift):
+    """`test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=8)
     right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
-    shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
-    assert find_shift(shifted, Causes()) == -1.0
+    shifted = replace(right, data=(apply_causes(right, Causes(shift=shift), images),))
+    assert find_shift(shifted, Causes()) == -shift
     # Three images are too few to show one.
     (later,) = shifted.data
     assert isinstance(later, CameraCorners)
