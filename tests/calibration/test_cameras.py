@@ -16,7 +16,7 @@ from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras import seen_ranges_warning
+from dhcal_pin.calibration.cameras import axis_order, seen_ranges_warning
 from dhcal_pin.calibration.cameras.axis_order import (
     ORDERS,
     Exchange,
@@ -27,6 +27,7 @@ from dhcal_pin.calibration.cameras.axis_order import (
 )
 from dhcal_pin.calibration.cameras.gate import _far_points, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
+from dhcal_pin.calibration.cameras.stages import ImageError
 from dhcal_pin.cameras import Board, Camera
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
@@ -249,6 +250,18 @@ def test_width_and_height_are_exchanged_if_all_corners_lie_in_the_turned_image(c
     camera = Camera("c", "world", 960, 1280, np.zeros(9))
     part: Any = SimpleNamespace(values=np.array([corner]), rig=SimpleNamespace(cameras=(camera,)))
     assert _is_size_exchanged([part], "c") == is_exchanged
+
+
+@pytest.mark.parametrize(("difference", "is_named"), [(20.0, True), (2.0, False)])
+def test_focal_lengths_that_differ_by_some_pixels_may_be_exchanged(arm, monkeypatch, difference, is_named):
+    """Another order would explain the images far better, if it was tried."""
+    camera = Camera("c", "world", 1280, 960, np.pad([1000, 1000 + difference, 600, 600], (0, 5)))
+    errors = iter([ImageError(pixels, 1e-4 * pixels, 99) for pixels in (10.0, 1.0)])
+    monkeypatch.setattr(axis_order, "_frames_error", lambda *_: (next(errors), 12))
+    monkeypatch.setattr(axis_order, "_reordered", lambda part, *_: part)
+    part: Any = SimpleNamespace(rig=SimpleNamespace(cameras=(camera,)))
+    found = axis_order._best_order(arm, [part], "c")
+    assert (found is not None and found.what == "fx and fy") == is_named
 
 
 def test_exchanged_width_and_height_are_named():
