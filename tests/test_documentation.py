@@ -33,10 +33,11 @@ import schema_files
 import tomli_w
 from camera_setups import visible_corners, wrong_arm
 from robots import ROOT
+from sessions import nominal_arm
 
 import dhcal_pin
 from dhcal_pin import se3
-from dhcal_pin.cameras import Rig
+from dhcal_pin.cameras import Camera, Rig
 from dhcal_pin.cli import main
 from dhcal_pin.estimation import parameters
 from dhcal_pin.exceptions import DhcalError
@@ -44,6 +45,7 @@ from dhcal_pin.io import measurement_text, read_dh
 from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.io.tables import sources
 from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.measurements.images.camera_parameters import camera_parameters
 from dhcal_pin.measurements.mounting import mount_rig
 from dhcal_pin.studies import read_study
 
@@ -235,6 +237,27 @@ def test_messages_of_the_troubleshooting_page_exist():
     texts = source_texts()
     assert len(messages) > 40
     assert [message for message in messages if message not in texts] == []
+
+
+def test_priors_are_those_of_their_page():
+    page = (DOCS / "explanation" / "priors.md").read_text(encoding="utf-8")
+    stated = {name: float(value) for name, value in re.findall(r"^\| (.*?) \| (\d[\d.e-]*)", page, re.M)}
+    sets = "placement,offset,gain,harmonics,compliance,base"
+    errors = dhcal_pin.select_parameters(nominal_arm("ur10"), sets).parameters
+    camera = Camera("c", "tip", 640, 480, np.pad([500.0, 500.0, 319.5, 239.5], (0, 5)))
+    found = {p.name: p.prior for p in (*errors, *camera_parameters(camera))}
+    for row, name, unit in (
+        ("lengths", "elbow_joint.x", 1e-3),
+        ("angles", "elbow_joint.rx", 1e-3),
+        ("joint offsets, θ", "elbow_joint.offset", np.deg2rad(1)),
+        ("base, tool", "base.x", 1),
+        ("gain, coupling", "elbow_joint.gain", 1),
+        ("harmonics of order 1 and 2", "elbow_joint.sin1", 1e-3),
+        ("compliance", "elbow_joint.compliance", 1),
+        ('focal lengths, image centre (`intrinsics = "prior"`)', "camera_c.fx", 1),
+        ('distortion (`intrinsics = "prior"`)', "camera_c.k1", 1),
+    ):
+        assert found[name] == pytest.approx(unit * stated[row]), row
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

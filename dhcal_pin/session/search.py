@@ -751,7 +751,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     alone = search.with_lag_alone() if len(search.causes) > 1 else None
     if alone and not _is_suspicious(problem, alone.x, alone.corrected_timeline(), is_ordered):
         search = alone
-    other_robot = search.other_robot() if search.causes else None
+    other_robot = search.other_robot()
     search.place_steps()
     causes = tuple(search.causes)
     return Session(

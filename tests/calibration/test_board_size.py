@@ -10,6 +10,7 @@ from camera_setups import ARMS, simulate, wrong_arm
 from slow_cases import some_slow
 
 import dhcal_pin as dh
+from dhcal_pin.calibration.cameras.board_size import BoardSize, _rms_correction, _scaled
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -71,6 +72,28 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
     assert fit.camera_stages[-1].is_kept
     assert fit.verdict.status == status
     assert (fit.board_size is not None) == (status == "caution")
+    # The estimated arm explains the images.
+    assert fit.problem.temperature == 1
     if fit.board_size:
         assert "size of the boards may be wrong" in fit.verdict.reasons[0]
         assert fit.board_size.size == pytest.approx(1 / size, rel=2e-3)
+
+
+@pytest.mark.parametrize(("log_ratio", "is_decisive"), [(6.0, False), (20.0, True)])
+def test_strong_evidence_of_another_size_is_decisive(log_ratio, is_decisive):
+    assert BoardSize(1.1, 0.03, 2.0, 0.3, log_ratio).is_decisive == is_decisive
+
+
+def test_an_arm_without_unknown_lengths_has_no_correction_of_lengths():
+    errors = dh.select_parameters(ARMS["ur10"](), "offset")
+    assert _rms_correction(errors, np.ones(len(errors.parameters))) == 0
+
+
+def test_estimated_corners_have_the_size_of_their_board():
+    arm, images = photograph(3, 5e-4)
+    (board,) = images.rig.boards
+    images = with_rig(images, boards=(replace(board, has_free_points=True),)).initialized(arm)
+    larger = _scaled(images, 1.1)
+    assert isinstance(larger, CameraCorners)
+    (points,) = larger.points(np.array([p.nominal for p in larger.instrument_parameters]))
+    np.testing.assert_allclose(points, 1.1 * board.points, atol=1e-12)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import camera_setups
 import numpy as np
@@ -14,11 +16,19 @@ from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras import seen_ranges_warning
-from dhcal_pin.calibration.cameras.axis_order import ORDERS, Exchange, _images_of, exchange_axes, reorder
-from dhcal_pin.calibration.cameras.gate import cluster_folds
+from dhcal_pin.calibration.cameras import axis_order, seen_ranges_warning
+from dhcal_pin.calibration.cameras.axis_order import (
+    ORDERS,
+    Exchange,
+    _images_of,
+    _is_size_exchanged,
+    exchange_axes,
+    reorder,
+)
+from dhcal_pin.calibration.cameras.gate import _far_points, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
-from dhcal_pin.cameras import Board
+from dhcal_pin.calibration.cameras.stages import ImageError
+from dhcal_pin.cameras import Board, Camera
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
@@ -235,6 +245,25 @@ def test_images_with_wrong_joint_values_are_not_exchanged(seed):
     assert exchange_axes(chain, [images])[1] == ()
 
 
+@pytest.mark.parametrize(("corner", "is_exchanged"), [((1200, 900), True), ((1200, 1100), False)])
+def test_width_and_height_are_exchanged_if_all_corners_lie_in_the_turned_image(corner, is_exchanged):
+    camera = Camera("c", "world", 960, 1280, np.zeros(9))
+    part: Any = SimpleNamespace(values=np.array([corner]), rig=SimpleNamespace(cameras=(camera,)))
+    assert _is_size_exchanged([part], "c") == is_exchanged
+
+
+@pytest.mark.parametrize(("difference", "is_named"), [(20.0, True), (2.0, False)])
+def test_focal_lengths_that_differ_by_some_pixels_may_be_exchanged(arm, monkeypatch, difference, is_named):
+    """Another order would explain the images far better, if it was tried."""
+    camera = Camera("c", "world", 1280, 960, np.pad([1000, 1000 + difference, 600, 600], (0, 5)))
+    errors = iter([ImageError(pixels, 1e-4 * pixels, 99) for pixels in (10.0, 1.0)])
+    monkeypatch.setattr(axis_order, "_frames_error", lambda *_: (next(errors), 12))
+    monkeypatch.setattr(axis_order, "_reordered", lambda part, *_: part)
+    part: Any = SimpleNamespace(rig=SimpleNamespace(cameras=(camera,)))
+    found = axis_order._best_order(arm, [part], "c")
+    assert (found is not None and found.what == "fx and fy") == is_named
+
+
 def test_exchanged_width_and_height_are_named():
     rng = np.random.default_rng(7)
     chain = ARMS["ur10"]()
@@ -266,7 +295,10 @@ def test_stages_show_a_board_that_is_not_as_stated(choice):
     data = dh.CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig)
     fit = dh.calibrate(chain, data, loss="linear")
     assert [stage.name for stage in fit.camera_stages] == ["frames", "intrinsics", "target points", "arm"]
-    _, stated_points, free_points, arm = fit.camera_stages
+    frames, stated_points, free_points, arm = fit.camera_stages
+    # The rig does not fix poses and lens.
+    assert frames.is_kept
+    assert stated_points.is_kept
     assert free_points.is_kept == has_free_points
     assert stated_points.by_region is not None
     assert free_points.by_region is not None
@@ -481,6 +513,22 @@ def test_clusters_hold_out_every_image_once(arm):
     np.testing.assert_array_equal(np.sum([fold[0] for fold in folds], 0), 1)
     for (mask,) in folds:
         assert all(len(set(mask[data.image == number])) == 1 for number in range(data.n_images))
+
+
+def test_clusters_start_in_the_middle_and_far_from_it():
+    points = np.random.default_rng(5).uniform(-0.3, 0.3, (40, 2))
+    points[7] = 0
+    points[[3, 11, 20, 38]] = [[2, 2], [-2, 2], [2, -2], [-2, -2]]
+    first, *others = _far_points(points)
+    assert first == 7
+    assert sorted(others) == [3, 11, 20, 38]
+
+
+def test_clusters_do_not_depend_on_the_unit_of_a_joint():
+    q = np.random.default_rng(6).uniform(-1, 1, (40, 6)) * [1, 2, 1, 1, 1, 1]
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    first, second = (cluster_folds([dh.Pose(q * [1, 1, unit, 1, 1, 1], poses)]) for unit in (1, 1e-3))
+    np.testing.assert_array_equal(first, second)
 
 
 def test_clusters_are_regions_of_joint_space(arm):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate
@@ -69,10 +71,23 @@ def test_derivative_by_the_corner_agrees_with_differences():
         np.testing.assert_allclose(slopes[:, :, axis], difference, atol=1e-6 * np.abs(slopes).max())
 
 
-def test_stated_noise_of_corners_is_kept(sim_6dof):
-    """Corners without displacements have the stated standard deviation of 0.3 px."""
+def test_a_stated_noise_is_the_least_one(sim_6dof):
     rng = np.random.default_rng(3)
     images = KINDS["camera"].simulate(sim_6dof, rng.uniform(-2, 2, (30, 6)), Noise(3e-4), rng)
+    fit = calibrate(sim_6dof, images.replace(sigma=2 * images.sigma), "camera,board").hand_eye_fit
+    assert fit is not None
+    (found,) = _with_corner_noise(replace(fit.fit, data=(images.replace(sigma=2 * images.sigma),)))
+    assert isinstance(found, CameraCorners)
+    assert np.all(found.sigma >= 0.6 - 1e-9)
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_noise_of_corners_without_displacements_is_that_of_the_simulation(sim_6dof, is_stated):
+    """The standard deviation is 0.3 px; without a stated one it is estimated."""
+    rng = np.random.default_rng(3)
+    images = KINDS["camera"].simulate(sim_6dof, rng.uniform(-2, 2, (30, 6)), Noise(3e-4), rng)
+    if not is_stated:
+        images = images.replace(sigma=np.ones_like(images.sigma), has_stated_sigma=False)
     fit = calibrate(sim_6dof, images, "camera,board").hand_eye_fit
     assert fit is not None
     (found,) = _with_corner_noise(fit.fit)

@@ -9,12 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_setups import ARMS
 from hand_eye_setups import SIGMA, faulty_setup
 from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.causes import (
+    ARM_SETS,
+    GEOMETRY,
+    OFFSETS,
     Causes,
     HandEyeData,
     apply_causes,
@@ -25,6 +29,7 @@ from dhcal_pin.calibration.cameras.causes import (
 from dhcal_pin.calibration.cameras.diagnosis import (
     HandEyeDiagnosis,
     Trial,
+    _arm_text,
     _lens_text,
     _without_rigid_motion,
 )
@@ -348,12 +353,13 @@ def test_shifted_joint_values_lie_between_those_of_two_images():
     np.testing.assert_array_equal(board.points, images.rig.boards[0].points)
 
 
-def test_images_of_the_row_before_are_paired_again():
-    """By a whole row; `test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
-    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=7)
+@pytest.mark.parametrize("shift", [1.0, 2.0])
+def test_images_of_the_rows_before_are_paired_again(shift):
+    """`test_a_shift_of_flange_poses_is_named` has a shift in the other direction."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=8)
     right = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
-    shifted = replace(right, data=(apply_causes(right, Causes(shift=1.0), images),))
-    assert find_shift(shifted, Causes()) == -1.0
+    shifted = replace(right, data=(apply_causes(right, Causes(shift=shift), images),))
+    assert find_shift(shifted, Causes()) == -shift
     # Three images are too few to show one.
     (later,) = shifted.data
     assert isinstance(later, CameraCorners)
@@ -361,14 +367,36 @@ def test_images_of_the_row_before_are_paired_again():
     assert find_shift(replace(shifted, data=(few,), sequence=file_sequence([few])), Causes()) == 0.0
 
 
-def test_a_change_of_one_coefficient_is_one_of_the_distortion():
+@pytest.mark.parametrize(
+    ("name", "change", "text"),
+    [("k1", 0.1, "distortion of camera"), ("cy", 50.0, "cx, cy of camera"), ("fy", 90.0, "fx, fy of camera")],
+)
+def test_the_values_of_the_lens_that_change_are_named(name, change, text):
     chain, images, _ = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=5)
     camera = images.rig.cameras[0]
     found = dict(zip(camera.lens.names, camera.values, strict=True))
-    found["k1"] += 0.1
+    found[name] += change
     state: Any = SimpleNamespace(values={f"camera_{camera.name}.{name}": v for name, v in found.items()})
     hand_eye = HandEyeData(select_parameters(chain, "base"), (images,), {}, file_sequence([images]), False)
-    assert "distortion of camera" in _lens_text(hand_eye, state)[0]
+    assert text in _lens_text(hand_eye, state)[0]
+
+
+@pytest.mark.parametrize(
+    ("sets", "parameter", "text"),
+    [
+        (GEOMETRY, "shoulder_pan_joint.x", "move the axis of shoulder_pan_joint by 1.000 mm"),
+        (GEOMETRY, "wrist_3_joint.y", "move the tool by 1.000 mm"),
+        (OFFSETS, "elbow_joint.offset", "its joint offsets, elbow_joint.offset 0.0573°"),
+    ],
+)
+def test_the_largest_error_of_the_arm_is_named(sets, parameter, text):
+    """The last axis of a UR10 is the y axis of its frame: a shift along it moves the tool only."""
+    errors = select_parameters(ARMS["ur10"](), ARM_SETS[sets])
+    x = np.array([1e-3 * (p.name == parameter) for p in errors.parameters])
+    fit = SimpleNamespace(problem=SimpleNamespace(errors=errors), solution=SimpleNamespace(x=x))
+    state: Any = SimpleNamespace(fit=fit, causes=Causes(arm=ARM_SETS[sets]))
+    hand_eye: Any = SimpleNamespace(is_arm_tried=False)
+    assert text in _arm_text(hand_eye, state)[0]
 
 
 def test_a_rigid_motion_does_not_bend_a_board():
@@ -386,6 +414,7 @@ def test_a_rigid_motion_does_not_bend_a_board():
         (lambda x: np.exp(x) - 1.2 * x, np.log(1.2)),
         (lambda x: -np.cos(3 * (x - 0.25)), 0.25),
         (lambda x: abs(x - 0.012), 0.012),
+        (lambda x: max(x - 0.0137, 3 * (0.0137 - x)), 0.0137),
         (lambda x: np.inf if x > 0.105 else (x - 0.1) ** 2, 0.1),
     ],
 )

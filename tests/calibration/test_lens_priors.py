@@ -9,7 +9,9 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import procedure
+from dhcal_pin.calibration.cameras.lens_priors import lens_prior_groups
 from dhcal_pin.calibration.evaluation import compute_errors
+from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.priors import PriorGroups
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -26,6 +28,16 @@ def other_images_error(seed, is_right):
     fit = dh.calibrate(arm, setup.images.with_rig(rig).take(is_fitted), SETS, loss="linear")
     others = setup.exact.with_rig(rig).take(~is_fitted)
     return np.sqrt(np.mean(compute_errors(fit.chain, [others], fit.instruments)[0]["pixels"] ** 2))
+
+
+def test_widths_of_a_stated_lens_lie_between_half_a_pixel_and_the_prior():
+    arm = ARMS["ur10"]()
+    images = simulate(arm, arm, np.random.default_rng(0), is_on_wrist=True, n_images=5, sigma=0.3).images
+    assert images.rig.cameras[0].intrinsics == "prior"
+    problem = make_problem(dh.select_parameters(arm, "base"), (images,), np.ones(6), {})
+    groups = lens_prior_groups(problem)
+    np.testing.assert_allclose(1 / groups.min_weights, [50, 0.3])
+    np.testing.assert_allclose(1 / groups.max_weights, [0.5, 3e-3])
 
 
 @pytest.mark.parametrize("n_seeds", some_slow([5, 10], {0}))

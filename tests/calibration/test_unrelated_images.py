@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from slow_cases import some_slow
 
 from dhcal_pin import calibrate
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES
+from dhcal_pin.calibration.cameras.image_checks import MIN_DIFFERENCE, _angle_difference
 from dhcal_pin.calibration.verdict import _few_images, judge
-from dhcal_pin.measurements import Position
+from dhcal_pin.measurements import Pose, Position
 
 MESSAGE = r"do not move as the joint values say: the rotations between images differ by [1-9]\d°"
 
@@ -24,6 +26,18 @@ def require_refusal(fit):
     (reason,) = fit.verdict.reasons
     assert re.search(MESSAGE, reason)
     assert fit.hand_eye is None
+    # A correction is made smaller, if at all.
+    assert 0 <= fit.shrinkage_factor <= 1
+
+
+@pytest.mark.parametrize("shift", [-2, -1, 0, 1, 2])
+def test_images_that_are_shifted_by_rows_are_related(shift):
+    chain = ARMS["ur10"]()
+    q = np.random.default_rng(0).uniform(-2, 2, (14, 6))
+    images: Any = SimpleNamespace(tool_poses=lambda: Pose(q[2 + shift : 12 + shift], chain.poses(q[2:12])))
+    assert _angle_difference(chain, images) < 1e-6
+    images = SimpleNamespace(tool_poses=lambda: Pose(q[:7], chain.poses(q[7:])))
+    assert _angle_difference(chain, images) > MIN_DIFFERENCE
 
 
 @pytest.mark.parametrize(("seed", "n_images"), some_slow([(2, 8), (1, 6), (0, 12), (1, 12)], {0}))

@@ -17,7 +17,11 @@ from slow_cases import some_slow
 import dhcal_pin as dh
 from dhcal_pin import se3
 from dhcal_pin.calibration import Result, summary
-from dhcal_pin.calibration.cameras.image_checks import describe_weak_positions
+from dhcal_pin.calibration.cameras.image_checks import (
+    _largest_std,
+    describe_weak_positions,
+    largest_tool_std,
+)
 from dhcal_pin.estimation.frame_gauge import tool_gauge_covariance
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.uncertainty import Uncertainty
@@ -157,3 +161,18 @@ def test_reasons_name_what_is_missing():
     assert few.startswith("Too few images. ")
     assert few.endswith("Take more images.")
     assert summary.position_notes(None) == summary.position_notes(np.inf) == []
+
+
+def test_the_largest_standard_deviation_is_that_of_any_direction():
+    turn = se3.exp3(np.array([0.4, -0.3, 1.0]))
+    blocks = [turn @ np.diag(np.square(std)) @ turn.T for std in ([1e-3, 2e-3, 5e-3], [3e-3, 3e-3, 3e-3])]
+    assert _largest_std(blocks) == pytest.approx(5e-3)
+
+
+def test_poses_that_are_not_estimated_have_no_standard_deviation():
+    arm = ARMS["ur10"]()
+    rig = simulate(arm, arm, np.random.default_rng(0), is_on_wrist=True, n_images=1, sigma=0.2).exact.rig
+    errors = select_parameters(arm, "placement")
+    n = len(errors.parameters)
+    priors = Uncertainty.from_errors(errors, np.zeros(n), arm, np.diag(errors.priors), np.empty((n, 0)))
+    assert largest_tool_std(rig, [], np.empty((0, 0)), priors) is None

@@ -53,6 +53,18 @@ def test_pose_of_points_that_are_not_flat(seed):
     np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
 
 
+@pytest.mark.parametrize(("count", "seed"), [(8, 20), (20, 117)])
+def test_pose_of_points_from_nearer_than_their_extent(count, seed):
+    """The view is far from an orthographic one."""
+    rng = np.random.default_rng(seed)
+    points, turn = rng.uniform(-0.1, 0.1, (count, 3)), se3.exp3(rng.normal(0, 2, 3))
+    position = np.array([*rng.uniform(-0.1, 0.1, 2), 0.15])
+    local = points @ turn.T + position
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], se3.transform(turn, position), atol=1e-6)
+
+
 def test_a_small_body_has_an_orthographic_image():
     """The errors are those of second order: of the depth by the square of size over depth."""
     rng = np.random.default_rng(3)
@@ -91,6 +103,15 @@ def test_pose_of_a_small_body_far_from_the_camera(count, error):
         assert estimate is not None
         angles.append(np.linalg.norm(se3.log3(estimate[0][:3, :3].T @ pose[:3, :3])))
     assert np.mean(np.array(angles) > 0.5) <= (0.1 if error else 0.0)
+
+
+def test_a_tag_of_four_corners_has_a_pose():
+    points = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    pose = se3.transform(se3.exp3(np.array([0.6, -0.4, 1.0])), [0.02, -0.03, 0.2])
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
 
 
 def test_five_points_that_are_not_flat_have_a_pose():
@@ -149,6 +170,8 @@ def test_a_line_and_one_more_point_determine_no_homography():
     assert not determines_homography(np.vstack([row, [[0.1, 0.2]]]))
     assert not determines_homography(np.vstack([[[0.2, 0.3]], row]))
     assert determines_homography(np.vstack([row, [[0.1, 0.2], [0.1, 0.3]]]))
+    # The origin of the plane does not matter.
+    assert not determines_homography(np.vstack([row, [[0.1, 0.2]]]) + np.array([0.4, -0.7]))
     points = np.pad(np.vstack([row, [[0.1, 0.2]]]), ((0, 0), (0, 1)))
     assert estimate_pose(points, points[:, :2] + [0.1, 0.1]) is None
 
@@ -211,8 +234,8 @@ def test_wrong_points_near_a_plane_do_not_agree(depth):
         np.testing.assert_array_equal(agreeing_points(points, image + np.array([3.0, 2.0])), agrees)
 
 
-def views(rng, count, points=CHECKERBOARD):
-    values = np.array([640.0, 660.0, 650.0, 350.0, 0, 0, 0, 0, 0])
+def views(rng, count, points=CHECKERBOARD, centre=(650.0, 350.0)):
+    values = np.array([640.0, 660.0, *centre, 0, 0, 0, 0, 0])
     out = []
     for _ in range(count):
         pose = random_pose(rng)
@@ -224,6 +247,13 @@ def views(rng, count, points=CHECKERBOARD):
 def test_intrinsics_from_views_of_a_board():
     values, seen = views(np.random.default_rng(1), 6)
     np.testing.assert_allclose(intrinsics_candidates(seen, CAMERA)[0], values[:4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("centre", [(1100.0, 350.0), (200.0, 350.0), (650.0, 650.0), (650.0, 100.0)])
+def test_the_centre_of_a_lens_is_near_the_middle_of_the_image(centre):
+    _, seen = views(np.random.default_rng(1), 6, centre=centre)
+    for found in intrinsics_candidates(seen, CAMERA):
+        np.testing.assert_array_equal(found[2:], CAMERA.image_centre)
 
 
 @pytest.mark.parametrize("depth", [1e-3, 2e-2, 0.2])

@@ -51,6 +51,12 @@ def test_normalize_is_the_inverse_of_project(lens):
     np.testing.assert_allclose(lens.normalize(lens.project(x, values)[0], values), x[:2] / x[2], atol=1e-9)
 
 
+def test_a_strong_distortion_has_an_inverse():
+    lens, x = LENSES["pinhole"], np.array([[0.9, -0.8, 0.7], [0.9, 0.9, -0.9], [1, 1, 1]])
+    values = np.array([500.0, 500, 320, 240, 0.8, 0.3, 0, 0, 0])
+    np.testing.assert_allclose(lens.normalize(lens.project(x, values)[0], values), x[:2], atol=1e-9)
+
+
 @LENS
 def test_points_on_the_axis_have_finite_derivatives(lens):
     found = lens.project(np.array([[0.0], [0.0], [1.0]]), VALUES[lens.name])

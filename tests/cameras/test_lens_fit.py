@@ -76,6 +76,23 @@ def test_exact_images_give_the_true_lens(model):
     assert angles(fit.poses, poses).max() < 1e-4
 
 
+def test_a_frontal_board_has_one_pose():
+    local = CHECKERBOARD - MIDDLE + [0, 0, 0.6]
+    view = CHECKERBOARD, LENSES["pinhole"].project(local.T, TRUE["pinhole"])[0].T
+    ((found,),) = fit_lens([view], LENSES["pinhole"], TRUE["pinhole"], np.zeros(9)).poses
+    np.testing.assert_allclose(found[0], se3.transform(np.eye(3), [0, 0, 0.6] - MIDDLE), atol=1e-6)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_focal_length_that_is_half_too_long_is_corrected(model):
+    """The first steps are too large."""
+    _, views = images(np.random.default_rng(0), model, count=6, sigma=0.0)
+    values, std = stated_lens(model, "free")
+    values[:2] *= 1.5
+    fit = fit_lens(views, LENSES[model], values, std)
+    np.testing.assert_allclose(fit.values[:4], TRUE[model][:4], atol=1)
+
+
 def test_lens_agrees_with_opencv():
     _, views = images(np.random.default_rng(1), "pinhole", sigma=0.3)
     fit = fit_lens(views, LENSES["pinhole"], *stated_lens("pinhole", "free"))

@@ -20,6 +20,11 @@ OPTIONS = ("--extend", "none", "--session", "off")
 OUTPUTS = ("out.urdf", "out.calibration.toml", "residuals.csv")
 
 
+# Manifest without files.
+MANIFEST = {"format": "dhcal bundle", "version": 1, "options": {}, "versions": {}, "joints": [], "tip": "",
+            "sha256": {}}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
     """Calibrate a simulated arm in a folder, with paths outside of it; return the folder."""
@@ -54,6 +59,9 @@ def test_a_bundle_repeats_the_calibration_with_equal_bytes(first, tmp_path, monk
     assert main(["calibrate", "--from", bundle, "-o", "out.urdf", "--bundle", "arm.dhcal.zip"]) == 0
     for name in (*OUTPUTS, "r.json", "arm.dhcal.zip"):
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+    with zipfile.ZipFile(bundle) as archive:
+        # No time is earlier in a zip file.
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     assert set(json.loads((tmp_path / "r.json").read_text())["inputs"]) == {"sim_6dof.dh.toml", "laser.csv"}
 
 
@@ -93,12 +101,19 @@ def changed(source, target, name, data):
         ("manifest.json", b"[" * 10**5, "no manifest"),
         ("manifest.json", b"[]", "no manifest"),
         ("manifest.json", b"[1]", "no manifest"),
+        ("manifest.json", json.dumps(MANIFEST | {"format": "zip"}).encode(), "no manifest"),
+        ("manifest.json", json.dumps(MANIFEST | {"joints": "j1"}).encode(), "no manifest"),
+        (
+            "manifest.json",
+            json.dumps(MANIFEST | {"version": 2}).encode(),
+            "version '2' of the format; expected 1",
+        ),
         ("inputs/more.csv", b"x", "was changed"),
         ("../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("/tmp/out.txt", b"x", "bad.dhcal.zip: unsafe name"),
         ("inputs/../../out.txt", b"x", "bad.dhcal.zip: unsafe name"),
     ],
-    ids=range(9),
+    ids=range(12),
 )
 def test_changed_and_unsafe_bundles_are_refused(first, tmp_path, capsys, member, data, message):
     path = changed(first / "arm.dhcal.zip", tmp_path / "bad.dhcal.zip", member, data)

@@ -22,6 +22,8 @@ def test_values_of_the_file(tmp_path):
     camera, board = rig.cameras["wrist"], rig.boards["table"]
     np.testing.assert_array_equal(camera.values, [640, 641, 639.5, 359.5, 0.1, 0, 0, 0, 0])
     assert (camera.link, camera.intrinsics, camera.pose) == ("tip", "prior", None)
+    # OpenCV draws the older pattern on request only.
+    assert not board.is_legacy
     assert board.points.shape == (24, 3)
     np.testing.assert_allclose(board.points[[0, 5, 6]], [[0.03, 0.03, 0], [0.18, 0.03, 0], [0.03, 0.06, 0]])
     assert board.pose is not None

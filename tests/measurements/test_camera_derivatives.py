@@ -9,8 +9,12 @@ import pytest
 from camera_setups import ARMS, simulate
 
 import dhcal_pin as dh
+from dhcal_pin import se3
+from dhcal_pin.calibration.cameras.jitter import Jitter, with_jitter
 from dhcal_pin.estimation.problem import Problem
+from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.measurements.images.camera_parameters import camera_parameters
+from dhcal_pin.robot.conditions import Conditions
 
 # Weights of f(x + k·h) - f(x - k·h), k = 1, 2, 3, in the derivative of sixth order (Fornberg 1988).
 WEIGHTS = np.array([3 / 4, -3 / 20, 1 / 60])
@@ -84,6 +88,25 @@ def test_small_displacements_hardly_change_the_residuals():
     u = problem.instrument_values_of(images, x)
     plain, small = (images.with_jitter(k * images.jitter).residual(frames, u) for k in (0.0, 1e-6))
     np.testing.assert_allclose(small, plain, atol=1e-9 * np.abs(plain).max())
+
+
+def test_jitter_is_that_of_images_from_a_displaced_tool():
+    problem, _, x = setting("ur10", "pinhole", is_on_wrist=True, seed=3)
+    (images,), chain = problem.data, problem.chain(x)
+    (found,) = with_jitter(problem, x, problem.data, Jitter(2.0, 1e-3, 3e-3))
+    assert isinstance(found, CameraCorners)
+    plain, u = images.with_jitter(np.zeros_like(images.jitter)), problem.instrument_values_of(images, x)
+
+    def pixels(twist):
+        motion = np.tile(se3.exp6(twist), (len(images.q), 1, 1))
+        moved = plain.replace(recorded=Conditions(images.q, tool_motion=motion))
+        return moved.residual(chain.forward_kinematics(moved.conditions()), u).T * plain.sigma
+
+    slopes = np.stack([(pixels(h) - pixels(-h)) / 2e-6 for h in 1e-6 * np.eye(6)], -1)
+    scaled = slopes * np.repeat([1e-3, 3e-3], 3)
+    covariance = scaled @ scaled.swapaxes(1, 2)
+    np.testing.assert_allclose(found.jitter @ found.jitter.swapaxes(1, 2), covariance, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.sigma, 2 * images.sigma)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

@@ -118,13 +118,14 @@ def test_changes_need_images_alone_and_of_one_board():
 
 @pytest.mark.parametrize("variance", [1e-2, 1.0, 1e2])
 def test_images_are_evidence_relative_to_their_noise(monkeypatch, variance):
-    """Twenty worse images are, four are not, and one image counts no more than an outlier does."""
+    """Twenty worse images are, four are not, and a wrong image counts no more than three of these."""
     monkeypatch.setattr(image_session, "_image_squares", lambda squares: variance * squares)
     explains_better: Any = image_session._explains_better
     for worse, is_evidence in (
         (np.full(20, 2.0), True),
         (np.full(4, 2.0), False),
         (np.r_[1e6, np.ones(19)], False),
+        (np.r_[1e6, 2.0, np.ones(18)], False),
     ):
         assert explains_better(np.ones(len(worse)), worse) == is_evidence
 

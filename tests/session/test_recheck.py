@@ -20,6 +20,7 @@ from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_u
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
 from dhcal_pin.planning import change_options, plan
 from dhcal_pin.session import Recheck, recheck
+from dhcal_pin.session.check import WIDTHS, _CheckModel
 
 STILL = pin.SE3.Identity()
 LENGTH, ANGLE = 5e-4, np.deg2rad(0.05)
@@ -222,16 +223,47 @@ def test_a_given_noise_replaces_that_of_the_measurements(kind):
     assert given.expected_rms == pytest.approx(np.sqrt(3) * 3e-4)
 
 
-def test_hidden_joints_are_named():
-    """The measured point is on the last axis of this arm."""
+@pytest.mark.parametrize(("ratio", "is_hidden"), [(0, True), (10, True), (100, False)])
+def test_joints_that_hardly_move_the_measured_point_are_named(ratio, is_hidden):
+    """The flange is on the last axis. A turn of 0.1 rad moves a point at ten times the noise by the noise."""
+    tool = pin.SE3(np.eye(3), np.array([ratio * NOISE, 0.0, 0.0])).homogeneous
+    chain = nominal_arm("ur10").with_base_and_tool(np.eye(4), tool)
+    q = np.random.default_rng(0).uniform(-2, 2, (10, 6))
+    result = recheck(chain, [Position(q, chain.poses(q)[:, :3, 3], NOISE)])
+    assert any("Zeros of wrist_3_joint do not move it" in reason for reason in result.reasons) == is_hidden
+
+
+def test_residuals_have_the_size_of_a_motion_of_all_points():
     chain = nominal_arm("ur10")
     q = np.random.default_rng(0).uniform(-2, 2, (10, 6))
     data = Position(q, chain.poses(q)[:, :3, 3], NOISE)
     result = recheck(chain, [data])
     assert result.verdict == "ok"
-    assert "Zeros of wrist_3_joint do not move it" in result.reasons[1]
     shifted = data.replace(values=data.positions() + np.array([0.003, 0.004, 0.0]))
     assert recheck(chain, [shifted]).residual_rms == pytest.approx(5e-3)
+
+
+def test_likelihoods_of_a_change_are_those_of_the_normal_distribution():
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (4, 6))
+    model = _CheckModel(chain, (Position(q, chain.poses(q)[:, :3, 3], NOISE),), None, {})
+    columns, residual = rng.normal(size=(12, 2)), rng.normal(size=12)
+    sets = model.scaled_sets(residual[:, None])
+    found = model.log_likelihoods(columns, sets, model.null_likelihoods(sets))[0, :, 0]
+    for width, value in zip(WIDTHS, found, strict=True):
+        covariance = np.eye(12) + width**2 * columns @ columns.T
+        square = residual @ np.linalg.solve(covariance, residual) - residual @ residual
+        expected = -0.5 * (square + np.linalg.slogdet(covariance)[1])
+        assert value - model.null_likelihoods(sets)[0, 0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_limit_of_the_evidence_grows_with_the_prior_probability():
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (4, 6))
+    model = _CheckModel(chain, (Position(q, chain.poses(q)[:, :3, 3], NOISE),), None, {})
+    columns, log_priors = [rng.normal(size=(12, 1)) for _ in range(2)], np.log([0.3, 0.1])
+    more, less = (model.limit(columns, log_priors + shift) for shift in (np.log(2), 0.0))
+    assert more - less == pytest.approx(np.log(2))
 
 
 def test_only_single_changes_have_a_size():
