@@ -262,7 +262,8 @@ def calibrate(
                 found = replace(found, scales=(replace(scale, files=files),))
         return replace(images, session=found, **settings)
     fit = reweighted(fit, stages)
-    if found and (scale := find_scale(fit.problem, fit.solution.x)):
+    # A scale of one axis, which the fit does not contain, makes the robot longer or shorter, too.
+    if found and not found.scales and (scale := find_scale(fit.problem, fit.solution.x)):
         found = replace(found, scales=(*found.scales, scale))
     result = _calibrate_samples(fit, groups, families, holdout, extended, signs, begun.diagnosis, progress)
     return replace(result, session=found, **settings)
