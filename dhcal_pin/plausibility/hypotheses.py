@@ -532,25 +532,32 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
     """Yield wrong units of joints, lengths, and rotation vectors or Euler angles."""
     n, revolute = chain.n_joints, [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
-    for members, large, small, factor in (
-        (revolute, "deg", "rad", ANGLES["deg"]),
-        ([j for j in range(n) if j not in revolute], "mm", "m", LENGTHS["mm"]),
+    for members, kind, large, small, factor in (
+        (revolute, "revolute", "deg", "rad", ANGLES["deg"]),
+        ([j for j in range(n) if j not in revolute], "prismatic", "mm", "m", LENGTHS["mm"]),
     ):
         groups = [members, *([j] for j in members if len(members) > 1)] if members else []
         for group in groups:
             is_single = len(group) == 1
             name = chain.joint_names[group[0]] if is_single else ""
-            key, label = (f"joint:{name}", f"joint {name} is") if is_single else ("joints", "the joints are")
+            key, label = (f"joint:{name}", f"joint {name}") if is_single else ("joints", f"all {kind} joints")
             for true, read, value in ((large, small, 1 / factor), (small, large, factor)):
                 factors = [value if i in group else 1.0 for i in range(n)]
-                text = f"{label} in {true}, but {'was' if is_single else 'were'} read as {read}"
+                text = f"the values of {label} are {_misread(true, read, value)}"
                 yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
     for true, read in permutations(("m", "mm", "in"), 2):
-        text = f"measured lengths are in {true}, but were read as {read}"
-        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(LENGTHS[read] / LENGTHS[true]))
+        factor = LENGTHS[read] / LENGTHS[true]
+        text = f"measured lengths are {_misread(true, read, factor)}"
+        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(factor))
     numbers = "Euler angles" if all(_notations(data) or [""]) else "rotation vectors"
-    text = f"measured {numbers} are in rad, but were read as deg"
+    text = f"measured {numbers} are {_misread('rad', 'deg', ANGLES['deg'])}"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
+
+
+def _misread(true: str, read: str, factor: float) -> str:
+    """Describe values that a factor corrects; their unit in the file may be another one than `read`."""
+    times, word = (factor, "small") if factor > 1 else (1 / factor, "large")
+    return f"{times:.4g} times too {word}, as if {true} had been read as {read}"
 
 
 def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
@@ -560,7 +567,7 @@ def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
         factor = LENGTHS[true] / LENGTHS[read]
         expected = max(np.delete(spreads, i)) * np.sqrt(factor)
         if (spreads[i] < expected) if factor < 1 else (spreads[i] > expected):
-            text = f"measured {axis} is in {true}, but was read as {read}"
+            text = f"measured {axis} is {_misread(true, read, 1 / factor)}"
             yield Hypothesis(f"{axis}:{true}-not-{read}", text, AxisScale(i, factor))
 
 

@@ -63,7 +63,7 @@ def test_only_the_coordinates_in_millimetres_are_named(warnings_of, ur10, wrong)
 
 @pytest.mark.parametrize(
     ("declared", "true", "expected"),
-    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotation vectors are in rad, but were read as deg")],
+    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotation vectors are 57.3 times too small, as if rad had been read as deg")],
 )
 def test_rotation_vectors_in_the_wrong_unit(warnings_of, ur10, declared, true, expected):
     (text,) = warnings_of(

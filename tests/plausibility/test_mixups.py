@@ -226,7 +226,7 @@ def test_euler_angles_in_radians_that_were_read_as_degrees_are_named(ur10):
     wrong = wrong.with_euler_angles("zyx", small)
     found = diagnose_mixups(ur10, [wrong])
     assert [hypothesis.key for hypothesis in found.hypotheses] == ["rotations:rad-not-deg"]
-    assert "Euler angles are in rad" in found.sentence
+    assert "Euler angles are 57.3 times too small, as if rad" in found.sentence
     np.testing.assert_allclose(mend(ur10, wrong, "rotations:rad-not-deg").poses, data.poses, atol=1e-9)
 
 
