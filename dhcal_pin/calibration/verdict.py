@@ -470,6 +470,8 @@ def _plausible_cause(fit: Evidence) -> str:
         )
     if fit.session and fit.session.lag:
         return f"{fit.session.lag.finding} {fit.session.lag.consequence}"
+    if fit.session and fit.session.scales:
+        return fit.session.scales[0].finding
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"

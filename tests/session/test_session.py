@@ -475,6 +475,16 @@ def test_a_wrong_scale_is_found_and_mended(scales, seed):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
+def test_a_large_scale_is_the_cause_of_the_errors_that_it_leaves():
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position, Changes(scales=(1.0, 1.0, 1.1)))
+    fit = calibrate(simulation.chain, data, extend="none")
+    first, second = fit.verdict.reasons
+    assert first.startswith("The fit leaves an RMS position error of")
+    assert first.endswith("mm. Measured z is 10 % too long compared with the other axes.")
+    assert second.startswith("Measured z is 10 % too long")
+
+
 @pytest.mark.parametrize("factor", [1, 20])
 def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(factor):
     """Computed on a grid of scales and of factors of the errors of the arm, also for noisy measurements."""
