@@ -597,6 +597,8 @@ def _overfitting(fit: Evidence) -> float:
 
 def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
+    if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
+        return []  # No part of the correction is applied.
     return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
 
 
