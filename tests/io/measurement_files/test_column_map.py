@@ -187,7 +187,8 @@ def test_rotations_in_every_convention(read, how, columns):
     assert isinstance(data, Pose)
     assert data.has_stated_sigma
     np.testing.assert_allclose(data.rotations(), turns.as_matrix(), atol=5e-15)
-    assert np.isfinite(data.angles).all() == ("euler" in how)
+    assert np.isfinite(data.angles).all() == ("euler" in how or "rotvec" in how)
+    assert (data.notations == "rotvec").all() == ("rotvec" in how)
 
 
 def test_euler_angles_are_kept_for_the_rows_that_are_used(read):
