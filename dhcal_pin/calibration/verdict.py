@@ -629,7 +629,7 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{_needed_configurations(fit, limit)} different poses."
+        f"{_needed_configurations(fit, limit)} different poses{' to be fitted' * bool(fit.holdout)}."
     )
     return [Finding("caution", text)]
 
