@@ -57,7 +57,7 @@ const CONTROLS = {
 
 // A message of the command, in the words of the page.
 function spoken(text) {
-  return text.replace(/(--[a-z-]+) (?:FILE|RIG\.toml)( \([^)]*\))?/g, "$1").replace(/,? or add --mend \S+(?: or --mend \S+)*\.?$/, ", or press a button below.")
+  return text.replace(/ \(--columns(?: MAP\.toml)?\)/g, "").replace(/(--[a-z-]+) (?:FILE|RIG\.toml)( \([^)]*\))?/g, "$1").replace(/, (or )?add --mend \S+(?:(?: or)? --mend \S+)*$/, ", $1press a button below.")
     .replace(/--[a-z][a-z-]*/g, option => CONTROLS[option] ?? `${option} of the command line`);
 }
 
@@ -477,7 +477,7 @@ function showResult({ result, status, screen, files: outputs }) {
   const isRefused = status === "refused";
   const key = verdict.status === "refused" && !isRefused ? "forced" : verdict.status;
   parts.push(element("div", { className: `card ${verdict.status}` }, element("p", { className: "verdict" }, VERDICTS[key]),
-    list(verdict.reasons.map(spoken)), isRefused ? remedies(verdict.reasons) : null));
+    list(verdict.reasons.map(spoken)), remedies(verdict.reasons, isRefused)));
   if (!isRefused && rows.length) {
     const [quantity, judged, before, after] = rows[0];
     const value = (name, text) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
@@ -508,9 +508,10 @@ const percent = share => share < 0.01 ? "under 1 %" : share > 0.99 ? "over 99 %"
 
 const outputName = outputs => outputs.find(({ name }) => /_calibrated\.(json|urdf)$/.test(name))?.name ?? "calibrated.urdf";
 
-// Buttons for the remedies that the reasons name.
-function remedies(reasons) {
+// Buttons for the remedies that the reasons name; null without one.
+function remedies(reasons, isRefused) {
   const keys = [...reasons.join(" ").matchAll(/--mend (\S+?)[.,;)]?(?=\s|$)/g)].map(match => match[1]).filter(key => !mends.includes(key));
+  if (!keys.length && !isRefused) return null;
   const out = element("div", { className: "buttons" });
   // Several keys are alternatives.
   for (const key of keys) {
@@ -519,9 +520,11 @@ function remedies(reasons) {
     apply.onclick = () => { mends.push(key); showMends(); calibrate(); };
     out.append(apply);
   }
-  const force = element("button", { type: "button" }, "Write the robot all the same");
-  force.onclick = () => calibrate(true);
-  out.append(force);
+  if (isRefused) {
+    const force = element("button", { type: "button" }, "Write the robot all the same");
+    force.onclick = () => calibrate(true);
+    out.append(force);
+  }
   return out;
 }
 

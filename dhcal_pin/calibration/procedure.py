@@ -191,8 +191,9 @@ def calibrate(
         result = _calibrate_images(setup, begun, groups)
     else:
         fit, found = reweighted(begun.fit, robust.LOSSES[loss].stages), begun.session
-        if found and (scale := find_scale(fit.problem, fit.solution.x)):
-            found = replace(found, scales=(*found.scales, scale))
+        # A scale of one axis, which the fit does not contain, makes the robot longer or shorter, too.
+        if found and not found.scales and (scale := find_scale(fit.problem, fit.solution.x)):
+            found = replace(found, scales=(scale,))
         result = _calibrate_samples(setup, replace(begun, fit=fit), groups, extended)
         result = replace(result, session=found)
     return replace(result, **settings)

@@ -494,6 +494,8 @@ def _plausible_cause(fit: Evidence) -> str:
         )
     if fit.session and fit.session.lag:
         return f"{fit.session.lag.finding} {fit.session.lag.consequence}"
+    if fit.session and fit.session.scales:
+        return fit.session.scales[0].finding
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"
@@ -619,6 +621,8 @@ def _overfitting(fit: Evidence) -> float:
 
 def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
+    if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
+        return []  # No part of the correction is applied.
     return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
 
 
@@ -649,7 +653,7 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{_needed_configurations(fit, limit)} different poses."
+        f"{_needed_configurations(fit, limit)} different poses{' to be fitted' * bool(fit.holdout)}."
     )
     return [Finding("caution", text)]
 

@@ -78,6 +78,7 @@ def _add_measurement_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sigma",
+        "--noise",
         metavar="[PIXELS,]LENGTH[,ANGLE]",
         help="standard deviation per axis of instrument and robot repeatability (default: as in --data, else "
         f"{DEFAULT_SIGMA}); with --rig, of corners in the image and of the robot (default: "

@@ -72,7 +72,9 @@ class Extrapolation:
             for name, value in self.max_excess.items()
         ]
         if not exceeding:
-            text = "No joint is beyond its measured range, but the combinations of joint values are new."
+            text = (
+                "No joint is beyond its measured range, but the combinations of joint values are new or rare."
+            )
             return [*out, text]
         more = f" and {len(exceeding) - _MAX_JOINTS} more joints" if len(exceeding) > _MAX_JOINTS else ""
         return [*out, f"Beyond the measured range: {', '.join(exceeding[:_MAX_JOINTS])}{more}."]

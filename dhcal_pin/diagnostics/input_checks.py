@@ -261,14 +261,21 @@ def _check_lengths(chain: Chain, file: MeasurementFile) -> list[str]:
             if median > largest_plausible:
                 out.append(
                     f"{name} is {_format_as_written(median, unit)}, but the robot reaches {reach:.2g} m; "
-                    f"if the values are millimetres, write {name}[mm]"
+                    f"{_other_unit([name], file, 'mm')}"
                 )
             elif 0 < largest < smallest_plausible:
                 out.append(
-                    f"{name} is at most {_format_as_written(largest, unit)}; "
-                    f"if the values are metres, write {name}[m]"
+                    f"{name} is at most {_format_as_written(largest, unit)}; {_other_unit([name], file, 'm')}"
                 )
     return out
+
+
+def _other_unit(names: Sequence[str], file: MeasurementFile, unit: str) -> str:
+    """Say how to write that columns are in another unit, unless the file states this unit."""
+    if any(file.units.get(name) == unit for name in names):
+        return "check the values"
+    word = {"mm": "millimetres", "m": "metres"}[unit]
+    return f"if they are {word}, write {','.join(f'{name}[{unit}]' for name in names)}"
 
 
 def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) -> list[str]:
@@ -285,8 +292,7 @@ def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) ->
         along = f" along {' and '.join(large)}" if 0 < len(large) < 3 else ""
         return [
             f"the positions spread {_format_as_written(spread, unit)} around their centre{along}, but the "
-            f"robot reaches {reach:.2g} m; if they are millimetres, write "
-            f"{','.join(f'{axis}[mm]' for axis in large or 'xyz')}"
+            f"robot reaches {reach:.2g} m; {_other_unit(large or 'xyz', file, 'mm')}"
         ]
     modelled_spread = median_radius(modelled)
     if not 0 < spread < modelled_spread / _MIN_SCALE:
@@ -295,8 +301,7 @@ def _check_position_spread(chain: Chain, file: MeasurementFile, reach: float) ->
     if scaled_misfit < _MAX_SCALED_MISFIT * modelled_spread:
         return [
             f"the positions spread {_format_as_written(spread, unit)} around their centre, but the robot "
-            f"moves its tip by {_format_as_written(modelled_spread, unit)}; if they are metres, write "
-            "x[m],y[m],z[m]"
+            f"moves its tip by {_format_as_written(modelled_spread, unit)}; {_other_unit('xyz', file, 'm')}"
         ]
     return []
 

@@ -134,6 +134,11 @@ def _read_dh_toml(path: PathLike) -> DHTable:
 def _read_dh_csv(path: PathLike) -> DHTable:
     table = read_table(path, TextLayout(header_example=_CSV_HEADER))
     table.require_good_rows()
+    if not table.columns.keys() & {"joint", *_REQUIRED}:
+        raise FileFormatError(
+            f"{table.source}: expected a DH table with the header {_CSV_HEADER}; the file of the robot comes "
+            "first, then measurements"
+        )
     notes = _notes(table)
     convention = notes.get("convention")
     if convention not in CONVENTIONS:

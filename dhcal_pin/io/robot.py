@@ -176,11 +176,11 @@ def _read(
     robot_format = find_format(path)
     table = None
     if robot_format is not None and robot_format.read_table is not None:
+        table = robot_format.read_table(path)
         if tip is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one tip; leave out --tip")
         if root is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one root; leave out --root")
-        table = robot_format.read_table(path)
         chain = Chain.from_dh(table, robot_name(path))
     else:
         chain = Chain.from_urdf(replace(_read_urdf(path), package_dirs=folders), tip, root)

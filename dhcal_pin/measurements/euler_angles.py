@@ -18,6 +18,8 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 
+#: Notation of rotation vectors, which are three numbers, too.
+ROTATION_VECTOR = "rotvec"
 _FIXED = "fixed-"
 _RPY = "rpy"
 _ORDERS = [*("".join(axes) for axes in permutations("xyz")), *(a + b + a for a, b in permutations("xyz", 2))]

@@ -51,9 +51,9 @@ class PoseMeasurement(Measurement):
         poses: Measured homogeneous matrices, (m, 4, 4).
         sigma: Standard deviations of the position, (m, 3) [m].
         rotation_sigma: Standard deviations of the rotation vector, (m, 3) [rad].
-        notations: Notation of the Euler angles that each rotation was read from, (m,), see `euler_angles`;
-            empty texts for rotations that were not read from Euler angles.
-        angles: These angles, (m, 3) [rad]; NaN if they are not known.
+        notations: Notation of the Euler angles or rotation vector that each rotation was read from, (m,), see
+            `euler_angles`; empty texts for rotations that were read from neither.
+        angles: These angles or components, (m, 3) [rad]; NaN if they are not known.
     """
 
     poses: Array
@@ -93,12 +93,12 @@ class PoseMeasurement(Measurement):
         )
 
     def with_euler_angles(self, notation: str, angles: Array) -> Self:
-        """Return the same rotations with the Euler angles that they were read from.
+        """Return the same rotations with the Euler angles or rotation vectors that they were read from.
 
         Args:
-            notation: Axes such as "zyx", with "fixed-" before axes that do not rotate, or "rpy"; empty if the
-                rotations were not read from Euler angles.
-            angles: Angles in the order of the axes, (m, 3) [rad].
+            notation: Axes such as "zyx", with "fixed-" before axes that do not rotate, or "rpy"; "rotvec" for
+                rotation vectors; empty if the rotations were read from neither.
+            angles: Angles in the order of the axes, or components, (m, 3) [rad].
 
         Returns:
             Copy that knows the angles. Poses stay as they are.

@@ -24,7 +24,12 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement
-from ..measurements.euler_angles import EULER_NOTATIONS, angles_to_matrix, matrix_to_angles
+from ..measurements.euler_angles import (
+    EULER_NOTATIONS,
+    ROTATION_VECTOR,
+    angles_to_matrix,
+    matrix_to_angles,
+)
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
@@ -221,7 +226,7 @@ class QuaternionOrder:
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the rotations of the reordered quaternions."""
-        if _notations([item]) != {""}:
+        if not _notations([item]) <= _COMPUTED:
             return None
         # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
         step = 1 if self.order == "xyzw" else -1
@@ -260,7 +265,7 @@ class RotationUnit:
             angles = ANGLES["deg"] * _numbers(item, notation)
             if np.abs(angles).max(initial=0.0) > 2 * np.pi:
                 return None
-            changed = _with_rotations(item, lambda _: angles_to_matrix(angles, notation))
+            changed = _with_rotations(item, lambda _: _rotations(angles, notation))
             return changed and changed.with_euler_angles(notation, angles)
         vectors = se3.log3(item.poses[:, :3, :3])
         if np.linalg.norm(vectors, axis=1).max(initial=0.0) > _MAX_SMALL_ROTATION:
@@ -268,12 +273,12 @@ class RotationUnit:
         return _with_rotations(item, lambda _: se3.exp3(ANGLES["deg"] * vectors))
 
 
-# Key and description of rotation vectors as a notation of a rotation by three numbers.
-_ROTVEC = "rotvec"
 # Notations of a rotation by three numbers.
-_NOTATIONS: dict[str, str] = {_ROTVEC: "rotation vectors", **EULER_NOTATIONS}
-# Notations that are tried both ways if a file does not have Euler angles: others made its rotations of them.
-_USUAL_NOTATIONS = (_ROTVEC, "xyz", "zyx", "rpy", "zyz")
+_NOTATIONS: dict[str, str] = {ROTATION_VECTOR: "rotation vectors", **EULER_NOTATIONS}
+# Notations of rotations that another program may have computed from Euler angles or quaternions.
+_COMPUTED = {"", ROTATION_VECTOR}
+# Notations that are tried both ways for these.
+_USUAL_NOTATIONS = (ROTATION_VECTOR, "xyz", "zyx", "rpy", "zyz")
 
 
 @dataclass(frozen=True)
@@ -285,30 +290,33 @@ class OtherNotation:
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the poses with the rotations of the true notation."""
-        if not isinstance(item, PoseMeasurement) or not np.isin(item.notations, ("", self.read)).all():
+        if not isinstance(item, PoseMeasurement) or not _notations([item]) <= {*_COMPUTED, self.read}:
             return None
         numbers = _numbers(item, self.read)
-        is_vector = self.true == _ROTVEC
-        changed = _with_rotations(
-            item, lambda _: se3.exp3(numbers) if is_vector else angles_to_matrix(numbers, self.true)
-        )
-        if changed is None or _notations([item]) == {""}:
+        changed = _with_rotations(item, lambda _: _rotations(numbers, self.true))
+        if changed is None or self.read not in _notations([item]):
             return changed
-        return changed.with_euler_angles("" if is_vector else self.true, numbers)
+        return changed.with_euler_angles(self.true, numbers)
+
+
+def _rotations(numbers: Array, notation: str) -> Array:
+    """Return the rotations (m, 3, 3) of three numbers each, (m, 3) [rad], in a notation."""
+    return se3.exp3(numbers) if notation == ROTATION_VECTOR else angles_to_matrix(numbers, notation)
 
 
 def _numbers(item: PoseMeasurement, notation: str) -> Array:
-    """Return the numbers (m, 3) of rotations in a notation; angles of the file where they are known.
+    """Return the numbers (m, 3) of rotations in a notation; those of the file where they are known.
 
     Other angles can give the same rotation in this notation, and another one in the true notation.
     """
     rotations = item.poses[:, :3, :3]
-    computed = se3.log3(rotations) if notation == _ROTVEC else matrix_to_angles(rotations, notation)
-    return np.where(np.isnan(item.angles), computed, item.angles)
+    computed = se3.log3(rotations) if notation == ROTATION_VECTOR else matrix_to_angles(rotations, notation)
+    is_known = (item.notations == notation)[:, None] & ~np.isnan(item.angles)
+    return np.where(is_known, item.angles, computed)
 
 
 def _notations(data: Sequence[Measurement]) -> set[str]:
-    """Return the notations of rotations that were read from Euler angles, and "" for other rotations."""
+    """Return the notations of rotations that were read from three numbers, and "" for other rotations."""
     return {text for item in data if isinstance(item, PoseMeasurement) for text in set(item.notations)}
 
 
@@ -532,25 +540,32 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
     """Yield wrong units of joints, lengths, and rotation vectors or Euler angles."""
     n, revolute = chain.n_joints, [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
-    for members, large, small, factor in (
-        (revolute, "deg", "rad", ANGLES["deg"]),
-        ([j for j in range(n) if j not in revolute], "mm", "m", LENGTHS["mm"]),
+    for members, kind, large, small, factor in (
+        (revolute, "revolute", "deg", "rad", ANGLES["deg"]),
+        ([j for j in range(n) if j not in revolute], "prismatic", "mm", "m", LENGTHS["mm"]),
     ):
         groups = [members, *([j] for j in members if len(members) > 1)] if members else []
         for group in groups:
             is_single = len(group) == 1
             name = chain.joint_names[group[0]] if is_single else ""
-            key, label = (f"joint:{name}", f"joint {name} is") if is_single else ("joints", "the joints are")
+            key, label = (f"joint:{name}", f"joint {name}") if is_single else ("joints", f"all {kind} joints")
             for true, read, value in ((large, small, 1 / factor), (small, large, factor)):
                 factors = [value if i in group else 1.0 for i in range(n)]
-                text = f"{label} in {true}, but {'was' if is_single else 'were'} read as {read}"
+                text = f"the values of {label} are {_misread(true, read, value)}"
                 yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
     for true, read in permutations(("m", "mm", "in"), 2):
-        text = f"measured lengths are in {true}, but were read as {read}"
-        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(LENGTHS[read] / LENGTHS[true]))
-    numbers = "Euler angles" if all(_notations(data) or [""]) else "rotation vectors"
-    text = f"measured {numbers} are in rad, but were read as deg"
+        factor = LENGTHS[read] / LENGTHS[true]
+        text = f"measured lengths are {_misread(true, read, factor)}"
+        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(factor))
+    numbers = "rotation vectors" if _notations(data) & _COMPUTED else "Euler angles"
+    text = f"measured {numbers} are {_misread('rad', 'deg', ANGLES['deg'])}"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
+
+
+def _misread(true: str, read: str, factor: float) -> str:
+    """Describe values that a factor corrects; their unit in the file may be another one than `read`."""
+    times, word = (factor, "small") if factor > 1 else (1 / factor, "large")
+    return f"{times:.4g} times too {word}, as if {true} had been read as {read}"
 
 
 def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
@@ -560,7 +575,7 @@ def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
         factor = LENGTHS[true] / LENGTHS[read]
         expected = max(np.delete(spreads, i)) * np.sqrt(factor)
         if (spreads[i] < expected) if factor < 1 else (spreads[i] > expected):
-            text = f"measured {axis} is in {true}, but was read as {read}"
+            text = f"measured {axis} is {_misread(true, read, 1 / factor)}"
             yield Hypothesis(f"{axis}:{true}-not-{read}", text, AxisScale(i, factor))
 
 
@@ -586,9 +601,11 @@ def _rotation_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
     notations = _notations(data)
     known = sorted(notations - {""})
     pairs = [(read, true) for read in known for true in _NOTATIONS if true != read]
-    if "" in notations:
+    if notations & _COMPUTED:
         for order in QUATERNION_ORDERS:
             text = f"quaternions are in the order {' '.join(order)}, but were read in the other one"
+            if "" not in notations:
+                text = f"the rotation vectors come from quaternions: {text}"
             yield Hypothesis(f"quaternions:{order}", text, QuaternionOrder(order))
         pairs += permutations(_USUAL_NOTATIONS, 2)
     for read, true in dict.fromkeys(pairs):

@@ -88,13 +88,18 @@ def download(page: Any, name: str) -> bytes:
     return Path(waiting.value.path()).read_bytes()
 
 
-def wrong_sign(example: Path) -> str:
-    """The measurements with the other sign of the elbow."""
+def multiplied(example: Path, column: int, factor: float) -> str:
+    """The measurements with a factor of one column."""
     lines = [line for line in (example / "laser.csv").read_text().splitlines() if line[0] != "#"]
     rows = [line.split(",") for line in lines]
     for row in rows[1:]:
-        row[2] = str(-float(row[2]))
+        row[column] = str(factor * float(row[column]))
     return "\n".join(map(",".join, rows))
+
+
+def wrong_sign(example: Path) -> str:
+    """The measurements with the other sign of the elbow."""
+    return multiplied(example, 2, -1)
 
 
 def test_dropped_files_end_in_the_robot_of_the_command_line(page, example):
@@ -156,6 +161,21 @@ def test_refusal_shows_the_remedy_and_applies_it(page, example):
     drop(page, ("laser.csv", "x"))
     assert page.is_hidden("#mends")
     assert page.is_hidden("#result")
+
+
+def test_a_caution_has_the_buttons_of_which_it_speaks(page, example):
+    urdf, _ = example_files(example)
+    drop_with_tip(page, urdf, ("laser.csv", multiplied(example, 8, 1.002)))
+    page.click("#calibrate")
+    page.wait_for_selector("#result .card.caution")
+    shown = page.inner_text("#result .card.caution")
+    assert "Measured z is 0.2 % too long" in shown
+    assert "press a button below" in shown
+    assert "--mend" not in shown
+    assert page.locator("text=Write the robot all the same").count() == 0
+    page.click("text=Apply the change and calibrate again")
+    page.wait_for_selector("#result .card.ok")
+    assert "scale:z:1.002" in page.inner_text("#mends")
 
 
 def test_a_loaded_page_shows_its_calibration_again(page, example):
@@ -235,6 +255,9 @@ def test_a_proposed_column_map_is_used(page, example):
     urdf, _ = example_files(example)
     drop_with_tip(page, urdf, ("tracker.csv", "\n".join([header, *rows])))
     page.wait_for_selector("#check .card.problem")
+    page.click("#calibrate")
+    page.wait_for_selector("#run-error:not([hidden])")
+    assert "write a column map with the lines" in page.inner_text("#run-error")
     page.click("text=Use this column map")
     page.wait_for_selector("#check .card.ok")
     page.click("#calibrate")

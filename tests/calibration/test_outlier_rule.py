@@ -197,6 +197,26 @@ def test_few_samples_that_cannot_show_outliers_are_not_ok(kind):
     assert calibrate(more.chain, more.measure(Position), extend="none").verdict.status == "ok"
 
 
+def test_needed_poses_do_not_count_those_that_are_held_out():
+    simulation = Simulation("ur10", 24, 35)
+    data = simulation.measure(Position)
+    held_out, fitted = data.take(np.s_[-8:]), data.take(np.s_[:-8])
+    for holdout, end in ((held_out, " different poses to be fitted."), ((), " different poses.")):
+        reasons = calibrate(simulation.chain, fitted, holdout=holdout, extend="none").verdict.reasons
+        (reason,) = (text for text in reasons if text.startswith("So few samples"))
+        assert reason.endswith(end)
+
+
+def test_a_kept_robot_has_no_part_of_the_correction():
+    simulation = Simulation("ur10", 9, 2)
+    data = simulation.measure(Position)
+    held_out, fitted = data.take(np.s_[-2:]), data.take(np.s_[:-2])
+    verdict = calibrate(simulation.chain, fitted, holdout=held_out, extend="none").verdict
+    assert verdict.keeps_nominal
+    (reason,) = (text for text in verdict.reasons if "correction" in text)
+    assert reason.endswith("No correction is applied; measure more poses.")
+
+
 def test_repeated_samples_do_not_show_outliers_but_stated_noise_does():
     simulation = Simulation("ur10", 18, 35)
     data = simulation.measure(Position)

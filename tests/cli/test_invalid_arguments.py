@@ -27,6 +27,10 @@ ARGUMENTS = {
         ["calibrate", "arm.urdf", "data.csv", "-o", "out.urdf", "--tip", "tool"],
         ["'tool'", "'tool0'"],
     ),
+    "data before the robot": (
+        ["calibrate", "data.csv", "arm.urdf", "--tip", "tool0", "-o", "out.urdf"],
+        ["data.csv: expected a DH table", "the file of the robot comes first"],
+    ),
     "tip of a table": ([*CALIBRATE, "--tip", "tool0"], ["arm.dh.toml", "leave out --tip"]),
     "unknown set": ([*CALIBRATE, "--parameters", "dh,gains"], ["'gains'", "dh, modified-dh"]),
     "empty set": ([*CALIBRATE, "--parameters", ""], ["''", "dh, modified-dh"]),

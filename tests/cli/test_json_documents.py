@@ -84,8 +84,8 @@ def test_old_and_new_names_of_options_do_the_same(run, robot_folder):
         texts.append(Path("s.csv").read_text())
     assert texts[0] == texts[1]
     plans = []
-    for word in ("-n", "-m", "--samples"):
-        words = ["arm.dh.toml", word, "8", "--candidates", "50", "-o", "p.csv"]
+    for word, noise in (("-n", "--sigma"), ("-m", "--noise"), ("--samples", "--sigma")):
+        words = ["arm.dh.toml", word, "8", noise, "0.1mm,0.01deg", "--candidates", "50", "-o", "p.csv"]
         status, _, err = run("plan", *words)
         assert status == 0, err
         plans.append(Path("p.csv").read_text())

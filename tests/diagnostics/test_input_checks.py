@@ -47,6 +47,16 @@ def test_a_wrong_unit_gives_one_warning(warnings_of, ur10, kind, units, expected
     assert len(found) <= (6 if expected.startswith("if the values are degrees") else 1)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("m", 1e-3)])
+def test_the_unit_of_the_header_is_not_advised(warnings_of, ur10, unit, factor):
+    header, *rows = csv_text_of(ur10, joint_positions(ur10), kind="position", length=unit).splitlines()
+    columns = np.array([row.split(",") for row in rows], float)
+    columns[:, [cell[0] in "xyz" for cell in header.split(",")]] *= factor
+    (found,) = warnings_of(ur10, "\n".join([header, *(",".join(map(str, row)) for row in columns)]))
+    assert "the positions spread" in found
+    assert found.endswith("; check the values")
+
+
 @pytest.mark.parametrize("wrong", ["z", "x,y"])
 def test_only_the_coordinates_in_millimetres_are_named(warnings_of, ur10, wrong):
     header, *rows = csv_text_of(ur10, joint_positions(ur10), kind="position", length="m").splitlines()
@@ -63,7 +73,10 @@ def test_only_the_coordinates_in_millimetres_are_named(warnings_of, ur10, wrong)
 
 @pytest.mark.parametrize(
     ("declared", "true", "expected"),
-    [("rad", "deg", "more than a turn"), ("deg", "rad", "rotation vectors are in rad, but were read as deg")],
+    [
+        ("rad", "deg", "more than a turn"),
+        ("deg", "rad", "rotation vectors are 57.3 times too small, as if rad had been read as deg"),
+    ],
 )
 def test_rotation_vectors_in_the_wrong_unit(warnings_of, ur10, declared, true, expected):
     (text,) = warnings_of(

@@ -226,8 +226,30 @@ def test_euler_angles_in_radians_that_were_read_as_degrees_are_named(ur10):
     wrong = wrong.with_euler_angles("zyx", small)
     found = diagnose_mixups(ur10, [wrong])
     assert [hypothesis.key for hypothesis in found.hypotheses] == ["rotations:rad-not-deg"]
-    assert "Euler angles are in rad" in found.sentence
+    assert "Euler angles are 57.3 times too small, as if rad" in found.sentence
     np.testing.assert_allclose(mend(ur10, wrong, "rotations:rad-not-deg").poses, data.poses, atol=1e-9)
+
+
+@pytest.mark.parametrize(("true", "key"), [("xyz", "rpy"), ("ZYX", "zyx")])
+def test_euler_angles_that_were_read_as_rotation_vectors_are_mended_in_all_rows(ur10, true, key):
+    """The file has longer vectors than rotations have: their matrices do not show the angles."""
+    data = measured(Pose)
+    angles = Rotation.from_matrix(data.rotations()).as_euler(true)
+    assert np.linalg.norm(angles, axis=1).max() > np.pi
+    wrong = with_rotations(data, lambda _: Rotation.from_rotvec(angles).as_matrix())
+    wrong = wrong.with_euler_angles("rotvec", angles)
+    (found,) = diagnose_mixups(ur10, [wrong]).hypotheses
+    assert found.key == f"rotations:{key}-not-rotvec"
+    assert found.description.endswith("but were read as rotation vectors")
+    np.testing.assert_allclose(mend(ur10, wrong, found.key).poses, data.poses, atol=1e-9)
+
+
+def test_rotation_vectors_of_another_program_may_come_from_quaternions(ur10):
+    wrong = with_rotations(measured(Pose), quaternions_in_another_order)
+    wrong = wrong.with_euler_angles("rotvec", Rotation.from_matrix(wrong.rotations()).as_rotvec())
+    (found,) = diagnose_mixups(ur10, [wrong]).hypotheses
+    assert found.description.startswith("the rotation vectors come from quaternions: ")
+    np.testing.assert_allclose(mend(ur10, wrong, found.key).poses, measured(Pose).poses, atol=1e-9)
 
 
 def test_a_turn_of_the_frame_is_one_mistake_and_not_two_about_the_axes(ur10):

@@ -332,7 +332,7 @@ def test_the_page_is_accessible_and_fits(browser, path, checked):
 
 def test_sections_are_folded_on_a_small_screen(open_page):
     page = open_page(viewport={"width": 390, "height": 800})
-    sections = page.locator("main > section[id]:not(#samples)")
+    sections = page.locator("main > section[id]")
     assert sections.count() > 5
     assert all("folded" in (section.get_attribute("class") or "") for section in sections.all())
     height = page.evaluate("document.documentElement.scrollHeight")
@@ -344,6 +344,11 @@ def test_sections_are_folded_on_a_small_screen(open_page):
     assert page.evaluate("document.documentElement.scrollHeight") > height
     page.locator(".contents a").last.click()
     assert page.locator("main > section.folded").count() <= sections.count() - 1
+    # A button of a plot's sample leads to its row in the list.
+    assert page.is_hidden("#samples tbody")
+    page.evaluate("document.querySelector('#samples tbody tr').click()")
+    page.click("text=Show in table")
+    assert page.locator("#samples tr.chosen").is_visible()
     page.emulate_media(media="print")
     assert all(heading.is_visible() for heading in page.locator("main table").all()[:3])
     page.close()

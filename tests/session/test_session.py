@@ -514,9 +514,11 @@ def test_no_joint_errors_or_steps_are_fitted_to_a_lag(lag, seed):
     assert simulation.true_error(fit.chain) <= 2 * clean.true_error(expected.chain)
 
 
-@pytest.mark.parametrize("scales", [(1.0, 1.0, 1.003), (1.015, 1.015, 1.015)])
-def test_a_wrong_scale_is_found_and_mended(scales):
-    simulation = Simulation("ur10", 100, 6)
+@pytest.mark.parametrize(
+    ("scales", "seed"), [((1.0, 1.0, 1.003), 6), ((1.0, 1.0, 1.02), 7), ((1.015, 1.015, 1.015), 6)]
+)
+def test_a_wrong_scale_is_found_and_mended(scales, seed):
+    simulation = Simulation("ur10", 100, seed)
     data = simulation.measure(Position, Changes(scales=scales))
     fit = calibrate(simulation.chain, data, extend="none")
     (scale,) = session_of(fit).scales
@@ -530,6 +532,16 @@ def test_a_wrong_scale_is_found_and_mended(scales):
     mended = calibrate(simulation.chain, mend(simulation.chain, data, key), extend="none")
     assert not session_of(mended).scales
     assert simulation.true_error(mended.chain) < 0.3 * before
+
+
+def test_a_large_scale_is_the_cause_of_the_errors_that_it_leaves():
+    simulation = Simulation("ur10", 100, 6)
+    data = simulation.measure(Position, Changes(scales=(1.0, 1.0, 1.1)))
+    fit = calibrate(simulation.chain, data, extend="none")
+    first, second = fit.verdict.reasons
+    assert first.startswith("The fit leaves an RMS position error of")
+    assert first.endswith("mm. Measured z is 10 % too long compared with the other axes.")
+    assert second.startswith("Measured z is 10 % too long")
 
 
 @pytest.mark.parametrize("factor", [1, 20])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ...formatting import Table
     from ...paper import PaperExperiment
 
-EXAMPLE = "dhcal demo --out demo"
+EXAMPLE = "dhcal demo -o demo"
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -43,6 +43,15 @@ COMMANDED = ("commanded_x", "commanded_y", "commanded_z")
 AFTER = ("after_x", "after_y", "after_z")
 # Pose of the tip, which image coordinates may have in place of the values of all joints.
 TOOL_POSE = ("x", "y", "z", *ROTVEC)
+# Columns of Kawasaki's angles. Beside other columns than X, Y and Z these letters can mean anything.
+KAWASAKI = ("o", "a", "t")
+# Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes, W, P, R of FANUC.
+EULER_NOTATIONS: Mapping[tuple[str, ...], tuple[str, str]] = {
+    ("a", "b", "c"): ("ZYX", "intrinsic"),
+    ("roll", "pitch", "yaw"): ("XYZ", "extrinsic"),
+    ("w", "p", "r"): ("XYZ", "extrinsic"),
+    KAWASAKI: ("ZYZ", "intrinsic"),
+}
 # Prefix of a joint's name in the columns of the second configuration of a row.
 SECOND_PREFIX = "to:"
 
@@ -174,7 +183,7 @@ def joints_off_the_chain(chain: Chain) -> list[str]:
 
 
 def needs_column_map(table: DataTable, chain: Chain) -> bool:
-    """Return whether a file has no header, or one that names no joint or no measured value.
+    """Return whether a file has no header, one that names no joint or no measured value, or Euler angles.
 
     A file with too few unknown columns to be described by a map does not need one.
     """
@@ -185,10 +194,22 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
         return False
     names = set(table.columns)
     joints = {*joint_column_names(chain.joint_names)}
+    if euler_columns(table, chain):
+        return True
     n_unknown = len(names - known_columns(chain))
     if set(values.columns) & VALUE_COLUMNS:
         return not names & joints and n_unknown >= chain.n_joints
     return n_unknown >= (1 if names & joints else chain.n_joints)
+
+
+def euler_columns(table: DataTable, chain: Chain) -> list[str]:
+    """Return the names of Euler angles beside the joints of a robot and x, y and z; empty without them."""
+    columns = {name.lower(): name for name in table.columns if name not in chain.joint_names}
+    if not {*chain.joint_names, "x", "y", "z"} <= table.columns.keys():
+        return []
+    known = known_columns(chain)
+    found = [[columns[key] for key in keys] for keys in EULER_NOTATIONS if columns.keys() >= set(keys)]
+    return next((names for names in found if not known.issuperset(names)), [])
 
 
 def check_columns(table: DataTable, chain: Chain) -> list[str]:

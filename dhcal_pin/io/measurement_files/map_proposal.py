@@ -15,11 +15,12 @@ import numpy as np
 
 from ..._typing import Array
 from ...exceptions import FileFormatError
+from ...formatting import join_names
 from ...messages import quote
 from ...robot.chain import Chain
-from ...units import LENGTHS
+from ...units import ANGLES, LENGTHS
 from ..tables import DataTable
-from .columns import joint_units
+from .columns import EULER_NOTATIONS, KAWASAKI, euler_columns, joint_units
 
 # Joint positions beyond this are degrees [rad]; lengths beyond this are millimetres [m].
 _MAX_RADIANS, _MAX_METRES = 2 * np.pi + 0.1, 20.0
@@ -67,8 +68,9 @@ def propose_map(table: DataTable, chain: Chain) -> list[str]:
 
 def _choose_joints(table: DataTable, chain: Chain, columns: Mapping[int, Array]) -> list[int]:
     """Return the columns of the joints: those of their names, otherwise the first n ones of numbers."""
-    if set(chain.joint_names) <= set(table.headers):
-        return [table.headers.index(name) for name in chain.joint_names]
+    named = {} if table.has_numbers_as_header else table.columns
+    if named.keys() >= set(chain.joint_names):
+        return [named[name].index for name in chain.joint_names]
     indices, n = list(columns), chain.n_joints
     # A counter of the rows is no joint.
     if len(indices) > n + 3 and _counts_rows(columns[indices[0]]):
@@ -104,24 +106,13 @@ def _is_axis(header: str, axis: str) -> bool:
     return bool(re.search(rf"(?<![a-z]){axis}(?![a-z])", header)) and not re.search(_NOT_MEASURED, header)
 
 
-# Columns of Kawasaki's angles. Beside other columns than X, Y and Z these letters can mean anything.
-_KAWASAKI = ("o", "a", "t")
-# Axes and frame of Euler angles by their columns: A, B, C of KUKA; angles about fixed axes, W, P, R of FANUC.
-_EULER_NOTATIONS: Mapping[tuple[str, ...], tuple[str, str]] = {
-    ("a", "b", "c"): ("ZYX", "intrinsic"),
-    ("roll", "pitch", "yaw"): ("XYZ", "extrinsic"),
-    ("w", "p", "r"): ("XYZ", "extrinsic"),
-    _KAWASAKI: ("ZYZ", "intrinsic"),
-}
-
-
 def _rotation_line(
     table: DataTable, position: Sequence[int], turns: Sequence[int], columns: Mapping[int, Array]
 ) -> list[str]:
     """Return the line of the rotation, if columns for one follow the position."""
     if table.has_numbers_as_header:
         candidates = list(turns)
-    elif _first_words(table, (*position, *turns[:3])) == ("x", "y", "z", *_KAWASAKI):
+    elif _first_words(table, (*position, *turns[:3])) == ("x", "y", "z", *KAWASAKI):
         candidates = list(turns[:3])
     else:
         candidates = [i for i in turns if re.search(_ROTATION, table.headers[i].lower())]
@@ -134,13 +125,13 @@ def _rotation_line(
     if len(candidates) < 3:
         return []
     unit = _unit(table, candidates[0], np.stack([columns[i] for i in candidates[:3]]), is_length=False)
-    names = _names(table, candidates[:3])
-    if unit == "rad":
+    names, words = _names(table, candidates[:3]), _first_words(table, candidates[:3])
+    if unit == "rad" and words not in EULER_NOTATIONS:
         return [f'rotation = {{convention = "rotvec", columns = {names}, unit = "rad"}}']
-    axes, frame = _EULER_NOTATIONS.get(_first_words(table, candidates[:3]), ("XYZ", "intrinsic"))
+    axes, frame = EULER_NOTATIONS.get(words, ("XYZ", "intrinsic"))
     return [
         f'rotation = {{convention = "euler", axes = "{axes}", frame = "{frame}", columns = {names}, '
-        f'unit = "deg"}}'
+        f'unit = "{unit}"}}'
     ]
 
 
@@ -161,6 +152,10 @@ def header_problem(table: DataTable, chain: Chain) -> str:
             f"{where}: column {quote(header)} is not understood; expected '{joint}[ticks]' for the counts "
             f"that the servo reports, with --servos FILE, or '{joint}[deg]' or '{joint}[rad]'; rename the "
             "columns of all joints"
+        )
+    if angles := euler_columns(table, chain):
+        return (
+            f"{where}: {join_names([*map(quote, angles)])} are Euler angles without their axes; remove them"
         )
     headers = [quote(header) for header in table.headers if header]
     n_more = len(headers) - _MAX_LISTED_NAMES
@@ -214,6 +209,9 @@ def _are_quaternions(values: Array) -> bool:
 def _unit(table: DataTable, index: int, values: Array, *, is_length: bool) -> str:
     """Return the unit that a header names, or that the size of the numbers (…, m) suggests."""
     header = "" if table.has_numbers_as_header else table.headers[index].lower()
+    written = re.search(r"\[(\w+)\]", header)
+    if written and written[1] in (LENGTHS if is_length else ANGLES):
+        return written[1]
     for unit in ("mm", "m") if is_length else ("deg", "rad"):
         if re.search(_HEADER_UNITS[unit], header):
             return unit

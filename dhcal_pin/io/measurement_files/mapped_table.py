@@ -151,11 +151,13 @@ def _apply_rule(vendor: _VendorTable, rule: ColumnRule) -> Array | list[str]:
 
 
 def _read_euler_angles(vendor: _VendorTable, notation: Rotation) -> EulerAngles | None:
-    """Read the Euler angles of a file; None if its rotations are of another convention."""
-    if notation.convention != "euler":
+    """Read the Euler angles of a file; NaN for matrices, None for rotation vectors and quaternions."""
+    if notation.convention in ("rotvec", "quaternion"):
         return None
-    angles = np.stack([vendor.values(name) for name in notation.columns], -1) / ANGLES[notation.unit]
     lines = np.array(vendor.table.lines)
+    if notation.convention == "matrix":
+        return EulerAngles("", lines, np.full((len(lines), 3), np.nan))
+    angles = np.stack([vendor.values(name) for name in notation.columns], -1) / ANGLES[notation.unit]
     return EulerAngles(euler_notation(notation.axes, notation.frame), lines, angles)
 
 
@@ -169,7 +171,7 @@ def _rotation_columns(
         return {
             column_header(name, notation.unit): values for name, values in zip(names, columns, strict=True)
         }
-    if euler is not None:
+    if euler is not None and euler.notation:
         rotations = angles_to_matrix(euler.angles, euler.notation)
     else:
         rotations = _orthonormalized(np.stack(columns, -1).reshape(-1, 3, 3), vendor.table)

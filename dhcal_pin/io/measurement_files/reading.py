@@ -26,6 +26,7 @@ from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, SampleError
 from ...measurements.base import Measurement
+from ...measurements.euler_angles import ROTATION_VECTOR
 from ...measurements.mounting import MountedRig
 from ...measurements.pose import Pose, PoseMeasurement
 from ...robot.chain import Chain
@@ -209,6 +210,10 @@ def _parse_table(
         euler = table.euler_angles
         used = np.searchsorted(euler.lines, data.rows)
         data = data.with_euler_angles(euler.notation, euler.angles[used])
+    elif isinstance(data, PoseMeasurement):
+        turn = [column.name for column in data.COLUMNS[3:]]
+        if measured.columns.keys() >= set(turn):
+            data = data.with_euler_angles(ROTATION_VECTOR, np.stack([values[name] for name in turn], -1))
     data = with_conditions(data, table, chain)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(

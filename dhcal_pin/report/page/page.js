@@ -14,10 +14,10 @@ function followContents() {
   for (const id of links.keys()) observer.observe(document.getElementById(id));
 }
 
-/** On a small screen, hides the content of all sections until their heading is pressed or a link leads there. */
+/** On a small screen, hides the content of all sections until their heading is pressed or a link or button leads there. */
 function foldSections() {
   if (!matchMedia("(max-width: 640px)").matches) return;
-  for (const section of document.querySelectorAll("main > section[id]:not(#samples)")) {
+  for (const section of document.querySelectorAll("main > section[id]")) {
     const title = section.querySelector("h2"), button = element("button", { type: "button", className: "fold" }, ...title.childNodes);
     const fold = isFolded => {
       section.classList.toggle("folded", isFolded);

@@ -182,6 +182,7 @@ class SampleTable {
     this.show();
   }
   scrollTo(i) {
+    this.body.closest("section.folded")?.querySelector(".fold").click();
     this.reveal(i);
     this.body.querySelector(".chosen")?.scrollIntoView({ block: "center" });
     this.body.querySelector(".chosen button")?.focus({ preventScroll: true });

@@ -187,7 +187,8 @@ def test_rotations_in_every_convention(read, how, columns):
     assert isinstance(data, Pose)
     assert data.has_stated_sigma
     np.testing.assert_allclose(data.rotations(), turns.as_matrix(), atol=5e-15)
-    assert np.isfinite(data.angles).all() == ("euler" in how)
+    assert np.isfinite(data.angles).all() == ("euler" in how or "rotvec" in how)
+    assert (data.notations == "rotvec").all() == ("rotvec" in how)
 
 
 def test_euler_angles_are_kept_for_the_rows_that_are_used(read):
@@ -224,6 +225,35 @@ def test_angles_of_makers_are_proposed_by_their_columns(tmp_path, arm, header, a
     line = f'axes = "{axes}", frame = "intrinsic", columns = {names}, unit = "deg"'
     assert (line in str(error.value)) == bool(axes)
     assert ("rotation =" in str(error.value)) == bool(axes)
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "order"),
+    [
+        ("ABC", "deg", "ZYX"),
+        ("ABC", "rad", "ZYX"),
+        ("WPR", "deg", "xyz"),
+        ("OAT", "deg", "ZYZ"),
+        (("roll", "pitch", "yaw"), "deg", "xyz"),
+    ],
+)
+def test_euler_angles_beside_named_joints_propose_a_map_that_reads_them(
+    read, arm, tmp_path, names, unit, order
+):
+    """Without their axes, which the map states, they are no measurement; they are not to be removed."""
+    header = [f"{joint}[deg]" for joint in reversed(JOINTS)] + ["x[cm]", "y[cm]", "z[cm]"]
+    text = "\n".join(
+        [",".join([*header, *(f"{name}[{unit}]" for name in names)]), "1,2,3,40,50,60,0.4,0.5,0.6"]
+    )
+    (tmp_path / "theirs.csv").write_text(text)
+    with pytest.raises(DhcalError, match="are Euler angles without their axes") as error:
+        read_measurements(tmp_path / "theirs.csv", arm)
+    data = read(text, "\n".join(line for line in str(error.value).split("`")[1::2])).data
+    assert isinstance(data, Pose)
+    np.testing.assert_allclose(np.rad2deg(data.q), [[3, 2, 1]])
+    np.testing.assert_allclose(data.positions(), [[0.4, 0.5, 0.6]])
+    expected = Rotation.from_euler(order, [0.4, 0.5, 0.6], degrees=unit == "deg").as_matrix()
+    np.testing.assert_allclose(data.rotations(), [expected], atol=1e-12)
 
 
 def test_a_second_configuration_is_read_back(read, arm):
