@@ -19,8 +19,9 @@ from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import diagnose_mixups
+from ..plausibility.mixups import diagnose_mixups, has_enough_rows
 from ..session import Session
+from ..session.linear_model import measures_positions
 from . import cameras
 from .cameras.arm_types import INDUSTRIAL, ArmType
 from .cross_validation import (
@@ -137,21 +138,27 @@ class Evidence(FittedModel):
 
     @cached_property
     def hand_eye_std(self) -> float | None:
-        """Largest standard deviation of the position of a camera or a board relative to the tool [m].
+        """Largest standard deviation of the position of a camera or a board relative to the arm [m].
 
-        It is that along the worst direction. Errors of the arm that no image shows, such as that of the
-        length of the last link, are not contained. None without images, if the arm is kept, whose errors
-        displace the camera by more, if the tool frame is estimated, too, and if no such position is.
+        It is that along the worst direction, relative to the tool. Errors of the arm that no image shows,
+        such as that of the length of the last link, are not contained. If the tool frame is estimated, too,
+        it is that of what stands still, in the frame of the measurements beside the images. None without
+        images, if the arm is kept, whose errors displace the camera by more, if no position is estimated,
+        and if nothing determines that frame.
         """
         tool_frame = self.errors.chain.tool_frame_index
         has_tool = any(p.error_frame == tool_frame for p in self.errors.parameters)
-        if self.rig is None or not self.errors.has_arm or has_tool:
+        if self.rig is None or not self.errors.has_arm:
             return None
+        names = [p.name for p in self.parameters]
+        if has_tool:
+            others = tuple(item for item in self.data if item.rig is None)
+            is_determined = measures_positions(others) and has_enough_rows(others)
+            return cameras.largest_fixed_std(self.rig, names, self.covariance) if is_determined else None
         count = len(self.errors.parameters)
         priors = Uncertainty.from_errors(
             self.errors, self.x[:count], self.chain, np.diag(self.prior_std[:count]), np.empty((count, 0))
         )
-        names = [p.name for p in self.parameters]
         return cameras.largest_tool_std(self.rig, names, self.covariance, priors)
 
     @cached_property

@@ -371,7 +371,7 @@ def _remedy(fit: Evidence) -> str:
 def _sufficient_iterations(fit: Evidence) -> int | None:
     """Return a limit of iterations, in hundreds, with which the last solution converges; None without one."""
     limit = 100 * math.ceil((fit.solution.iterations + MAX_CONTINUED) / 100)
-    options = {"warm_start": fit.solution} if fit.method == "lm" else {}
+    options: dict[str, Any] = {"warm_start": fit.solution} if fit.method == "lm" else {}
     with suppress(ConvergenceError):
         if minimize(fit.problem, fit.method, fit.solution.x, limit, **options).converged:
             return limit

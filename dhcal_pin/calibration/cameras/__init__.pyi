@@ -16,6 +16,7 @@ from .gate import judge_stages as judge_stages
 from .gate import judge_target_points as judge_target_points
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
 from .image_checks import describe_weak_positions as describe_weak_positions
+from .image_checks import largest_fixed_std as largest_fixed_std
 from .image_checks import largest_position_std as largest_position_std
 from .image_checks import largest_tool_std as largest_tool_std
 from .image_checks import second_rotation as second_rotation

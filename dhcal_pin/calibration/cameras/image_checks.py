@@ -27,7 +27,7 @@ from ...estimation.uncertainty import Uncertainty
 from ...formatting import Quantity
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
-from ...measurements.mounting import MountedRig
+from ...measurements.mounting import Mount, MountedRig
 from ...robot.chain import Chain
 from ..partition import different_configurations
 from ..reweighting import Fit
@@ -152,8 +152,9 @@ def largest_tool_std(
     the arm before the measurement: what these imitate is not contained. None without such an unknown.
     """
     gauge, blocks = tool_gauge_covariance(priors), []
-    for entry, link_pose, pose in _entries_on_tool(rig):
-        if f"{entry}.x" in names:
+    for entry, mount, pose in _entries(rig):
+        if mount.moves and f"{entry}.x" in names:
+            link_pose = mount.link_pose
             axes = link_pose[:3, :3]
             by_tool = np.concatenate([np.eye(3), -se3.skew(link_pose[:3, 3] + axes @ pose[:3, 3])], 1)
             imitated = axes.T @ by_tool @ gauge @ by_tool.T @ axes
@@ -161,15 +162,29 @@ def largest_tool_std(
     return _largest_std(blocks) if blocks else None
 
 
-def _entries_on_tool(rig: MountedRig) -> Iterator[tuple[str, Array, Array]]:
-    """Yield the prefix of the names, the pose of the link, and the pose in it, of what the tool carries."""
+def largest_fixed_std(rig: MountedRig, names: Sequence[str], covariance: Array) -> float | None:
+    """Return the largest standard deviation of the position of a camera or a board that stands still [m].
+
+    It is that in the measuring frame. `covariance` (p, p) is that of the unknowns `names`. None without such
+    an unknown.
+    """
+    blocks = [
+        _position_block(entry, names, covariance)
+        for entry, mount, _ in _entries(rig)
+        if not mount.moves and f"{entry}.x" in names
+    ]
+    return _largest_std(blocks) if blocks else None
+
+
+def _entries(rig: MountedRig) -> Iterator[tuple[str, Mount, Array]]:
+    """Yield the prefix of the names, the mount, and the pose of each camera and board whose pose is known."""
     for kind, entries, mounts in (
         ("camera", rig.cameras, rig.camera_mounts),
         ("board", rig.boards, rig.board_mounts),
     ):
         for entry, mount in zip(entries, mounts, strict=True):
-            if mount.moves and entry.pose is not None:
-                yield f"{kind}_{entry.name}", mount.link_pose, entry.pose
+            if entry.pose is not None:
+                yield f"{kind}_{entry.name}", mount, entry.pose
 
 
 def _position_block(entry: str, names: Sequence[str], covariance: Array) -> Array:
