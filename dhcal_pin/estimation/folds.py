@@ -178,9 +178,11 @@ def solve_fold(
     candidate[columns] += step
     cost += float(np.sum((fitted.weights * x)[~columns] ** 2))
     n_samples = sum(len(item.rows) for item in fitted.data)
-    if fitted.cost(candidate) <= cost + _NONLINEARITY_TOL * cost / max(1, n_samples):
+    candidate_cost = fitted.cost(candidate)
+    if candidate_cost <= cost + _NONLINEARITY_TOL * cost / max(1, n_samples):
         return candidate
-    return refit(fitted, candidate)
+    # A step in a curved valley can lead far away.
+    return refit(fitted, candidate if candidate_cost <= fitted.cost(x) else x)
 
 
 @dataclass(frozen=True, eq=False)
