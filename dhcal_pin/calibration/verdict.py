@@ -494,8 +494,6 @@ def _plausible_cause(fit: Evidence) -> str:
         )
     if fit.session and fit.session.lag:
         return f"{fit.session.lag.finding} {fit.session.lag.consequence}"
-    if fit.session and fit.session.scales:
-        return fit.session.scales[0].finding
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"
@@ -507,6 +505,8 @@ def _plausible_cause(fit: Evidence) -> str:
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
         if fit.rank < len(fit.x) and not fit.problem.weights.any():
             return "Nothing holds the parameters that the measurements do not determine: --priors default."
+    if fit.session and fit.session.scales:
+        return fit.session.scales[0].finding
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
     if fit.input_warnings:
