@@ -131,7 +131,11 @@ def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
         loose = minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True)
-        return next_iterate(problem, loose, MAX_REFIT_ITERATIONS)
+        end = next_iterate(problem, loose)
+        if problem.cost(end) <= problem.cost(loose.x):
+            return end
+        # An undamped step in a curved valley can lead far away.
+        return minimize(problem, "lm", loose.x, MAX_REFIT_ITERATIONS, warm_start=loose).x
     if not fit.converged:
         with suppress(DhcalError):  # method "gn" may diverge on few samples
             return minimize(problem, fit.method, nominal, min(fit.iterations, MAX_REFIT_ITERATIONS)).x

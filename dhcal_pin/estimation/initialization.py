@@ -255,7 +255,7 @@ def _fit_frames(
     problem = make_problem(frames, data, 1 / frames.priors, known)
     solution = minimize(problem, max_iterations=max_iterations, loose=True)
     cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
-    return cost, frames.at(next_iterate(problem, solution, max_iterations)[: len(frames.parameters)])
+    return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
 
 
 def initialize_frames(

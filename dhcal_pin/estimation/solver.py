@@ -121,13 +121,10 @@ def bounded_step(problem: Problem, system: TriangularSystem, x: Array) -> Array:
     return np.clip(scaled, low, high) / scale
 
 
-def next_iterate(problem: Problem, solution: SolverResult, max_iterations: int = 100) -> Array:
-    """Compute the point that an undamped step reaches from a loose solution; iterate if the cost rises."""
+def next_iterate(problem: Problem, solution: SolverResult) -> Array:
+    """Compute the point that one undamped step reaches from a loose solution."""
     system = solution.system.with_priors(problem.weights, solution.x)
-    end = solution.x + bounded_step(problem, system, solution.x)
-    if problem.cost(end) <= _cost(problem, solution.system, solution.x):
-        return end
-    return minimize(problem, "lm", solution.x, max_iterations, warm_start=solution).x
+    return solution.x + bounded_step(problem, system, solution.x)
 
 
 def _undamped_change(problem: Problem, data: TriangularSystem, x: Array) -> float:
@@ -332,7 +329,8 @@ def levenberg_marquardt(
         if not converged and (stalled or rules.undamped_steps_are_due(iteration, last_undamped)):
             last_undamped, damped_end = iteration, x
             x, cost = _undamped_steps(problem, x, cost)
-            is_curved, accepted_system = x is damped_end, None
+            is_curved = x is damped_end and iteration >= rules.MIN_CURVED_ITERATIONS
+            accepted_system = None
         # Unknown if x did not move, or only by undamped steps after a rejection.
         has_moved = x is not start and growth == rules.INITIAL_GROWTH
         last_change = change if has_moved else 0.0

@@ -75,6 +75,8 @@ EXTRAPOLATED_SHARES = 1.0, 0.5, 0.25
 UNDAMPED_INTERVAL = 8
 N_UNDAMPED_STEPS = 6
 
+# Iterations before which a series of undamped steps that fails means nothing: far from the minimum many do.
+MIN_CURVED_ITERATIONS = 32
 # Factor on the column scales of rotations after a series of undamped steps has failed.
 CURVED_ROTATION_FACTOR = 1000.0
 # Largest ratio of an undamped step to its standard deviation, in any direction, that means convergence in a
