@@ -21,9 +21,9 @@ In a narrow curved valley damped steps downhill become tiny, while undamped Gaus
 uphill and then arrive at the minimum. From time to time, and when only damped steps have become negligible,
 a series of undamped steps is tried, and kept if the cost falls.
 
-Where such a series fails, rotations make the valley curved, such as those of a tool and of a board on it that
-turns back: no row changes, but the board moves along a circle. Translations are linear. From then on D counts
-rotations more, so that steps in directions that several unknowns share are translations.
+Where such a series fails after many iterations, rotations make the valley curved, such as those of a tool and
+of a board on it that turns back: no row changes, but the board moves along a circle. Translations are linear.
+Then D counts rotations more, so that steps in directions that several unknowns share are translations.
 
 The iteration has converged if a step changes the rows by less than 1e-8 of their norm, or by less than
 rounding, at small damping. In a curved valley it has converged, too, if the undamped step no longer shrinks
@@ -244,7 +244,6 @@ def levenberg_marquardt(
     damping, scale, last_change = state.damping, state.scale, state.last_change
     iterates, iteration = (list(warm_start.iterates), warm_start.iterations) if warm_start else ([x], 0)
     growth, converged, last_undamped = rules.INITIAL_GROWTH, False, 0
-    is_rotation = np.array([parameter.unit == "rad" for parameter in problem.parameters], bool)
     # Whether a series of undamped steps has failed, and the change of the rows by one undamped step.
     is_curved, remaining = False, math.inf
     last_step = state.last_step
@@ -269,6 +268,7 @@ def levenberg_marquardt(
         scale = np.maximum(scale, np.sqrt(np.einsum("ij,ij->j", undamped.r, undamped.r)))
         damping_scale = np.where(scale > 0, scale, 1.0)
         if is_curved:
+            is_rotation = [parameter.unit == "rad" for parameter in problem.parameters]
             damping_scale[is_rotation] *= rules.CURVED_ROTATION_FACTOR
         # Whether steps have become negligible although the undamped step is not.
         stalled = False
