@@ -83,6 +83,15 @@ def join_names(names: Sequence[str]) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
+def format_count(count: int, noun: str) -> str:
+    """Return a count with a noun whose plural ends in s.
+
+    >>> format_count(1, "sample"), format_count(3, "sample")
+    ('1 sample', '3 samples')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def capitalized(text: str) -> str:
     """Return a text with its first letter in upper case."""
     return text[:1].upper() + text[1:]

@@ -476,8 +476,9 @@ function showResult({ result, status, screen, files: outputs }) {
   const { verdict } = result, rows = accuracies(result), parts = [];
   const isRefused = status === "refused";
   const key = verdict.status === "refused" && !isRefused ? "forced" : verdict.status;
+  const buttons = [...mendButtons(verdict.reasons), ...(isRefused ? [forceButton()] : [])];
   parts.push(element("div", { className: `card ${verdict.status}` }, element("p", { className: "verdict" }, VERDICTS[key]),
-    list(verdict.reasons.map(spoken)), remedies(verdict.reasons, isRefused)));
+    list(verdict.reasons.map(spoken)), buttons.length ? element("div", { className: "buttons" }, ...buttons) : null));
   if (!isRefused && rows.length) {
     const [quantity, judged, before, after] = rows[0];
     const value = (name, text) => element("div", {}, element("dt", {}, name), element("dd", {}, text));
@@ -508,24 +509,22 @@ const percent = share => share < 0.01 ? "under 1 %" : share > 0.99 ? "over 99 %"
 
 const outputName = outputs => outputs.find(({ name }) => /_calibrated\.(json|urdf)$/.test(name))?.name ?? "calibrated.urdf";
 
-// Buttons for the remedies that the reasons name; null without one.
-function remedies(reasons, isRefused) {
+// Buttons for the remedies that the reasons name.
+function mendButtons(reasons) {
   const keys = [...reasons.join(" ").matchAll(/--mend (\S+?)[.,;)]?(?=\s|$)/g)].map(match => match[1]).filter(key => !mends.includes(key));
-  if (!keys.length && !isRefused) return null;
-  const out = element("div", { className: "buttons" });
   // Several keys are alternatives.
-  for (const key of keys) {
+  return keys.map(key => {
     const text = keys.length > 1 ? `Apply ${key} and calibrate again` : "Apply the change and calibrate again";
     const apply = element("button", { type: "button", className: "primary" }, text);
     apply.onclick = () => { mends.push(key); showMends(); calibrate(); };
-    out.append(apply);
-  }
-  if (isRefused) {
-    const force = element("button", { type: "button" }, "Write the robot all the same");
-    force.onclick = () => calibrate(true);
-    out.append(force);
-  }
-  return out;
+    return apply;
+  });
+}
+
+function forceButton() {
+  const force = element("button", { type: "button" }, "Write the robot all the same");
+  force.onclick = () => calibrate(true);
+  return force;
 }
 
 function downloadItem({ name, label, use, content }) {

@@ -152,8 +152,7 @@ class Evidence(FittedModel):
             return None
         names = [p.name for p in self.parameters]
         if has_tool:
-            others = tuple(item for item in self.data if item.rig is None)
-            is_determined = measures_positions(others) and has_enough_rows(others)
+            is_determined = positions_beside_images(self.data)
             return cameras.largest_fixed_std(self.rig, names, self.covariance) if is_determined else None
         count = len(self.errors.parameters)
         priors = Uncertainty.from_errors(
@@ -300,6 +299,12 @@ class Evidence(FittedModel):
         n_counted, n_outliers = (int(np.sum(np.concatenate(masks) == counted)) for counted in (True, False))
         everything = Accuracy.from_errors(errors[1]) if n_outliers else Accuracy()
         return Comparison("hold-out", n_counted, before, after, n_outliers, everything, *alone)
+
+
+def positions_beside_images(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
+    """Return the measurements beside images if they measure positions and can determine frames, else none."""
+    others = tuple(item for item in data if item.rig is None)
+    return others if measures_positions(others) and has_enough_rows(others) else ()
 
 
 def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:

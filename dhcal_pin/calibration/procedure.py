@@ -52,7 +52,6 @@ from ..robot.chain import BASE_FRAME, Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import Session, can_have_session, find_scale
-from ..session.linear_model import measures_positions
 from ..session.timeline import order_samples
 from . import cameras, model_selection
 from .cameras import (
@@ -66,7 +65,7 @@ from .cameras import (
 )
 from .cross_validation import leave_regions_out
 from .evaluation import accuracy, fit_nominal
-from .evidence import diagnose
+from .evidence import diagnose, positions_beside_images
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import SessionFit, SessionModels, fit_session
@@ -467,8 +466,7 @@ def _calibrate_images(setup: _Setup, begun: SessionFit, groups: PriorGroups) -> 
     result = cameras.calibrate_images(
         fitting, begun.fit, setup.chain, begun.holdout, setup.exchanges, setup.families
     )
-    others = tuple(item for item in setup.data if item.rig is None)
-    if setup.finds_session and measures_positions(others) and has_enough_rows(others):
+    if setup.finds_session and (others := positions_beside_images(setup.data)):
         alone = _first_fit(setup, others, setup.errors)
         groups = _prior_groups(alone, setup.priors)
         alone = reweight(alone, stages, groups, options.max_iterations, setup.progress)

@@ -16,7 +16,7 @@ from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import fold_harmonics
 from ..estimation.qr import TriangularSystem
-from ..formatting import SMALL_UNITS, Quantity, Table
+from ..formatting import SMALL_UNITS, Quantity, Table, format_count
 from ..identifiability import label_unobservable
 from ..measurements.groups import ERROR_GROUPS
 from .cross_validation import Generalization
@@ -75,6 +75,11 @@ def parameter_notes(unobservable: Sequence[str], weakly_observable: Sequence[str
         *map(label_unobservable, unobservable),
         *(f"poorly identified: {text}" for text in weakly_observable),
     ]
+
+
+def describe_convergence(converged: bool, iterations: int) -> str:
+    """State whether a fit converged, and in how many iterations."""
+    return f"{'converged' if converged else 'not converged'} after {format_count(iterations, 'iteration')}"
 
 
 def position_notes(std: float | None) -> list[str]:
@@ -265,13 +270,13 @@ def describe_samples(comparison: Comparison) -> str:
     count = comparison.n_samples
     if comparison.title == "region hold-out":
         return "on regions that were left out"
-    return f"on {count} {comparison.title} {'sample' if count == 1 else 'samples'}"
+    return f"on {format_count(count, f'{comparison.title} sample')}"
 
 
 def describe_sample_count(n_used: int, n_samples: int) -> str:
     """Describe the number of samples that a fit used, such as "60 samples" or "57 of 60 samples"."""
     used = "" if n_used == n_samples else f"{n_used} of "
-    return f"{used}{n_samples} samples"
+    return f"{used}{format_count(n_samples, 'sample')}"
 
 
 def small_sample_note(comparison: Comparison) -> str:

@@ -23,7 +23,7 @@ from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
 from ..estimation.solver import minimize
 from ..exceptions import ConvergenceError
-from ..formatting import capitalized, format_below, format_quantity, join_names
+from ..formatting import capitalized, format_below, format_count, format_quantity, join_names
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
@@ -144,10 +144,13 @@ class Verdict:
         """Combine findings."""
         ordered = sorted(findings, key=lambda finding: -STATUSES.index(finding.status))
         status = ordered[0].status if ordered else "ok"
+        if status == "refused":
+            # Whether to keep the nominal robot is decided only by a calibration that may be used.
+            ordered = [finding for finding in ordered if not finding.keeps_nominal]
         return cls(
             status,
             tuple(finding.reason for finding in ordered),
-            status != "refused" and any(finding.keeps_nominal for finding in ordered),
+            any(finding.keeps_nominal for finding in ordered),
         )
 
 
@@ -352,7 +355,8 @@ def _convergence(fit: Evidence) -> list[Finding]:
     if fit.converged:
         return []
     remedy = _remedy(fit) or f"It did not in {MAX_CONTINUED} more, either."
-    return [Finding("refused", f"The fit did not converge in {fit.iterations} iterations. {remedy}")]
+    count = format_count(fit.iterations, "iteration")
+    return [Finding("refused", f"The fit did not converge in {count}. {remedy}")]
 
 
 def _remedy(fit: Evidence) -> str:

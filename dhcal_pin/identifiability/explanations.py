@@ -29,7 +29,7 @@ from ..estimation.error_model import ErrorParameter
 from ..estimation.parameters import fold_harmonics
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.qr import TriangularSystem
-from ..formatting import join_names
+from ..formatting import format_count, join_names
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import BASE_FRAME, Chain
@@ -385,7 +385,7 @@ class Explainer:
         if len(self.names) - self.layers["unmoved"].shape[1] == n_equations:
             n_missing = -(-r * samples // n_equations)
             return f"{n_equations} equations for {len(self.names)} parameters", (
-                f"measure at least {n_missing} more {'pose' if n_missing == 1 else 'poses'}"
+                f"measure at least {format_count(n_missing, 'more pose')}"
             )
         chain = self.plain_errors.chain
         decisive = [

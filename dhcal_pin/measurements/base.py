@@ -35,6 +35,7 @@ from .._kernels import apply_observation_matrix
 from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
+from ..formatting import format_count
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS, Conditions, concatenate_conditions, directions_in_order
 from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
@@ -159,8 +160,7 @@ class Measurement(ABC):
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
-        count = len(self.rows)
-        parts = [f"{count} sample{'' if count == 1 else 's'}", *self.description()]
+        parts = [format_count(len(self.rows), "sample"), *self.description()]
         return f"{type(self).__name__}({', '.join(parts)})"
 
     def description(self) -> list[str]:

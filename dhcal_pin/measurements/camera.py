@@ -35,6 +35,7 @@ from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.rig import WORLD, Camera, Rig
 from ..exceptions import InvalidArgumentError, NotObservableError, SampleError
+from ..formatting import format_count
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from . import images
@@ -329,10 +330,8 @@ class CameraCorners(Measurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        count = self.n_images
-        images = f"{count} image{'' if count == 1 else 's'}"
         return [
-            images,
+            format_count(self.n_images, "image"),
             format_sigma((self.sigma, 1.0, "px")) if self.has_stated_sigma else "sigma not stated",
         ]
 

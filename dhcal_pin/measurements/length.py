@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
+from ..formatting import format_count
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
@@ -120,8 +121,7 @@ class Wires(PointMeasurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        count = self.values.shape[1]
-        return [f"{count} wire{'s' if count > 1 else ''}", *super().description()]
+        return [format_count(self.values.shape[1], "wire"), *super().description()]
 
     def _instrument_values(self, u: Array) -> tuple[Array, Array]:
         """Return anchors (w, 3) and offsets (w,) with the unknown ones taken from u."""

@@ -13,7 +13,7 @@ from ..calibration import summary
 from ..calibration.result import Result
 from ..calibration.summary import STATISTIC_LABELS, Headline, statistic
 from ..exceptions import InvalidArgumentError
-from ..formatting import capitalized
+from ..formatting import capitalized, format_count
 from ..measurements.groups import ERROR_GROUPS
 from ..saving import write_files
 from .context import ReportContext
@@ -60,9 +60,9 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
     else:
         heading = "No hold-out measurements"
         note = (
-            f"The figures describe the {best.n_samples} fitted "
-            f"{'sample' if best.n_samples == 1 else 'samples'} and say little about other measurements. "
-            "Calibrate with --holdout 0.3, or validate with other measurements, to assess the robot."
+            f"The figures describe the {format_count(best.n_samples, 'fitted sample')} and say little about "
+            "other measurements. Calibrate with --holdout 0.3, or validate with other measurements, to "
+            "assess the robot."
         )
     values = [("before", "before, RMS", head.before), ("after", "after, RMS", head.after)]
     if best.before.groups[head.group].rms:
@@ -122,7 +122,7 @@ def _warnings(context: ReportContext) -> list[str]:
     if context.outliers:
         count, n_rejected = len(context.outliers), fit.n_samples - fit.n_inliers
         texts.append(
-            f"{count} {'outlier' if count == 1 else 'outliers'} among the samples, in none of the figures; "
+            f"{format_count(count, 'outlier')} among the samples, in none of the figures; "
             f"{n_rejected or 'none'} rejected. See the section on outliers."
         )
     return texts

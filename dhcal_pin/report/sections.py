@@ -466,14 +466,13 @@ def _choices(context: ReportContext) -> list[list[str]]:
         choices.append([name, f"{count} of 6 components estimated" if count else "as given"])
     if fixed := [e.name for e in fit.estimates if e.fixed]:
         choices.append(["fixed", ", ".join(fixed)])
-    state = "converged" if fit.converged else "not converged"
     priors = (
         "normal with nominal mean, standard deviations in the tables above; wide for frames and instruments"
     )
     return [
         *choices,
         ["method", {"lm": "Levenberg-Marquardt", "gn": "Gauss-Newton as in the paper"}[fit.method]],
-        ["state", f"{state} after {fit.iterations} iterations"],
+        ["state", summary.describe_convergence(fit.converged, fit.iterations)],
         ["priors", priors if np.any(fit.problem.weights) else "none"],
         *([name, text] for name, text in source.settings.items()),
     ]
@@ -501,9 +500,9 @@ def _definition_section(context: ReportContext) -> Section:
 
 def _state_section(context: ReportContext) -> Section:
     fit = context.fit
-    state = "converged" if fit.converged else "NOT converged"
+    state = summary.describe_convergence(fit.converged, fit.iterations)
     sentences = [
-        f"{state} after {fit.iterations} iterations; {fit.sample_count}; "
+        f"{state}; {fit.sample_count}; "
         f"rank {fit.rank} of {len(fit.parameters)}; condition {fit.condition:.3g}",
         *(text for text in fit.unobservable if text.startswith(EXPECTED)),
     ]

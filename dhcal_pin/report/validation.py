@@ -11,7 +11,7 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evaluation import Accuracy, compute_errors, error_norms
 from ..calibration.summary import STATISTIC_LABELS, statistic
-from ..formatting import Table
+from ..formatting import Table, format_count
 from ..iso9283.characteristics import PoseCharacteristics
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
@@ -63,7 +63,7 @@ def validation_page(validation: Validation) -> str:
     return html_page(
         Document(
             title=f"Validation of {validation.name}",
-            heading=f"{label.capitalize()} on {count} {'sample' if count == 1 else 'samples'}",
+            heading=f"{label.capitalize()} on {format_count(count, 'sample')}",
             sections=_sections(validation, shown),
             eyebrow=f"Validation of {validation.name}",
             values=values,

@@ -45,7 +45,7 @@ def reason(fit: Result) -> str:
 )
 def test_the_named_options_help(sim_6dof, kind, size, method, max_iterations, remedy):
     text = reason(fitted(sim_6dof, kind, size, method=method, max_iterations=max_iterations))
-    assert text.endswith(f"iterations. {remedy}")
+    assert text.endswith(f". {remedy}")
     limit = re.search(r"--max-iterations (\d+)", text)
     method = "lm" if "--method lm" in text else method
     iterations = int(limit[1]) if limit else max_iterations

@@ -14,7 +14,13 @@ from slow_cases import some_slow
 from dhcal_pin import calibrate, split
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.calibration.summary import headline
-from dhcal_pin.calibration.verdict import MIN_ROWS_PER_DIRECTION, MIN_STATED_ROWS_PER_DIRECTION, STATUSES
+from dhcal_pin.calibration.verdict import (
+    MIN_ROWS_PER_DIRECTION,
+    MIN_STATED_ROWS_PER_DIRECTION,
+    STATUSES,
+    Finding,
+    Verdict,
+)
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import LOSSES
@@ -374,3 +380,9 @@ def test_outliers_that_spoil_a_fit_are_a_caution(options, advice):
     assert simulation.true_error(advised.chain) < 0.5 * simulation.true_error(fit.chain)
     clean = calibrate(simulation.chain, simulation.measure(Position), session="off", **options)
     assert "Outliers spoil" not in " ".join(clean.verdict.reasons)
+
+
+def test_a_refused_calibration_says_nothing_about_the_use_of_the_nominal_robot():
+    keep, wrong = Finding("caution", "No correction is applied.", True), Finding("refused", "Wrong sign.")
+    assert Verdict.from_findings([keep]) == Verdict("caution", ("No correction is applied.",), True)
+    assert Verdict.from_findings([keep, wrong]) == Verdict("refused", ("Wrong sign.",))

@@ -9,7 +9,7 @@ from ... import formatting
 from ..._typing import Array
 from ...exceptions import InvalidArgumentError
 from .. import presentation
-from ..summary import generalization_lines, headline, largest_corrections
+from ..summary import describe_convergence, generalization_lines, headline, largest_corrections
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -217,7 +217,7 @@ class ResultPlots:
             headline(fit.comparisons).text,
             *generalization_lines(fit.generalization, fit.comparisons),
             f"{count} parameters from {fit.sample_count}; {fit.rank} combinations are identifiable; "
-            f"{'converged' if fit.converged else 'NOT converged'} after {fit.iterations} iterations.",
+            f"{describe_convergence(fit.converged, fit.iterations)}.",
         ]
         largest = largest_corrections(fit.estimates, fit.x, fit.solution.system)[:5]
         if largest:

@@ -12,7 +12,7 @@ from ...calibration.cameras import split_sets
 from ...calibration.evaluation import Comparison
 from ...calibration.result import Result
 from ...calibration.verdict import Verdict
-from ...formatting import Quantity, Table
+from ...formatting import Quantity, Table, format_count
 from ...identifiability import EXPECTED
 from ...measurements.base import Measurement
 from ...measurements.groups import ERROR_GROUPS
@@ -127,7 +127,7 @@ def _describe_data(items: Sequence[Measurement]) -> list[str]:
         return []
     texts = items[0].description()
     if n_images := _count_images(items):
-        texts = [f"{n_images} image{'s' if n_images > 1 else ''}", texts[-1]]
+        texts = [format_count(n_images, "image"), texts[-1]]
     return [items[0].kind, *texts]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ...calibration.evaluation import Accuracy
 from ...calibration.summary import STATISTIC_LABELS, statistic
 from ...diagnostics.inspection import FileInspection, column_table
-from ...formatting import Quantity, Table
+from ...formatting import Quantity, Table, format_count
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
@@ -179,7 +179,7 @@ def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
         if inspection.problem:
             problems.append(f"{name}: problem: {inspection.problem}")
         elif count:
-            doubtful.append(f"{title}; {count} warning{'s' if count > 1 else ''}, see --verbose")
+            doubtful.append(f"{title}; {format_count(count, 'warning')}, see --verbose")
         else:
             others.append(title)
     return [

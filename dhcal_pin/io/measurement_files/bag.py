@@ -20,6 +20,7 @@ import numpy as np
 from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, InvalidArgumentError
+from ...formatting import format_count
 from ...measurements.base import Measurement
 from ...measurements.pose import Pose
 from ...measurements.position import Position
@@ -127,12 +128,12 @@ def convert_bag(
         raise FileFormatError(f"{source}: {joint_topic}, {pose_topic}: {error}") from None
     frame = poses.frame or "unknown"
     notes = [
-        f"{_count_stops(len(stops.q))} of {joint_topic} and {pose_topic} (frame {frame})",
+        f"{format_count(len(stops.q), 'stop')} of {joint_topic} and {pose_topic} (frame {frame})",
         *notes,
         f"the clock of {pose_topic} is {stops.clock_offset:+.2f} s off that of {joint_topic}",
     ]
     if stops.n_without_poses:
-        notes.append(f"left out {_count_stops(stops.n_without_poses)} without a pose")
+        notes.append(f"left out {format_count(stops.n_without_poses, 'stop')} without a pose")
     return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
 
 
@@ -141,10 +142,6 @@ def read_bag_joints(path: PathLike, joint_topic: str | None) -> RecordedJoints:
     source = os.fspath(path)
     with _open_bag(source) as reader:
         return _read_joints(reader, source, _choose_joint_topic(reader, source, joint_topic), None)
-
-
-def _count_stops(count: int) -> str:
-    return f"{count} stop{'' if count == 1 else 's'}"
 
 
 def _stops_text(stops: Stops, names: tuple[str, ...], chain: Chain | None, comments: list[str]) -> str:

@@ -16,6 +16,7 @@ from xml.parsers import expat
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError
+from ...formatting import format_count
 from ...messages import quote
 from ...ros_packages import resolve_robot_path
 
@@ -153,9 +154,8 @@ def parse_numbers(tag: XmlTag, key: str, count: int) -> list[float]:
     # separate.
     words = [word for word in tag.attributes[key].split(" ") if word]
     if len(words) != count:
-        noun = "number" if len(words) == 1 else "numbers"
         separated = ", separated by spaces" if count > 1 else ""
-        raise tag.error(f"{key} has {len(words)} {noun}; expected {count}{separated}")
+        raise tag.error(f"{key} has {format_count(len(words), 'number')}; expected {count}{separated}")
     for word in words:
         if not _NUMBER.fullmatch(word) or not math.isfinite(float(word)):
             raise tag.error(f"{key} has {quote(word)}; expected a finite number such as 0.25 or -1e-3")
