@@ -182,6 +182,8 @@ def _read(
         if root is not None:
             raise InvalidArgumentError(f"{os.fspath(path)}: a DH table has one root; leave out --root")
         chain = Chain.from_dh(table, robot_name(path))
+        # Messages name the file of the table.
+        chain = replace(chain, urdf=replace(chain.urdf, source=os.fspath(path)))
     else:
         chain = Chain.from_urdf(replace(_read_urdf(path), package_dirs=folders), tip, root)
     sidecar = sidecar or existing_sidecar(path)

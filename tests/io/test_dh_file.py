@@ -12,7 +12,7 @@ from robots import SCARA, write
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import dh_text, read_dh
+from dhcal_pin.io import dh_text, read_dh, read_measurements, read_robot
 from dhcal_pin.robot import DHTable
 
 TABLE = ("theta", "d", "a", "alpha", "beta", "lower", "upper")
@@ -35,6 +35,13 @@ def test_entries_are_converted_from_the_units_of_the_file(tmp_path, name, text):
     assert table.alpha.tolist() == [0, np.pi]
     np.testing.assert_allclose(table.lower, [-130 * np.pi / 180, -0.21], rtol=2e-16)
     assert table.upper.tolist() == [np.inf, 0.0]
+
+
+def test_messages_on_the_robot_of_a_table_name_its_file(tmp_path):
+    path = write(tmp_path, "arm.dh.toml", SCARA.replace('"lift"', '"z"'))
+    assert read_robot(path).urdf.source == str(path)
+    with pytest.raises(DhcalError, match=r"arm\.dh\.toml: joint 'z' has the name of a measurement column"):
+        read_measurements(write(tmp_path, "m.csv", "shoulder,z,x,y,z\n"), read_robot(path))
 
 
 @pytest.mark.parametrize(
