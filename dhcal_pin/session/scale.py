@@ -6,12 +6,13 @@ of the arm are therefore
 
     x = k·s + M·e + n,
 
-with the relative error k of the scale, the corrections s that a unit of it causes, errors e of base, tool and
-all joint origins, which the fit carries into its own parameters by M, and the noise n of the fit. The errors
+with the error k of the scale as a fraction of the measured lengths, the corrections s that a unit of it
+causes, errors e of base, tool and all joint origins, which the fit carries into its own parameters by M, and
+the noise n of the fit. The errors
 of the lengths and of the angles are normal with their prior standard deviations times two unknown factors,
 whose logarithms have a uniform prior. The posterior distribution of k is a mixture of normal distributions
-over both factors. With one factor it is Student's t distribution. The factor 1 + k is reported if the
-probability of the other sign of k is negligible.
+over both factors. With one factor it is Student's t distribution. The factor 1/(1 - k) of the true lengths
+is reported if the probability of the other sign of k is negligible.
 
 Reference: A. Gelman et al., Bayesian Data Analysis, 3rd edition 2013, section 14.2.
 """
@@ -79,7 +80,8 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     best = np.unravel_index(np.argmax(weights), weights.shape)
     n_lengths = float(np.trace(np.linalg.solve(covariances[best], lengths[best[0]])))
     if (
-        not MIN_CHANGE <= abs(change) <= MAX_SCALE_CHANGE
+        not MIN_CHANGE <= abs(change) < 1
+        or abs((factor := 1 / (1 - change)) - 1) > MAX_SCALE_CHANGE
         or n_lengths < MIN_LENGTHS
         or max(weights[-1].sum(), weights[:, -1].sum()) > EDGE
     ):
@@ -90,7 +92,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     if chance > MAX_CHANCE:
         return None
     variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))
-    return Scale(1 + change, float(np.sqrt(variance)), "")
+    return Scale(factor, factor**2 * float(np.sqrt(variance)), "")
 
 
 def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Array, Array]:

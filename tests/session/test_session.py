@@ -534,6 +534,14 @@ def test_a_wrong_scale_is_found_and_mended(scales, seed):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
+@pytest.mark.parametrize("factor", [0.85, 0.95, 1.15])
+def test_a_large_scale_of_all_lengths_is_exact(factor):
+    simulation = Simulation("panda", 60, 5)
+    data = simulation.measure(Position, Changes(scales=(factor, factor, factor)))
+    (scale,) = session_of(calibrate(simulation.chain, data, extend="none")).scales
+    assert scale.factor == pytest.approx(factor, abs=3 * scale.std)
+
+
 def test_a_large_scale_is_the_cause_of_the_errors_that_it_leaves():
     simulation = Simulation("ur10", 100, 6)
     data = simulation.measure(Position, Changes(scales=(1.0, 1.0, 1.1)))
@@ -560,7 +568,9 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(fact
         np.testing.assert_allclose(noise, root @ root.T, atol=1e-4 * np.abs(noise).max())
     scale = find_scale(problem, x)
     assert scale is not None
-    grid = scale.factor - 1 + scale.std * np.linspace(-8, 8, 81)
+    # Errors of the scale as fractions of the measured lengths.
+    found, std = 1 - 1 / scale.factor, scale.std / scale.factor**2
+    grid = found + std * np.linspace(-8, 8, 81)
     logs = np.array([
         multivariate_normal(cov=a**2 * both[0] + b**2 * both[1] + noise, allow_singular=True).logpdf(
             x[arm] - np.outer(grid, change)
@@ -569,8 +579,8 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(fact
     ])  # fmt: skip
     density = np.exp(logs - logs.max()).sum(0)
     mean = np.average(grid, weights=density)
-    assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
-    assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
+    assert found == pytest.approx(mean, rel=1e-3)
+    assert std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
 
 
