@@ -648,7 +648,7 @@ class _Search:
         geometric = [c for c in self.layout.model if c < len(names)]
         # The prior is that of one robot, see `solve`.
         sizes = np.array([names[c].prior for c in geometric])
-        block = Block("robot", "", 0, np.array(geometric), sizes)
+        block = Block("robot", "", np.array(geometric), sizes)
         count = float(np.sum(self.groups >= 0))
         needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
