@@ -29,6 +29,7 @@ from dhcal_pin.calibration.cameras.axis_order import (
 from dhcal_pin.calibration.cameras.gate import Gate, _far_points, apply_gate, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.calibration.cameras.stages import ImageError
+from dhcal_pin.calibration.cameras.target_points import judged_boards
 from dhcal_pin.cameras import Board, Camera
 from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.exceptions import DhcalError
@@ -413,6 +414,12 @@ def test_corners_of_a_right_board_are_held(seed):
     stage = target_points_of(dh.calibrate(setup.nominal, setup.images, loss="linear"))
     assert not stage.is_kept
     assert "The corners are kept as stated" in stage.reason
+
+
+@pytest.mark.parametrize(("count", "names"), [(150, ["points"]), (151, [])])
+def test_the_corners_of_boards_with_up_to_150_corners_are_tried(count, names):
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 3))
+    assert judged_boards([Board("points", "tip", "points", listed_points=points)]) == names
 
 
 @pytest.mark.slow

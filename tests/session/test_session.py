@@ -17,7 +17,8 @@ from slow_cases import some_slow
 from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.initialization import make_problem
-from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, select_parameters
+from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.io import read_measurements
 from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
@@ -626,6 +627,27 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(fact
     assert scale.factor - 1 == pytest.approx(mean, rel=1e-3)
     assert scale.std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
+
+
+def test_errors_of_origins_change_the_estimates_as_in_calibrations():
+    """Each origin of an exact arm has an error in turn."""
+    simulation = Simulation("ur10", 40, 6)
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors, origins = (select_parameters(chain, f"{name},base,tool") for name in ("minimal", "placement"))
+    weights, arm = 1 / errors.priors, np.flatnonzero(errors.is_of_arm)
+
+    def problem_of(truth):
+        positions = truth.poses(simulation.q)[:, :3, 3]
+        return make_problem(errors, (Position(simulation.q, positions, 1e-4),), weights, {})
+
+    expected = {unit: np.zeros((len(arm), len(arm))) for unit in ("m", "rad")}
+    for i, parameter in enumerate(origins.parameters):
+        size = {"m": LENGTH_PRIOR, "rad": ANGLE_PRIOR}[parameter.unit]
+        x = minimize(problem_of(origins.at(size * np.eye(len(origins.parameters))[i]))).x[arm]
+        expected[parameter.unit] += np.outer(x, x)
+    _, _, *found = _responses(problem_of(chain), np.zeros(len(weights)), arm)
+    for each, unit in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, expected[unit], atol=0.05 * np.abs(expected[unit]).max())
 
 
 def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():
