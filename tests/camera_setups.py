@@ -8,8 +8,11 @@ import numpy as np
 from robots import paper
 
 from dhcal_pin import Chain, read_robot, select_parameters
+from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.estimation.error_model import ErrorModel
+from dhcal_pin.estimation.initialization import make_problem
+from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise
 from dhcal_pin.measurements.mounting import MountedRig, mount_rig
 from dhcal_pin.robot.inverse_kinematics import pose_task, solve_ik
@@ -186,6 +189,31 @@ def simulate(
     noisy = pixels + sigma * rng.standard_normal(pixels.shape)
     images = CameraCorners(q, noisy, corner, rig, *names)
     return Setup(chain, truth, images, CameraCorners(q, pixels, corner, true_rig, *names), sigma)
+
+
+def placement_fit(arm_error: float, n_images: int, seed: int, *, size: float = 1.0) -> Fit:
+    """Fit the geometry of a UR10 and the poses of camera and board to images with a known lens.
+
+    Args:
+        arm_error: Size of the errors of the links [m].
+        n_images: Number of configurations.
+        seed: Seed.
+        size: Stated size of the board relative to the true one.
+
+    Returns:
+        The fit with the default priors.
+    """
+    rng, chain = np.random.default_rng(seed), ARMS["ur10"]()
+    truth = wrong_arm(chain, arm_error, rng)
+    setup = simulate(chain, truth, rng, is_on_wrist=True, n_images=n_images, sigma=0.2, intrinsics_error=0.0)
+    rig = setup.exact.rig
+    board = replace(rig.boards[0], type="points", listed_points=size * rig.boards[0].points)
+    rig = replace(rig, boards=(board,))
+    images = CameraCorners(setup.images.q, setup.images.values, setup.images.corner, rig).initialized(chain)
+    lens = {p.name: p.nominal for p in images.instrument_parameters if images.set_of(p.name) == "intrinsics"}
+    errors = select_parameters(chain, "placement")
+    problem = make_problem(errors, (images,), 1 / errors.priors, lens)
+    return Fit((images,), problem, minimize(problem, "lm", None, 40), (np.ones(len(images.rows)),))
 
 
 def polyhedron_setup(seed: int, *, point_error: float, n_images: int = 40, sigma: float = 0.5) -> Setup:

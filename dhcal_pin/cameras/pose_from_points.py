@@ -237,7 +237,7 @@ def _orthographic_pose(points: Array, image: Array) -> Array:
     turned = sights @ turn.T
     plane = turned[:, :2] / turned[:, 2:]
     centre, middle = points.mean(0), plane.mean(0)
-    affine = np.linalg.lstsq(points - centre, plane - middle, rcond=None)[0].T
+    affine = np.linalg.lstsq(points - centre, plane, rcond=None)[0].T
     left, scale, right = np.linalg.svd(affine, full_matrices=False)
     rows = left @ right
     depth = 1 / max(float(scale.mean()), 1e-300)

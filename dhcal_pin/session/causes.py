@@ -40,18 +40,18 @@ class Block:
     Attributes:
         kind: What changes.
         of: Name of the joint, of the axis of a scale, or of what moved if not base or tool; else empty.
-        index: Number of the joint; 0 for other blocks.
         columns: Indices of the columns, (c,).
         sizes: Change of each column that moves the tool by about 1 m, (c,).
+        index: Number of the joint or of the axis of a scale; 0 for other blocks.
         is_constant: Whether it is the same for all samples.
         origin: Point whose motion is stated, in the frame of base or tool, (3,) [m].
     """
 
     kind: Kind
     of: str
-    index: int
     columns: Array
     sizes: Array
+    index: int = 0
     is_constant: bool = False
     origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
 

@@ -308,7 +308,7 @@ class _CheckModel:
         seen = [replace(b, sizes=np.where(effects[b.columns] > MIN_EFFECT, b.sizes, 0.0)) for b in found]
         seen = [b for b in seen if b.sizes.any()]
         columns, sizes = (np.concatenate([getattr(b, key) for b in seen]) for key in ("columns", "sizes"))
-        return [*seen, Block("robot", "", 0, columns, sizes)]
+        return [*seen, Block("robot", "", columns, sizes)]
 
     @property
     def hidden_joints(self) -> list[str]:
@@ -483,7 +483,7 @@ def _log_sums(values: Array) -> Array:
 
 def _log_means(values: Array) -> Array:
     """Return the logarithms of the means of exponentials over the first two axes, (d,)."""
-    flat = values.reshape(-1, values.shape[-1])
+    flat = np.concatenate(values)
     return _log_sums(flat) - np.log(len(flat))
 
 

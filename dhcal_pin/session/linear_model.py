@@ -96,22 +96,22 @@ class Layout:
         of_base, of_tool = (
             np.array([names.index(q.name) for q in parameters]) for parameters in (base(chain), tool(chain))
         )
-        blocks = [Block("base", "", 0, of_base, of_frame), Block("tool", "", 0, of_tool, of_frame)]
+        blocks = [Block("base", "", of_base, of_frame), Block("tool", "", of_tool, of_frame)]
         # Joint values that only reproduce poses of the tip have no zeros, and their links do not grow.
         has_joints = all(item.has_joint_values for item in problem.data)
         for j, name in enumerate(chain.joint_names if has_joints else ()):
             unit = 1.0 if chain.is_prismatic[j] else 1 / size
-            blocks.append(Block("joint", name, j, joints[j : j + 1], np.array([unit])))
+            blocks.append(Block("joint", name, joints[j : j + 1], np.array([unit]), j))
         # All links by one factor, or each by its own.
         if has_joints and grows.any():
-            blocks.append(Block("links", "", 0, np.array([all_links]), np.array([1 / size])))
-            blocks.append(Block("links", "", 0, links[grows], np.full(grows.sum(), 1 / size)))
+            blocks.append(Block("links", "", np.array([all_links]), np.array([1 / size])))
+            blocks.append(Block("links", "", links[grows], np.full(grows.sum(), 1 / size)))
         blocks += [
-            Block("scale", axis, i, scales[i : i + 1], np.array([1 / size]), is_constant=True)
+            Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_constant=True)
             for i, axis in enumerate(SCALE_AXES)
             if axis and measures_positions(problem.data)  # the size of the robot imitates a scale of all axes
         ]
-        blocks.append(Block("lag", "", 0, np.array([lag]), np.array([1.0]), is_constant=True))
+        blocks.append(Block("lag", "", np.array([lag]), np.array([1.0]), is_constant=True))
         return cls(
             replace(problem, errors=extended),
             model,
@@ -132,9 +132,8 @@ class Layout:
         """
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
-        flat = rows.reshape(-1, rows.shape[-1])
         changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))
-        products = flat.T @ flat
+        products = np.tensordot(rows, rows, ((0, 1), (0, 1)))
         of_model = products[np.ix_(self.model, changing)]
         explained = inverse(products[np.ix_(self.model, self.model)]) @ of_model
         squares = np.diag(products)[changing]

@@ -127,7 +127,6 @@ class _Search:
         self, problem: Problem, x: Array, timeline: Timeline, is_ordered: bool, n_samples: int, n_cells: int
     ):
         """Prepare the samples in the order of measurement, linearize the model at x and fit it."""
-        self.n_cells = n_cells
         self.layout = Layout.of(problem)
         self.is_ordered = is_ordered
         self.timeline, self.chain = timeline, problem.errors.chain
@@ -135,7 +134,8 @@ class _Search:
         self.order = np.argsort(self.part.fitted_numbers, kind="stable")
         self.numbers = self.part.fitted_numbers[self.order]
         self.times = self.part.fitted_times[self.order]
-        self.edges = self._cell_edges(())
+        # First sample of each cell, and N.
+        self.edges = np.linspace(0, len(self.order), min(len(self.order), n_cells) + 1).astype(int)
         self.x = x
         self.changes = RobotChanges()
         self.causes: list[Cause] = []
@@ -162,14 +162,6 @@ class _Search:
                 label[:, : item.residual_dim][:, group.rows] = units.index(key)
             labels.append(label)
         return np.concatenate(labels)[self.order]
-
-    def _cell_edges(self, near: Sequence[int]) -> Array:
-        """Return the first sample of each cell, and N; cells near some samples have one sample each."""
-        n = len(self.numbers)
-        edges = np.linspace(0, n, min(n, self.n_cells) + 1).astype(int)
-        width = int(np.diff(edges).max())
-        single = [np.arange(max(0, s - 2 * width), min(n, s + 2 * width)) for s in near]
-        return np.unique(np.concatenate([edges, *single]))
 
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:
@@ -409,14 +401,14 @@ class _Search:
             found = self.best_cause(fit)
             if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
                 break
-            before = self.x, self.changes, [*self.causes], self.edges
+            before = self.x, self.changes, [*self.causes]
             self._add(found)
             settled = self._settle()
             judged = self._judge(self.rows, settled, len(self.causes) - 1)
             if judged.log_evidence >= MIN_LOG_EVIDENCE:
                 fit = settled
                 continue
-            self.x, self.changes, self.causes, self.edges = before
+            self.x, self.changes, self.causes = before
             self.rejected.add((found.block, type(found.shape)))
             if len(self.rejected) > MAX_REJECTED:
                 break
@@ -431,12 +423,6 @@ class _Search:
     def _add(self, cause: Cause) -> None:
         """Add a cause, with coefficients of zero."""
         self.causes.append(replace(cause, values=np.zeros_like(cause.values)))
-        steps = [
-            int(np.searchsorted(self.numbers, c.shape.number))
-            for c in self.causes
-            if isinstance(c.shape, Step)
-        ]
-        self.edges = self._cell_edges(steps)
 
     def _settle(self) -> LinearFit:
         """Fit, and move the steps to the samples where they fit best."""
@@ -662,7 +648,7 @@ class _Search:
         geometric = [c for c in self.layout.model if c < len(names)]
         # The prior is that of one robot, see `solve`.
         sizes = np.array([names[c].prior for c in geometric])
-        block = Block("robot", "", 0, np.array(geometric), sizes)
+        block = Block("robot", "", np.array(geometric), sizes)
         count = float(np.sum(self.groups >= 0))
         needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
@@ -676,8 +662,8 @@ class _Search:
             return None
         difference, std = best[2].step[-len(sizes) :], np.sqrt(np.diag(best[2].covariance)[-len(sizes) :])
         # The most significant difference of the arm itself.
-        is_arm = np.array([names[c].prior < MAX_ARM_PRIOR for c in geometric])
-        worst = int(np.argmax(np.where(is_arm, np.abs(difference) / std, 0.0)))
+        is_arm = [names[c].prior < MAX_ARM_PRIOR for c in geometric]
+        worst = max(range(len(is_arm)), key=lambda i: (is_arm[i], abs(difference[i]) / std[i]))
         before, after = (self.timeline.place(best[1] + i) for i in (-1, 0))
         name, unit = names[geometric[worst]].name, names[geometric[worst]].unit
         size = abs(float(difference[worst]))
@@ -717,7 +703,7 @@ def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
 def _bounded_cost(residual: Array) -> Array:
     """Return the cost of each sample, (N,), which grows linearly beyond the limit of influence."""
     size = np.sqrt(np.mean(residual**2, 1))
-    return np.where(size < HUBER_LIMIT, size**2, HUBER_LIMIT * (2 * size - HUBER_LIMIT)) * residual.shape[1]
+    return (size**2 - np.maximum(size - HUBER_LIMIT, 0.0) ** 2) * residual.shape[1]
 
 
 def can_have_session(data: Sequence[Measurement]) -> bool:

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, simulate, wrong_arm
+from camera_setups import ARMS, placement_fit, simulate, wrong_arm
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras.board_size import BoardSize, _rms_correction, _scaled
+from dhcal_pin.calibration.cameras.board_size import BoardSize, _rms_correction, _scaled, find_board_size
+from dhcal_pin.estimation.problem import whitened_residuals
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -82,6 +83,27 @@ def test_a_size_that_is_slightly_wrong_needs_caution(size, status):
 @pytest.mark.parametrize(("log_ratio", "is_decisive"), [(6.0, False), (20.0, True)])
 def test_strong_evidence_of_another_size_is_decisive(log_ratio, is_decisive):
     assert BoardSize(1.1, 0.03, 2.0, 0.3, log_ratio).is_decisive == is_decisive
+
+
+def test_the_evidence_of_a_size_counts_the_lengths_that_images_determine_beside_default_priors():
+    """The priors of the calibration are far wider. The rows are those of finite differences."""
+    fit = placement_fit(5e-4, 20, 3, size=1.02)
+    problem, x, n = fit.problem, fit.solution.x, len(fit.problem.errors.parameters)
+    wide = problem.with_prior_weights(np.append(problem.weights[:n] / 100, problem.weights[n:]))
+    found = find_board_size(replace(fit, problem=wide))
+    assert found is not None
+    assert found.size == pytest.approx(1 / 1.02, abs=2e-3)
+    steps = 1e-6 * np.eye(len(x))
+    residuals = [
+        np.concatenate([np.ravel(each) for each in whitened_residuals(problem, x + sign * step)])
+        for step in steps
+        for sign in (1, -1)
+    ]
+    rows = (np.array(residuals[::2]) - residuals[1::2]) / 2e-6
+    covariance = np.linalg.inv(rows @ rows.T + np.diag(problem.weights**2))
+    lengths = [i for i, parameter in enumerate(problem.errors.parameters) if parameter.unit == "m"]
+    count = np.sum(1 - np.diag(covariance)[lengths] * problem.weights[lengths] ** 2)
+    assert found.log_ratio == pytest.approx(count * np.log(found.stated / found.found), rel=1e-3)
 
 
 def test_an_arm_without_unknown_lengths_has_no_correction_of_lengths():

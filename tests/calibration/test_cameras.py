@@ -10,13 +10,14 @@ from typing import Any
 import camera_setups
 import numpy as np
 import pytest
-from camera_setups import ARMS, random_setup, simulate, wrong_arm
+from camera_setups import ARMS, placement_fit, random_setup, simulate, wrong_arm
 from hand_eye_setups import faulty_setup
 from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import axis_order, seen_ranges_warning
+from dhcal_pin.calibration.cameras.arm_types import INDUSTRIAL
 from dhcal_pin.calibration.cameras.axis_order import (
     ORDERS,
     Exchange,
@@ -25,10 +26,12 @@ from dhcal_pin.calibration.cameras.axis_order import (
     exchange_axes,
     reorder,
 )
-from dhcal_pin.calibration.cameras.gate import _far_points, cluster_folds
+from dhcal_pin.calibration.cameras.gate import Gate, _far_points, apply_gate, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.calibration.cameras.stages import ImageError
+from dhcal_pin.calibration.cameras.target_points import judged_boards
 from dhcal_pin.cameras import Board, Camera
+from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
@@ -77,6 +80,21 @@ def test_few_images_of_a_wrong_arm_are_a_cause_for_caution(arm, count):
     assert fit.verdict.status == "caution"
     assert any(f"{count} different configurations are too few" in text for text in fit.verdict.reasons)
     assert not any("noise of the corners explains them" in text for text in fit.input_warnings)
+
+
+def test_six_images_that_the_arm_explains_are_judged_at_a_temperature_of_2_2():
+    """The temperature is 1 + N/5, whatever the number of corners of an image."""
+    gated = apply_gate(placement_fit(0.0, 6, 0), PriorGroups.none(), 40, INDUSTRIAL)
+    assert gated.gate.is_complete
+    assert not gated.gate.is_open
+    assert gated.with_arm.problem.temperature == pytest.approx(1 + 6 / 5)
+
+
+@pytest.mark.parametrize(("ratio", "is_open"), [(0.499, True), (0.5, False)])
+def test_half_of_the_error_is_not_below_half_of_it(ratio, is_open):
+    gate = Gate(ratio, 1.0, 20, False, True)
+    assert gate.is_open == is_open
+    assert ("50 %, not below 50 %" in gate.sentence) == (not is_open)
 
 
 def test_an_arm_with_errors_of_another_kind_is_kept(arm):
@@ -396,6 +414,12 @@ def test_corners_of_a_right_board_are_held(seed):
     stage = target_points_of(dh.calibrate(setup.nominal, setup.images, loss="linear"))
     assert not stage.is_kept
     assert "The corners are kept as stated" in stage.reason
+
+
+@pytest.mark.parametrize(("count", "names"), [(150, ["points"]), (151, [])])
+def test_the_corners_of_boards_with_up_to_150_corners_are_tried(count, names):
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (count, 3))
+    assert judged_boards([Board("points", "tip", "points", listed_points=points)]) == names
 
 
 @pytest.mark.slow

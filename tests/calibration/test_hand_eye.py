@@ -31,6 +31,8 @@ from dhcal_pin.calibration.cameras.diagnosis import (
     Trial,
     _arm_text,
     _lens_text,
+    _n_examined,
+    _px,
     _without_rigid_motion,
 )
 from dhcal_pin.calibration.cameras.stages import ImageError, held_out_error
@@ -333,6 +335,8 @@ def test_a_shift_of_flange_poses_is_named():
     assert fit.hand_eye is not None
     assert "belongs to the flange poses one row" in fit.hand_eye.likely
     assert "Correct the table of flange poses." in fit.hand_eye.likely
+    # No other cause is tried.
+    assert [trial.cause for trial in fit.hand_eye.trials] == ["pairing"]
     with pytest.raises(dh.DhcalError, match="'minimal': need joint values"):
         dh.calibrate(chain, images.replace(has_joint_values=False), "minimal,camera,board")
 
@@ -420,6 +424,20 @@ def test_a_rigid_motion_does_not_bend_a_board():
 )
 def test_a_minimum_of_a_function_is_found(cost, least):
     assert find_minimum(cost, 0.0, 0.01, 0.15) == pytest.approx(least, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("count", "per_image", "n_examined"), [(90, 100, 90), (400, 5, 300), (400, 20, 150), (400, 100, 100)]
+)
+def test_causes_are_looked_for_in_3000_corners_of_at_least_100_configurations(count, per_image, n_examined):
+    assert _n_examined(count, count * per_image) == n_examined
+
+
+@pytest.mark.parametrize(
+    ("pixels", "text"), [(4990.0, "4990 px"), (5000.0, "5000 px"), (5010.0, "more than 5000 px")]
+)
+def test_errors_above_5000_pixels_are_not_stated(pixels, text):
+    assert _px(pixels) == text
 
 
 @pytest.mark.parametrize(("pixels", "has_noise"), [(4.0, True), (254.0, False)])

@@ -7,9 +7,15 @@ import pytest
 from scipy.spatial.distance import pdist
 
 from dhcal_pin import se3
-from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, solve_hand_eye
+from dhcal_pin.cameras import LENSES, Board, Camera, estimate_pose, intrinsics, solve_hand_eye
 from dhcal_pin.cameras.hand_eye import choose_poses, mean_pose
-from dhcal_pin.cameras.intrinsics import _in_plane, _is_plausible, _without_centre, intrinsics_candidates
+from dhcal_pin.cameras.intrinsics import (
+    _in_plane,
+    _is_plausible,
+    _search,
+    _without_centre,
+    intrinsics_candidates,
+)
 from dhcal_pin.cameras.pose_from_points import (
     _orthographic_pose,
     agreeing_points,
@@ -234,6 +240,27 @@ def test_wrong_points_near_a_plane_do_not_agree(depth):
         np.testing.assert_array_equal(agreeing_points(points, image + np.array([3.0, 2.0])), agrees)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_half_of_the_points_beside_those_of_a_map_are_enough(seed):
+    """Seven of ten points are right: four determine a map, and half of the other six agree with it."""
+    rng = np.random.default_rng(seed)
+    points, pose = np.pad(rng.uniform(-0.1, 0.1, (10, 2)), ((0, 0), (0, 1))), random_pose(rng)
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    image = local[:, :2] / local[:, 2:]
+    image[:3] += rng.uniform(0.05, 0.2, (3, 2))
+    np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), range(3))
+
+
+def test_a_point_beside_the_plane_of_all_others_may_have_a_wrong_image():
+    """A map of points in space explains any image of it."""
+    points, pose = CHECKERBOARD.copy(), random_pose(np.random.default_rng(0))
+    points[7, 2] = 1e-3
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    image = local[:, :2] / local[:, 2:]
+    image[7] += [0.05, -0.03]
+    np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), [7])
+
+
 def views(rng, count, points=CHECKERBOARD, centre=(650.0, 350.0)):
     values = np.array([640.0, 660.0, *centre, 0, 0, 0, 0, 0])
     out = []
@@ -310,6 +337,29 @@ def test_a_flat_board_keeps_its_distances_in_its_plane():
     plane = _in_plane(points)
     assert plane is not None
     np.testing.assert_allclose(pdist(plane), pdist(points), atol=1e-12)
+
+
+def test_a_long_and_narrow_board_is_flat_relative_to_its_length():
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3)) * [0.5, 0.02, 2e-4]
+    plane = _in_plane(points)
+    assert plane is not None
+    np.testing.assert_allclose(pdist(plane), pdist(points), atol=1e-5)
+    assert _in_plane(points * [1, 1, 10]) is None
+
+
+@pytest.mark.parametrize(("increase", "is_determined"), [(20.0, False), (30.0, True)])
+def test_twice_the_focal_length_is_25_variances_worse(monkeypatch, increase, is_determined):
+    """Five views of ten points leave 70 of 100 rows, whose sum of squares of 70 has the variance 1."""
+    focal, views = 1024.0, [(np.zeros((10, 3)), np.zeros((10, 2)))] * 5
+    monkeypatch.setattr(
+        intrinsics,
+        "_square_sum",
+        lambda views, camera, values: 70 + increase * np.log2(values[0] / focal) ** 2,
+    )
+    found = _search(views, CAMERA)
+    assert (found is not None) == is_determined
+    if found:
+        assert found == pytest.approx((focal, focal, *CAMERA.image_centre))
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,11 @@ def test_a_missing_file_is_named_before_a_bundle_is_written(tmp_path, monkeypatc
 
 
 def test_a_large_content_and_other_files_are_refused(first, tmp_path, monkeypatch):
-    monkeypatch.setattr("dhcal_pin.io.bundle.MAX_BYTES", 1000)
+    with zipfile.ZipFile(first / "arm.dhcal.zip") as archive:
+        size = sum(info.file_size for info in archive.infolist())
+    monkeypatch.setattr("dhcal_pin.io.bundle.MAX_BYTES", size)
+    read_bundle(first / "arm.dhcal.zip")
+    monkeypatch.setattr("dhcal_pin.io.bundle.MAX_BYTES", size - 1)
     with pytest.raises(FileFormatError, match="too large"):
         read_bundle(first / "arm.dhcal.zip")
     (tmp_path / "text.dhcal.zip").write_text("no zip file")

@@ -57,7 +57,7 @@ def test_text_reads_back(tmp_path):
         (CAMERA + BOARD_TABLE.replace("rows = 5", "rows = 1"), "expected at least 2 each"),
         (
             CAMERA + BOARD_TABLE.replace("22.0", "2e5"),
-            "expected a length in millimetres above 0 and up",
+            "expected a length in millimetres above 0 and up to 100000",
         ),
         (CAMERA + BOARD_TABLE.replace("charuco", "chess"), 'choose from "checkerboard"'),
         (CAMERA + BOARD_TABLE + "squares = 3\n", "unknown key 'squares'"),

@@ -17,20 +17,22 @@ from slow_cases import some_slow
 from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.initialization import make_problem
-from dhcal_pin.estimation.parameters import select_parameters
+from dhcal_pin.estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, select_parameters
+from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.io import read_measurements
 from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.session import Session
+from dhcal_pin.session import search as search_module
 from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
 from dhcal_pin.session.facts import Scale, SlowChange
-from dhcal_pin.session.linear_model import Layout, whitened_rows
+from dhcal_pin.session.linear_model import Layout, inverse, whitened_rows
 from dhcal_pin.session.refinement import refine_changes
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import TIME_CONSTANTS, _Search, find_session
+from dhcal_pin.session.search import FINE_CONSTANTS, TIME_CONSTANTS, _Search, find_session
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -196,8 +198,61 @@ def test_a_small_drift_has_its_time_constant(of, time_constant, low, high):
     assert low <= cause.shape.time_constant / 59 <= high
 
 
+@pytest.mark.parametrize(("gain", "constant"), [(2.5, np.inf), (3.5, FINE_CONSTANTS[8])])
+def test_a_drift_is_exponential_from_a_gain_of_three(gain, constant):
+    """The residuals are those of an exponential drift, of which linear ones leave a part of a known size."""
+    search = search_of(Changes())
+    linear, exponential = (
+        Cause(search.layout.blocks[0], Drift(0.0, 59.0, 59 * ratio), np.zeros(6), np.zeros((6, 6)))
+        for ratio in (np.inf, FINE_CONSTANTS[8])
+    )
+    columns = [
+        cause.columns_of(search.rows, search.numbers, search.times).reshape(360, 6)
+        for cause in (linear, exponential)
+    ]
+    explained = np.hstack([search.rows[..., search.layout.model].reshape(360, -1), columns[0]])
+    left = columns[1][:, 0] - explained @ np.linalg.lstsq(explained, columns[1][:, 0])[0]
+    search.rows[..., -1] = (np.sqrt(2 * gain) * columns[1][:, 0] / np.linalg.norm(left)).reshape(60, 6)
+    search.causes = [linear]
+    fit = replace(search.first_fit, weights=np.ones(60), noise=np.ones((60, 6)))
+    assert search._change_drifts(fit) == (gain > 3)
+    assert search.causes[0].shape == Drift(0.0, 59.0, 59 * constant)
+
+
+def test_a_step_before_the_last_three_samples_is_found():
+    """The blocks that are left out are shorter than its shorter side."""
+    search = search_of(Changes("tool", 5e-4, at=0.95))
+    search.run()
+    assert [cause.shape for cause in search.causes] == [Step(57)]
+
+
+def test_a_session_has_a_largest_number_of_causes(monkeypatch):
+    monkeypatch.setattr(search_module, "MAX_CAUSES", 1)
+    search = search_of(Changes("base", 2e-4, joint=(4, 0.015 * DEGREE), at=0.3))
+    search.run()
+    assert len(search.causes) == 1
+
+
+def test_what_the_measurements_do_not_show_has_the_prior_of_a_metre():
+    search = search_of(Changes())
+    base = search.layout.blocks[0]
+    rows = search.rows.copy()
+    rows[..., base.columns] = 0
+    fit = search.solve(rows, [Cause(base, Step(30), np.zeros(6), np.zeros((6, 6)))])
+    np.testing.assert_allclose(fit.covariance[-6:, -6:], np.diag(base.sizes**2), atol=1e-9)
+
+
+def test_passes_of_a_fit_end_where_weights_and_noise_stay(monkeypatch):
+    search, calls = search_of(Changes()), []
+    monkeypatch.setattr(search_module, "inverse", lambda matrix: [calls.append(1), inverse(matrix)][1])
+    search.solve(search.rows, [])
+    # The covariances of the result are two more inverse matrices.
+    assert len(calls) - 2 < search_module.N_PASSES
+
+
 def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_order():
     search = search_of(Changes("base", 2e-3, at=0.45), n_cells=10)
+    np.testing.assert_array_equal(search.edges, range(0, 61, 6))
     search.run()
     assert [cause.shape for cause in search.causes] == [Step(27)]
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
@@ -582,6 +637,27 @@ def test_a_scale_has_the_mean_and_the_scatter_of_its_posterior_distribution(fact
     assert found == pytest.approx(mean, rel=1e-3)
     assert std == pytest.approx(np.sqrt(np.average((grid - mean) ** 2, weights=density)), rel=0.01)
     assert find_scale(problem, 0.1 * x) is None
+
+
+def test_errors_of_origins_change_the_estimates_as_in_calibrations():
+    """Each origin of an exact arm has an error in turn."""
+    simulation = Simulation("ur10", 40, 6)
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors, origins = (select_parameters(chain, f"{name},base,tool") for name in ("minimal", "placement"))
+    weights, arm = 1 / errors.priors, np.flatnonzero(errors.is_of_arm)
+
+    def problem_of(truth):
+        positions = truth.poses(simulation.q)[:, :3, 3]
+        return make_problem(errors, (Position(simulation.q, positions, 1e-4),), weights, {})
+
+    expected = {unit: np.zeros((len(arm), len(arm))) for unit in ("m", "rad")}
+    for i, parameter in enumerate(origins.parameters):
+        size = {"m": LENGTH_PRIOR, "rad": ANGLE_PRIOR}[parameter.unit]
+        x = minimize(problem_of(origins.at(size * np.eye(len(origins.parameters))[i]))).x[arm]
+        expected[parameter.unit] += np.outer(x, x)
+    _, _, *found = _responses(problem_of(chain), np.zeros(len(weights)), arm)
+    for each, unit in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, expected[unit], atol=0.05 * np.abs(expected[unit]).max())
 
 
 def test_a_scale_is_the_same_with_redundant_parameters_and_without_priors():

@@ -32,8 +32,8 @@ from ..reweighting import Fit
 
 # Rounds of noise and solution.
 _N_ROUNDS = 2
-# Largest share of the displacement at the board beside a stated noise in the image.
-_MAX_STATED_SHARE = 0.9999
+# Largest share of the displacement at the board beside the noise in the image.
+_MAX_SHARE = 0.9999
 
 
 def fit_with_corner_noise(fit: Fit, max_iterations: int) -> Fit:
@@ -93,7 +93,7 @@ def estimate_corner_variances(
         variance = scale(share, variance) * variance
         return float(np.sum(np.log(variance)) + np.sum(squares / variance) / freedom)
 
-    bounds = (0.0, _MAX_STATED_SHARE if is_stated else 1.0)
+    bounds = (0.0, _MAX_SHARE)
     found = minimize_scalar(cost, bounds=bounds, method="bounded").x
     share = min((float(found), *bounds), key=cost)
     factor = scale(share, (1 - share) * in_image + share * ratio * at_board)

@@ -311,7 +311,7 @@ def _search(
     count = int(label.max(initial=-1)) + 1
     if count < MIN_CONFIGURATIONS:
         return None
-    n_used = min(MAX_CONFIGURATIONS, max(MAX_CORNERS * count // len(label), MAX_CONFIGURATIONS // 3))
+    n_used = _n_examined(count, len(label))
     if count > n_used:
         is_used = np.isin(label, evenly_spaced_indices(count, n_used))
         ends = np.cumsum([len(item.rows) for item in data])[:-1]
@@ -324,6 +324,11 @@ def _search(
     if base.error.pixels > MAX_LEFT_OUT_RATIO * fitted.pixels:
         base = replace(base, error=fitted, noise=base.scatter)
     return _Search(hand_eye, base, *_find_causes(hand_eye, base))
+
+
+def _n_examined(count: int, n_corners: int) -> int:
+    """Return the number of configurations in which causes are looked for, of a count with some corners."""
+    return min(count, MAX_CONFIGURATIONS, max(MAX_CORNERS * count // n_corners, MAX_CONFIGURATIONS // 3))
 
 
 def describe_contradiction(fit: Fit, errors: Accuracy) -> str:

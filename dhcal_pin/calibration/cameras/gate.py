@@ -36,7 +36,6 @@ from ...estimation.error_model import ErrorModel
 from ...estimation.folds import factor_partition
 from ...estimation.priors import PriorGroups, effective_parameters
 from ...estimation.problem import Problem
-from ...estimation.robust import ZERO_WEIGHT
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
@@ -145,8 +144,7 @@ def judge_target_points(fit: Fit, max_iterations: int) -> TargetPoints | None:
 
 def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: ArmType) -> GatedFit:
     """Fit arm, cameras and boards as far as the images show that the arm is wrong."""
-    is_good = np.concatenate([weights > ZERO_WEIGHT for weights in fit.weights])
-    n_configurations = len(np.unique(configuration_groups(fit.data)[is_good]))
+    n_configurations = len(np.unique(configuration_groups(fit.without_rejected().data)))
     folds = cluster_folds(fit.problem.data)
     nominal = without_arm(fit, max_iterations)
     is_right = not residual_jitter(nominal).is_significant
@@ -169,7 +167,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
         _trial(model, groups, factor * temperature(n_configurations, CLOSED_SAMPLES), folds, max_iterations)
         for model, factor in models
     ]
-    best = min(trials, key=lambda trial: trial.error) if len(folds) > 1 else trials[-1]
+    best = min(trials, key=lambda trial: trial.error) if folds else trials[-1]
     others_ratio = _others_ratio(best.closed, max_iterations)
     gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
     if not gate.is_open:

@@ -88,7 +88,7 @@ def fitted_error(fit: Fit) -> ImageError:
 
 def held_out_error(fit: Fit, folds: Sequence[Fold]) -> ImageError | None:
     """Compute the error of images under fits of the other images, by one step from the fit of all."""
-    if len(folds) < 2:
+    if not folds:
         return None
     problem, x = fit.problem, fit.solution.x
     columns = np.ones(len(x), bool)
