@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
@@ -16,6 +17,7 @@ from ..report.json_document import json_text
 from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
+from .output_table import Done, Output, OutputFile, chosen_files, require_endings
 
 
 def is_same_file(a: str, b: str) -> bool:
@@ -44,6 +46,16 @@ def require_workbook(sheet: str, inputs: Sequence[str]) -> None:
         raise InvalidArgumentError(
             f"--sheet {sheet}: no input is an Excel file; expected {endings}, or leave out --sheet"
         )
+
+
+def checked_files(
+    args: Namespace, table: Mapping[str, Output[Done]], inputs: Sequence[str]
+) -> list[OutputFile[Done]]:
+    """List the files that the options of a command name, and check their paths and endings."""
+    files = chosen_files(vars(args), table)
+    require_writable_outputs([file.path for file in files], inputs)
+    require_endings(files)
+    return files
 
 
 def existing_sidecars(robots: Sequence[str]) -> list[str]:

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_urdf_options
+from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -100,17 +100,12 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
 
 def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of the stops of a recording, and notes on them."""
-    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ...io.measurement_files.bag import convert_bag
+    from ...io.measurement_files.bag import convert_bag  # lazy import: loads Pinocchio
 
     if not args.output.lower().endswith(".csv"):
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
     for option, value in (("--convention", args.convention), ("--template", args.template)):
         if value:
             raise InvalidArgumentError(f"{option}: a recording has none; omit it")
-    chain = (
-        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-        if args.robot
-        else None
-    )
+    chain = read_one_robot(args.robot, args) if args.robot else None
     return convert_bag(args.input, args.pose_topic, args.joint_topic, chain)

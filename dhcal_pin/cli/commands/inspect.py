@@ -7,9 +7,15 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, SERVOS, SHEET, add_urdf_options
+from ..options import DATA, JSON, RIG, ROBOT, add_table_options, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
+# Why some options need the robot.
+_ROBOT_REASONS = {
+    "columns": "as the map names its joints",
+    "rig": "whose links carry the cameras and boards",
+    "servos": "whose joints the servos move",
+}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -18,9 +24,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
     )
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
+    add_table_options(parser)
     parser.add_argument("--rig", **RIG)
     parser.add_argument(
         "--skip-bad-rows",
@@ -38,7 +42,6 @@ def run(args: Namespace) -> int:
     if any(map(is_bundle, args.data)):
         return _inspect_bundle(args)
     from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
-    from ...io import read_robot
     from ...io.rig_file import read_rig
     from ...io.servo_file import read_servos
     from ...measurements.mounting import mount_rig
@@ -47,22 +50,15 @@ def run(args: Namespace) -> int:
     from ..screens import console
     from ..screens.result_screens import inspection_screen
 
-    if args.columns and not args.robot:
-        raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
-    if args.rig and not args.robot:
-        raise InvalidArgumentError("--rig: needs --robot, whose links carry the cameras and boards")
-    if args.servos and not args.robot:
-        raise InvalidArgumentError("--servos: needs --robot, whose joints the servos move")
+    for option, reason in _ROBOT_REASONS.items():
+        if getattr(args, option) and not args.robot:
+            raise InvalidArgumentError(f"--{option}: needs --robot, {reason}")
     robots = [args.robot] if args.robot else []
     settings = [path for path in (args.columns, args.rig, args.servos) if path]
     inputs = [*robots, *existing_sidecars(robots), *args.data, *settings]
     require_writable_outputs([args.json], inputs)
     require_workbook(args.sheet, inputs)
-    chain = (
-        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-        if args.robot
-        else None
-    )
+    chain = read_one_robot(args.robot, args) if args.robot else None
     rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
     servos = read_servos(args.servos) if args.servos else None
     inspections = [inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data]

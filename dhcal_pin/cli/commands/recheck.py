@@ -7,7 +7,16 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, ROBOT, SERVOS, SHEET, SKIP_BAD_ROWS, add_urdf_options, read_data
+from ..options import (
+    DATA,
+    JSON,
+    ROBOT,
+    SKIP_BAD_ROWS,
+    add_table_options,
+    add_urdf_options,
+    read_data,
+    read_one_robot,
+)
 from ..output_table import Output
 
 if TYPE_CHECKING:
@@ -50,10 +59,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("robot", **{**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"})
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    add_table_options(parser)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
@@ -78,13 +85,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Check whether a robot is still calibrated, write the answer and show it."""
-    from ...io import (
-        existing_sidecar,
-        read_instrument,
-        read_robot,
-        read_servos,
-        robot_name,
-    )
+    from ...io import existing_sidecar, read_instrument, read_servos, robot_name
     from ...io.check_history import Check, read_history
     from ...io.measurement_files.reading import has_image_coordinates
     from ...io.sidecar import read_uncertainty  # lazy import, as the following: they load Pinocchio
@@ -92,22 +93,20 @@ def run(args: Namespace) -> int:
     from ...report.provenance import file_digests
     from ...session import recheck
     from ...units import parse_noise
-    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_workbook, require_writable_outputs, write_outputs
+    from ..output_table import file_contents, paths_by_name
+    from ..outputs import checked_files, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import recheck_screen
 
     sidecar = existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
-    outputs = chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in outputs], inputs)
+    outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    require_endings(outputs)
     if args.plot and not args.history:
         raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")
     noise = Noise(*parse_noise(args.sigma, "--sigma")) if args.sigma else None
     size = parse_noise(args.size, "--size")[0]
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    chain = read_one_robot(args.robot, args)
     if sidecar is None:
         raise InvalidArgumentError(
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
@@ -124,16 +123,14 @@ def run(args: Namespace) -> int:
     known = {name: value for name, value in known.items() if name in used}
     result = recheck(chain, data, read_uncertainty(sidecar, chain), known=known, noise=noise, size=size)
     now = Check.of(result, args.robot, args.data)
-    written = paths_by_name(outputs)
     document: dict[str, Any] = result.to_dict() | {
         "time": now.time,
         "robot": args.robot,
-        "files": written,
+        "files": paths_by_name(outputs),
         "inputs": file_digests(inputs),
     }
     contents = file_contents(outputs, Checked(robot_name(args.robot), [*earlier, now]))
     write_outputs(contents, args.json, document)
-    shown = [path for name, path in written.items() if name != "json"]
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(recheck_screen(result, notes, shown), args.verbosity)
+    console.show(recheck_screen(result, notes, contents), args.verbosity)
     return STATUS[result.verdict]

@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
-    COLUMNS,
     DATA,
     FIT_FRAMES,
     JSON,
     RIG,
     ROBOT,
-    SERVOS,
-    SHEET,
     SKIP_BAD_ROWS,
+    add_table_options,
     add_urdf_options,
     read_data,
+    read_one_robot,
 )
 from ..output_table import Output
 
@@ -45,14 +44,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("robot", **ROBOT)
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
+    add_table_options(parser)
     parser.add_argument(
         "--rig",
         **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
     )
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sidecar",
         metavar="S.toml",
@@ -65,7 +62,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
     )
-    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
+    parser.add_argument("--fit-frames", **FIT_FRAMES)
     parser.add_argument(
         "--map",
         metavar="MAP",
@@ -147,16 +144,15 @@ def run(args: Namespace) -> int:
     from ...iso9283 import pose_characteristics
     from ...report.provenance import file_digests
     from ...report.validation import Validation
-    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_workbook, require_writable_outputs, write_outputs
+    from ..output_table import file_contents, paths_by_name
+    from ..outputs import checked_files, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or existing_sidecar(args.robot)
-    inputs, outputs = _input_paths(args, sidecar), chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in outputs], inputs)
+    inputs = _input_paths(args, sidecar)
+    outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    require_endings(outputs)
     given = _read_input(args, sidecar)
     judged = _judge(args, given)
     data, accuracies = given.data, judged.accuracies
@@ -214,10 +210,10 @@ def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
 
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
-    from ...io import read_instrument, read_measured_region, read_robot, read_servos
+    from ...io import read_instrument, read_measured_region, read_servos
     from ...measurements.position import require_common_reference_target
 
-    chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
+    chain = read_one_robot(args.robot, args, sidecar)
     servos = read_servos(args.servos) if args.servos else None
     rig, estimated = _mounted_rig(args, sidecar, chain, servos)
     predictor = _predictor(chain, sidecar, args) if args.map else None
@@ -362,9 +358,8 @@ def _nominal_accuracy(
 
     from ...calibration import accuracy
     from ...diagnostics import fit_frames
-    from ...io import read_robot
 
-    nominal = read_robot(args.nominal, args.tip, None, args.package_dir, args.root)
+    nominal = read_one_robot(args.nominal, args)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "

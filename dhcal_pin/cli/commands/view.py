@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
-    COLUMNS,
     DATA,
     FIT_FRAMES,
     JSON,
     POSITIVE_INTEGER,
     RIG,
     ROBOT,
-    SERVOS,
-    SHEET,
     SKIP_BAD_ROWS,
     add_open_option,
+    add_table_options,
     add_urdf_options,
     read_data,
     read_robot_or_table,
@@ -43,10 +41,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--data", **{**DATA, "help": f"{DATA['help']}; their poses are drawn and played"}, default=[]
     )
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    add_table_options(parser)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--rig",
         metavar=RIG["metavar"],
@@ -77,7 +73,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
     )
-    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
+    parser.add_argument("--fit-frames", **FIT_FRAMES)
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 
