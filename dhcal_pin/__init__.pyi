@@ -9,6 +9,7 @@ from .calibration.partition import split as split
 from .calibration.presentation.residual_table import ResidualTable as ResidualTable
 from .calibration.procedure import calibrate as calibrate
 from .calibration.result import Result as Result
+from .calibration.robot_files import write_urdf as write_urdf
 from .calibration.streaming import calibrate_stream as calibrate_stream
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
@@ -24,7 +25,6 @@ from .io.measurement_files import read_measurements as read_measurements
 from .io.measurement_files import read_targets as read_targets
 from .io.rig_file import read_rig as read_rig
 from .io.robot import read_robot as read_robot
-from .io.robot import write_urdf as write_urdf
 from .io.servo_file import read_servos as read_servos
 from .measurements.base import Noise as Noise
 from .measurements.camera import CameraCorners as CameraCorners

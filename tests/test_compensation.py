@@ -15,11 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration.robot_files import write_urdf
 from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_targets, write_urdf
+from dhcal_pin.io import read_targets
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain, DHTable
 

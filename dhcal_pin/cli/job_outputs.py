@@ -130,9 +130,8 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
     """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io.measurement_files.fitted_rows import fitted_row_digests
+    from ..calibration.robot_files import findings_of
     from ..io.robot import urdf_files
-    from ..io.sidecar import Fitted
     from ..report.provenance import file_digests
     from ..robot import urdf_edit
 
@@ -157,16 +156,8 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
             data = urdf_edit.with_fixed_frame(data, frame.parent, frame.name, frame.pose, "--camera-frame")
         return data
 
-    contents = urdf_files(
-        written,
-        output,
-        fit.transferable_instruments,
-        fit.uncertainty,
-        fit.measured_region,
-        edit,
-        fit.rig,
-        Fitted(list(file_digests(options["data"]).values()), fitted_row_digests(fit.data)),
-    )
+    digests = list(file_digests(options["data"]).values())
+    contents = urdf_files(written, output, findings_of(fit, digests), edit)
     if options["camera_files"]:
         from ..io.camera_files import camera_files  # lazy import: only for cameras
 

@@ -19,7 +19,6 @@ from .robot import convert_robot as convert_robot
 from .robot import read_robot as read_robot
 from .robot import robot_name as robot_name
 from .robot import urdf_files as urdf_files
-from .robot import write_urdf as write_urdf
 from .robot_format import ConvertedRobot as ConvertedRobot
 from .robot_format import RobotFormat as RobotFormat
 from .robot_format import RobotSource as RobotSource

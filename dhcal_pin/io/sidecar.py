@@ -366,6 +366,19 @@ class Fitted(NamedTuple):
     rows: bytes = b""  # Digests of the rows, see `fitted_rows`; empty if they are not known
 
 
+class Findings(NamedTuple):
+    """What a calibration found beside the robot itself."""
+
+    instrument: Mapping[str, float] = {}  # Instrument parameters by name [m or rad]
+    uncertainty: Uncertainty | None = None
+    measured_region: MeasuredRegion | None = None
+    rig: MountedRig | None = None  # Cameras and boards with their estimated poses and lenses
+    fitted: Fitted = Fitted()
+
+
+NO_FINDINGS = Findings()
+
+
 def read_fitted(path: PathLike) -> Fitted:
     """Read what identifies the measurements that the calibration of a sidecar fitted."""
     manifest = read_toml(path, MAX_SIDECAR_BYTES).get("manifest", {})
@@ -693,25 +706,21 @@ def sidecar_text(
     chain: Chain,
     tool: Array,
     urdf: bytes,
-    instrument: Mapping[str, float] | None = None,
-    uncertainty: Uncertainty | None = None,
-    measured_region: MeasuredRegion | None = None,
-    rig: MountedRig | None = None,
-    additions: Mapping[str, Array] | None = None,
-    fitted: Fitted | None = None,
+    findings: Findings,
+    additions: Mapping[str, Array],
     *,
     required: bool = False,
 ) -> str | None:
     """Return the text of the sidecar of a calibrated robot."""
     tables = {
-        "link": {name: toml.pose_content(pose) for name, pose in (additions or {}).items()},
+        "link": {name: toml.pose_content(pose) for name, pose in additions.items()},
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),
         **_link_content(chain),
-        "instrument": {name: float(value) for name, value in (instrument or {}).items()},
-        "uncertainty": _uncertainty_content(uncertainty),
-        "measured": _measured_content(chain, measured_region),
-        **(rig_content(rig.cameras, rig.boards) if rig else {}),
+        "instrument": {name: float(value) for name, value in findings.instrument.items()},
+        "uncertainty": _uncertainty_content(findings.uncertainty),
+        "measured": _measured_content(chain, findings.measured_region),
+        **(rig_content(rig.cameras, rig.boards) if (rig := findings.rig) else {}),
     }
     tables = {key: table for key, table in tables.items() if table}
     has_frames = not all(np.array_equal(pose, np.eye(4)) for pose in (chain.base, tool))
@@ -727,7 +736,7 @@ def sidecar_text(
     content = {
         "tip": chain.tip,
         **frames,
-        "manifest": _manifest_content(urdf, chain.tip, fitted or Fitted()),
+        "manifest": _manifest_content(urdf, chain.tip, findings.fitted),
         **tables,
     }
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.
