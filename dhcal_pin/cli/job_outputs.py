@@ -1,14 +1,12 @@
-"""Contents of the output files of a calibration job.
+"""Files of the calibrated robot that a calibration job writes, by the ending of --output.
 
-A field of `Job` that names an output file holds its `Output`; `ROBOT_FORMATS` lists the files of the robot
-itself. Functions import what they need when they are called, because help pages load no NumPy.
+Functions import what they need when they are called, because help pages load no NumPy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..exceptions import InvalidArgumentError
@@ -19,76 +17,11 @@ if TYPE_CHECKING:
     from ..calibration.result import Result
     from ..io.camera_files import CameraFrame
     from ..io.servo_file import ServoFile
-    from ..report.provenance import Provenance
     from ..robot.chain import Chain
-
-
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """Result of a job, from which its output files are made."""
-
-    fit: Result  # Result of the calibration
-    written: Result  # The same for the joint values of the files, with corrected zeros of servos
-    source: Provenance  # Files, command and settings
-    robot: str  # Path of the nominal robot
-    reports: tuple[str, ...]  # Paths of all reports
-    meta: tuple[str, ...]  # Facts for the certificate, `KEY=VALUE` each
-
-    @cached_property
-    def report_contents(self) -> dict[PathLike, str | bytes]:
-        """Contents of all reports, which have their figures in common."""
-        from ..report.calibration_report import report_files  # lazy import: only for reports
-
-        return report_files(self.fit, self.reports, self.source)
-
-
-def map_content(done: Calibrated, path: str) -> str:
-    """Make the map of uncertainty and hold-out errors."""
-    from ..report import workspace_map  # lazy import: only for maps
-
-    return workspace_map.map_content(path, done.fit, done.fit.holdout, done.fit.instruments)
-
-
-def scene_content(done: Calibrated, path: str) -> str:
-    """Make the 3-D scene of the nominal and the calibrated robot."""
-    from ..io.robot import robot_name  # lazy import, as the following: only for scenes
-    from ..visualization import scene
-
-    return scene.scene_html(done.fit.nominal_refitted, done.fit, title=robot_name(done.robot))
-
-
-def curves_content(done: Calibrated, path: str) -> str:
-    """Make the table of joint corrections."""
-    from ..io.tabular import csv_text  # lazy import, as the following: they load NumPy
-    from ..robot.correction_table import correction_columns, joint_corrections
-
-    return csv_text(correction_columns(joint_corrections(done.written.chain)))
-
-
-def residuals_content(done: Calibrated, path: str) -> str:
-    """Make the table of all residuals."""
-    from ..io.tabular import csv_text  # lazy import: loads NumPy
-
-    return csv_text(done.fit.residuals.file_columns())
-
-
-def report_content(done: Calibrated, path: str) -> str | bytes:
-    """Make one of the reports."""
-    return done.report_contents[path]
-
-
-def certificate_content(done: Calibrated, path: str) -> str:
-    """Make the certificate."""
-    from ..report import certificate  # lazy import: only for certificates
-
-    return certificate.certificate_page(done.fit, certificate.parse_meta(done.meta), done.source)
 
 
 # Ending of the corrected servo file.
 SERVO_ENDING = ".servos.toml"
-
-
-# --- files of the robot ----------------------------------------------------------------------------
 
 
 class RobotOutput(NamedTuple):

@@ -17,7 +17,7 @@ from ..report.json_document import json_text
 from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
-from .output_table import Done, Output, OutputFile, chosen_files, require_endings
+from .output_table import Output, OutputFile, chosen_files, require_endings
 
 
 def is_same_file(a: str, b: str) -> bool:
@@ -48,9 +48,7 @@ def require_workbook(sheet: str, inputs: Sequence[str]) -> None:
         )
 
 
-def checked_files(
-    args: Namespace, table: Mapping[str, Output[Done]], inputs: Sequence[str]
-) -> list[OutputFile[Done]]:
+def checked_files(args: Namespace, table: Mapping[str, Output], inputs: Sequence[str]) -> list[OutputFile]:
     """List the files that the options of a command name, and check their paths and endings."""
     files = chosen_files(vars(args), table)
     require_writable_outputs([file.path for file in files], inputs)

@@ -20,7 +20,7 @@ from ..planning.views import CameraViews
 from ..programs import Program, Stop, program_text
 from ..report.provenance import versions
 from ..robot.chain import Chain
-from .output_table import Output, chosen_files, paths_by_name
+from .output_table import Makers, Output, chosen_files, paths_by_name
 
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
 DEGREE_DECIMALS = 4
@@ -121,7 +121,7 @@ def _program_content(done: Planned, path: str) -> str:
     return program_text(Program(done.chain, "poses to measure, by dhcal plan", warning, stops), path)
 
 
-def _report_content(done: Planned, path: str) -> str:
+def _report_content(done: Planned) -> str:
     """Make the report with the poses."""
     from ..report.plan import PlanReport, plan_page  # lazy import: only for reports
 
@@ -142,13 +142,23 @@ def _report_content(done: Planned, path: str) -> str:
     )
 
 
-OUTPUTS: dict[str, Output[Planned]] = {
-    "output": Output(lambda done, path: done.poses_text, "poses", (".csv",)),
-    "json": Output(None),
-    "export": Output(_program_content),
-    "html": Output(lambda done, path: done.scene, "a scene", (".html",), (".htm",)),
-    "report": Output(_report_content, "the report of a plan", (".html",), (".htm",)),
+OUTPUTS = {
+    "output": Output("poses", (".csv",)),
+    "json": Output(),
+    "export": Output(),
+    "html": Output("a scene", (".html",), (".htm",)),
+    "report": Output("the report of a plan", (".html",), (".htm",)),
 }
+
+
+def content_makers(done: Planned) -> Makers:
+    """Return the functions that make the output files."""
+    return {
+        "output": lambda path: done.poses_text,
+        "export": lambda path: _program_content(done, path),
+        "html": lambda path: done.scene,
+        "report": lambda path: _report_content(done),
+    }
 
 
 def plan_document(done: Planned) -> dict[str, Any]:

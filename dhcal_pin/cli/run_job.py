@@ -15,12 +15,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
-from .. import io, plausibility
+from .. import io, plausibility, report, visualization
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images
@@ -46,14 +46,13 @@ from ..parallel import TaskExecutor
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
-from ..robot.correction_table import joint_corrections
+from ..robot.correction_table import correction_columns, joint_corrections
 from .arm_types import with_arm_type
 from .bundle_content import bundle_content
 from .job import REGION, Job
 from .job_outputs import (
     ROBOT_FORMATS,
     SERVO_ENDING,
-    Calibrated,
     companion_paths,
     name_robot_files,
     require_servos,
@@ -61,7 +60,7 @@ from .job_outputs import (
     robot_stem,
 )
 from .options import split_commas
-from .output_table import file_contents, paths_by_name, require_endings
+from .output_table import Makers, file_contents, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
     is_same_file,
@@ -234,11 +233,9 @@ def checked_inputs(job: Job) -> list[str]:
     require_writable_outputs([*job.output_paths, *companions], protected)
     require_endings(job.outputs)
     if job.meta:
-        from ..report import certificate  # lazy import: only for certificates
-
         if not job.certificate:
             raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
-        certificate.parse_meta(job.meta)
+        report.parse_meta(job.meta)
     return inputs
 
 
@@ -453,11 +450,10 @@ def _write_job(
         data.notes.setdefault(job.robot, []).extend(moved_zeros)
     source = _provenance(job, sets, data, inputs, contents, hint)
     files = name_robot_files(map(str, contents), job.output)
-    done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
     files = {name: shown.get(path, path) for name, path in files.items()}
-    contents |= file_contents(outputs, done)
+    contents |= file_contents(outputs, _content_makers(job, fit, written, source))
     outliers = dict(zip(data.fitted, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
@@ -473,6 +469,29 @@ def _write_job(
         contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, outcome.document)
     write_outputs(contents, job.json, outcome.document if job.json else None)
     return outcome
+
+
+def _content_makers(job: Job, fit: Result, written: Result, source: Provenance) -> Makers:
+    """Return the functions that make the output files beside those of the robot; modules load on first use.
+
+    `written` is the result for the joint values of the files, with corrected zeros of servos.
+    """
+
+    @cache
+    def reports() -> dict[PathLike, str | bytes]:
+        # They have their figures in common.
+        return report.report_files(fit, job.report, source)
+
+    return {
+        "map": lambda path: report.map_content(path, fit, fit.holdout, fit.instruments),
+        "scene": lambda path: visualization.scene_html(
+            fit.nominal_refitted, fit, title=io.robot_name(job.robot)
+        ),
+        "curves": lambda path: io.csv_text(correction_columns(joint_corrections(written.chain))),
+        "residuals": lambda path: io.csv_text(fit.residuals.file_columns()),
+        "report": lambda path: reports()[path],
+        "certificate": lambda path: report.certificate_page(fit, report.parse_meta(job.meta), source),
+    }
 
 
 def _provenance(

@@ -11,6 +11,7 @@ import pytest
 from robots import write
 
 from dhcal_pin import se3
+from dhcal_pin.calibration.robot_files import write_urdf
 from dhcal_pin.estimation import PARAMETER_SETS, Uncertainty
 from dhcal_pin.estimation.uncertainty import FamilyGain, ModelFit
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
@@ -20,7 +21,6 @@ from dhcal_pin.io import (
     read_robot,
     read_uncertainty,
     urdf_files,
-    write_urdf,
 )
 from dhcal_pin.io.sidecar import Findings, sidecar_text
 from dhcal_pin.measurements import MeasuredRegion

@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 from ..output_table import Output
 
 if TYPE_CHECKING:
-    from ...diagnostics import Calibrated, Difference
+    from ...diagnostics import Calibrated
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
 
 
-class Compared(NamedTuple):
-    """Result of a comparison, from which its output files are made."""
-
-    difference: Difference
-    names: list[str]
-    inputs: dict[str, str]
-
-
-def _report_content(done: Compared, path: str) -> str:
-    from ...report.changes import difference_page  # lazy import: only for reports
-
-    return difference_page(done.names, done.difference, done.inputs)
-
-
-OUTPUTS: dict[str, Output[Compared]] = {
-    "json": Output(None),
-    "report": Output(_report_content, "the report of a difference", (".html",), (".htm",)),
-}
+OUTPUTS = {"json": Output(), "report": Output("the report of a difference", (".html",), (".htm",))}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -46,7 +29,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Compare two robots, write the difference and show it."""
-    from ...diagnostics import compare  # lazy import, as the following: they load Pinocchio
+    from ... import report  # lazy import, as the following: they load Pinocchio
+    from ...diagnostics import compare
     from ...io import robot_name
     from ...report.provenance import file_digests
     from ..output_table import file_contents, paths_by_name
@@ -58,9 +42,11 @@ def run(args: Namespace) -> int:
     inputs = [*robots, *existing_sidecars(robots)]
     outputs = checked_files(args, OUTPUTS, inputs)
     difference = compare(*(_read(path, args) for path in robots))
-    done = Compared(difference, [robot_name(path) for path in robots], file_digests(inputs))
-    document = difference.to_dict() | {"files": paths_by_name(outputs), "inputs": done.inputs}
-    contents = file_contents(outputs, done)
+    names, digests = [robot_name(path) for path in robots], file_digests(inputs)
+    document = difference.to_dict() | {"files": paths_by_name(outputs), "inputs": digests}
+    contents = file_contents(
+        outputs, {"report": lambda path: report.difference_page(names, difference, digests)}
+    )
     write_outputs(contents, args.json, document)
     console.show(difference_screen(difference, contents), args.verbosity)
     return 0

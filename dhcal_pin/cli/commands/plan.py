@@ -27,7 +27,7 @@ def run(args: Namespace) -> int:
     from ..output_table import file_contents
     from ..outputs import checked_files, require_workbook, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
-    from ..plan_outputs import OUTPUTS, Planned, plan_document
+    from ..plan_outputs import OUTPUTS, Planned, content_makers, plan_document
     from ..screens import console
     from ..screens.result_screens import plan_screen
 
@@ -44,7 +44,7 @@ def run(args: Namespace) -> int:
     if n_repeated:
         result = with_repeats(result, chain, n_repeated, given["space"], given["margin"])
     done = Planned(result, chain, given, rows, args, file_digests(inputs))
-    contents = file_contents(files, done)
+    contents = file_contents(files, content_makers(done))
     write_outputs(contents, args.json, plan_document(done))
     console.show(plan_screen(result, done.moves, contents), args.verbosity)
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
@@ -17,10 +17,7 @@ from ..options import (
     read_data,
     read_one_robot,
 )
-from ..output_table import Output
-
-if TYPE_CHECKING:
-    from ...io.check_history import Check
+from ..output_table import Makers, Output
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
@@ -28,29 +25,10 @@ EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
 
-class Checked(NamedTuple):
-    """Result of a check, from which its output files are made."""
-
-    robot: str
-    checks: list[Check]  # The checks of the history and this one
-
-
-def _history_content(done: Checked, path: str) -> str:
-    from ...io.check_history import history_text  # lazy import: only for histories
-
-    return history_text(done.checks)
-
-
-def _plot_content(done: Checked, path: str) -> str:
-    from ...report.changes import history_page  # lazy import: only for pages
-
-    return history_page(done.robot, done.checks)
-
-
-OUTPUTS: dict[str, Output[Checked]] = {
-    "json": Output(None),
-    "history": Output(_history_content, "a history", (".jsonl",)),
-    "plot": Output(_plot_content, "a plot of the history", (".html",), (".htm",)),
+OUTPUTS = {
+    "json": Output(),
+    "history": Output("a history", (".jsonl",)),
+    "plot": Output("a plot of the history", (".html",), (".htm",)),
 }
 
 
@@ -85,10 +63,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Check whether a robot is still calibrated, write the answer and show it."""
+    from ... import report  # lazy import, as the following: they load Pinocchio
     from ...io import existing_sidecar, read_instrument, read_servos, robot_name
-    from ...io.check_history import Check, read_history
+    from ...io.check_history import Check, history_text, read_history
     from ...io.measurement_files.reading import has_image_coordinates
-    from ...io.sidecar import read_uncertainty  # lazy import, as the following: they load Pinocchio
+    from ...io.sidecar import read_uncertainty
     from ...measurements import Noise
     from ...report.provenance import file_digests
     from ...session import recheck
@@ -129,7 +108,12 @@ def run(args: Namespace) -> int:
         "files": paths_by_name(outputs),
         "inputs": file_digests(inputs),
     }
-    contents = file_contents(outputs, Checked(robot_name(args.robot), [*earlier, now]))
+    checks = [*earlier, now]
+    makers: Makers = {
+        "history": lambda path: history_text(checks),
+        "plot": lambda path: report.history_page(robot_name(args.robot), checks),
+    }
+    contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
     console.show(recheck_screen(result, notes, contents), args.verbosity)

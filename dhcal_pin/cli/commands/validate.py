@@ -19,7 +19,7 @@ from ..options import (
     read_data,
     read_one_robot,
 )
-from ..output_table import Output
+from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
     from ...calibration import Accuracy, Result
@@ -110,40 +110,20 @@ class Judged(NamedTuple):
     remarks: Sequence[str] = ()
 
 
-class Validated(NamedTuple):
-    """Result of a validation, from which its output files are made."""
-
-    report: Validation
-    predictor: Predictor | None
-
-
-def _map_content(done: Validated, path: str) -> str:
-    from ...report.workspace_map import map_content  # lazy import: only for maps
-
-    assert done.predictor is not None
-    return map_content(path, done.predictor, done.report.data, done.report.known)
-
-
-def _report_content(done: Validated, path: str) -> str:
-    from ...report.validation import validation_page  # lazy import: only for reports
-
-    return validation_page(done.report)
-
-
-OUTPUTS: dict[str, Output[Validated]] = {
-    "json": Output(None),
-    "map": Output(_map_content, "a map", (".csv", ".html")),
-    "report": Output(_report_content, "the report of a validation", (".html",), (".htm",)),
+OUTPUTS = {
+    "json": Output(),
+    "map": Output("a map", (".csv", ".html")),
+    "report": Output("the report of a validation", (".html",), (".htm",)),
 }
 
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...diagnostics import find_extrapolation  # lazy import, as the following: they load Pinocchio
+    from ... import report  # lazy import, as the following: they load Pinocchio
+    from ...diagnostics import find_extrapolation
     from ...io import existing_sidecar, robot_name
     from ...iso9283 import pose_characteristics
     from ...report.provenance import file_digests
-    from ...report.validation import Validation
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
     from ..screens import console
@@ -163,7 +143,7 @@ def run(args: Namespace) -> int:
     warnings = _input_warnings(args, given, judged, sidecar)
     notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
     extrapolation = given.region and find_extrapolation(given.region, judged.chain, data, judged.known)
-    report = Validation(
+    done = report.Validation(
         robot_name(args.robot),
         judged.chain,
         data,
@@ -183,18 +163,24 @@ def run(args: Namespace) -> int:
         characteristics,
     )
     files = paths_by_name(outputs)
-    document = _document(report, judged) | {
+    document = _document(done, judged) | {
         "estimated_entries": given.estimated,
-        "warnings": [*notes, *report.warnings],
+        "warnings": [*notes, *done.warnings],
         "measured_region": extrapolation and extrapolation.to_dict(),
         "iso9283": characteristics and characteristics.to_dict(),
         "files": files,
     }
-    write_outputs(file_contents(outputs, Validated(report, given.predictor)), args.json, document)
+
+    def map_content(path: str) -> str:
+        assert given.predictor is not None
+        return report.map_content(path, given.predictor, data, judged.known)
+
+    makers: Makers = {"map": map_content, "report": lambda path: report.validation_page(done)}
+    write_outputs(file_contents(outputs, makers), args.json, document)
     title = f"{args.robot}: accuracy on {document['samples']} samples"
     shown = {name: path for name, path in files.items() if name != "json"}
     tables = characteristics.tables() if characteristics else []
-    screen = validation_screen(title, accuracies, report.remarks, notes, warnings, shown, tables)
+    screen = validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
     console.show(screen, args.verbosity)
     return 0
 

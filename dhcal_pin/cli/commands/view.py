@@ -6,7 +6,7 @@ import os
 import tempfile
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ...exceptions import InvalidArgumentError
 from ..options import (
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ...measurements import Measurement, MountedRig
     from ...robot import Chain
 
-OUTPUTS: dict[str, Output[Any]] = {"html": Output(None, "a scene", (".html",), (".htm",))}
+OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
