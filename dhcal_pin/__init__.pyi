@@ -7,9 +7,9 @@ from .calibration.partition import k_fold as k_fold
 from .calibration.partition import leave_one_group_out as leave_one_group_out
 from .calibration.partition import split as split
 from .calibration.presentation.residual_table import ResidualTable as ResidualTable
+from .calibration.presentation.robot_files import write_urdf as write_urdf
 from .calibration.procedure import calibrate as calibrate
 from .calibration.result import Result as Result
-from .calibration.robot_files import write_urdf as write_urdf
 from .calibration.streaming import calibrate_stream as calibrate_stream
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
 from dhcal_pin.estimation import select_parameters

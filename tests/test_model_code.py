@@ -22,7 +22,7 @@ from exported_models import (
 from robots import random_table, robot_file, with_masses
 
 from dhcal_pin import se3
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import read_robot

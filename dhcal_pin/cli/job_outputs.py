@@ -37,11 +37,7 @@ class RobotOutput(NamedTuple):
 
     help: str
     files: Callable[[Result, str, Mapping[str, Any]], dict[PathLike, str | bytes]]
-    require: Callable[[Chain, str, Mapping[str, Any]], None]
-
-
-def _any_robot(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
-    """Accept all robots and options."""
+    require: Callable[[Chain, str, Mapping[str, Any]], None] = lambda chain, output, options: None
 
 
 def _require_mjcf(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
@@ -63,7 +59,7 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
     """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..calibration.robot_files import findings_of
+    from ..calibration.presentation.robot_files import findings_of
     from ..io.robot import urdf_files
     from ..report.provenance import file_digests
     from ..robot import urdf_edit
@@ -140,15 +136,12 @@ def _urdf_beside(fit: Result, output: str, options: Mapping[str, Any]) -> dict[P
 
 # Formats of the calibrated robot by the ending of --output.
 ROBOT_FORMATS = {
-    ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar, _any_robot),
+    ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar),
     ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF (.xml)", urdf_with_sidecar, _require_mjcf),
-    ".json": RobotOutput(
-        "LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files, _any_robot
-    ),
+    ".json": RobotOutput("LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files),
     ".ros2_control.yaml": RobotOutput(
         "joint parameters of ros2_control drivers with their URDF (.ros2_control.yaml, needs --servos)",
         ros2_control_files,
-        _any_robot,
     ),
 }
 # Endings of the files of a robot, and what they are called in the JSON document.

@@ -61,11 +61,6 @@ def existing_sidecars(robots: Sequence[str]) -> list[str]:
     return [path for path in map(existing_sidecar, robots) if path]
 
 
-def json_path(target: str | None) -> str | None:
-    """Return the file that an option --json names, if it names one."""
-    return target if target != STDOUT else None
-
-
 # Files that this process has written for the current command, for the message after an interrupt.
 _written: list[str] = []
 
@@ -86,15 +81,12 @@ def write_outputs(
     document: object,
 ) -> None:
     """Write all outputs of a command, all or none."""
-    if path := json_path(json_target):
-        contents = {**contents, path: json_text(document)}
-
-    def print_json() -> None:
-        print_to_stdout(json_text(document))
-
+    is_printed = json_target == STDOUT
+    if json_target and not is_printed:
+        contents = {**contents, json_target: json_text(document)}
     # An interrupt waits until the files are noted as written.
     with defer_signals():
-        write_files(contents, print_json if json_target == STDOUT else None)
+        write_files(contents, (lambda: print_to_stdout(json_text(document))) if is_printed else None)
         _written.extend(os.fspath(path) for path, content in contents.items() if content is not None)
 
 

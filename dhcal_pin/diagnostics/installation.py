@@ -21,8 +21,8 @@ from typing import Literal
 import numpy as np
 
 from .. import _kernels
+from ..calibration.presentation.robot_files import write_urdf
 from ..calibration.procedure import calibrate
-from ..calibration.robot_files import write_urdf
 from ..io import read_dh, read_robot, shipped_file
 from ..measurements import Noise, Pose
 from ..robot import Chain

@@ -541,7 +541,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     if missing := [key for key in ("sqrt_covariance", "unbounded_directions") if values[key] is None]:
         raise table.error(missing[0], "expected base64 text, or a table [uncertainty.information]")
     columns = {
-        key: _decode_rows(values[key], n_rows, f"{table.where}: {key}")
+        key: _as_rows(_decode(values[key], f"{table.where}: {key}"), n_rows, "<f8", f"{table.where}: {key}")
         for key in ("sqrt_covariance", "unbounded_directions", "frame_part")
         if values[key] is not None
     }
@@ -671,11 +671,6 @@ def _coefficient_indices(chain: Chain) -> dict[str, int]:
         for family in FAMILIES.values()
         for c in family.coefficients(chain, parts)
     }
-
-
-def _decode_rows(text: Any, n_rows: int, where: str) -> Array:
-    """Decode base64 text to an array of doubles with n rows."""
-    return _as_rows(_decode(text, where), n_rows, "<f8", where)
 
 
 def _decode(text: Any, where: str) -> bytes:

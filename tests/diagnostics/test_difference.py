@@ -13,7 +13,7 @@ from scipy import stats
 from sessions import ANGLE_NOISE, NOISE, Simulation
 
 from dhcal_pin import Result, calibrate, se3
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.diagnostics import Calibrated, Difference, compare
 from dhcal_pin.exceptions import InvalidArgumentError

@@ -10,9 +10,9 @@ import pytest
 from robots import URDF, robot_file
 
 from dhcal_pin import se3
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
-from dhcal_pin.calibration.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import StructuredRows

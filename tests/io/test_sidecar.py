@@ -11,7 +11,7 @@ import pytest
 from robots import write
 
 from dhcal_pin import se3
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.estimation import PARAMETER_SETS, Uncertainty
 from dhcal_pin.estimation.uncertainty import FamilyGain, ModelFit
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError

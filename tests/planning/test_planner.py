@@ -12,7 +12,7 @@ from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.exceptions import DhcalError

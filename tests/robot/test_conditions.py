@@ -11,7 +11,7 @@ import pytest
 from robots import robot_file
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import ZERO_WEIGHT, reject_groups, standardized_residuals

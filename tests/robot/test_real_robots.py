@@ -13,7 +13,7 @@ from robots import robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.estimation import PARAMETER_SETS, Problem, linearize_and_factor, qr, select_parameters
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_robot

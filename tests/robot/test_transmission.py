@@ -12,7 +12,7 @@ import pytest
 from robots import paper, random_table, robot_file, with_masses
 
 from dhcal_pin.calibration import calibrate
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import PARAMETER_SETS, select_parameters
 from dhcal_pin.estimation.batch import ChainBatch

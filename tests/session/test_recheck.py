@@ -14,7 +14,7 @@ import pytest
 from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 
 from dhcal_pin import Result, calibrate
-from dhcal_pin.calibration.robot_files import write_urdf
+from dhcal_pin.calibration.presentation.robot_files import write_urdf
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import measurement_text, read_robot, read_uncertainty

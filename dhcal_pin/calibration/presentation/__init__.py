@@ -1,4 +1,4 @@
-"""Presentation of results: plots, joint correction curves and predicted accuracy.
+"""Presentation of results: plots, joint correction curves, predicted accuracy and files of the robot.
 
 `ResultPlots` has the methods of `Result` that draw or tabulate it. What they draw is computed in `curves` and
 `workspace`, and drawn in `fit_plots` with the functions of `dhcal_pin.plots`.

@@ -71,13 +71,6 @@ POSE_TYPES: Mapping[str, Callable[[Any], _PoseSample]] = {
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
-class ConvertedBag(NamedTuple):
-    """Measurement file made from a recording."""
-
-    text: str  # Text of the CSV file
-    notes: list[str]  # Sentences on the recording
-
-
 def is_bag(path: PathLike) -> bool:
     """Return whether a path is that of a recording: by its ending, or a folder of ROS 2."""
     return os.fspath(path).lower().endswith(ENDINGS) or os.path.exists(os.path.join(path, "metadata.yaml"))
@@ -85,8 +78,8 @@ def is_bag(path: PathLike) -> bool:
 
 def convert_bag(
     path: PathLike, pose_topic: str | None, joint_topic: str | None, chain: Chain | None
-) -> ConvertedBag:
-    """Make a measurement file from the stops of a recording."""
+) -> tuple[str, list[str]]:
+    """Make the text of a measurement file from the stops of a recording; return it, and notes."""
     source = os.fspath(path)
     with _open_bag(source) as reader:
         joint_topic = _choose_joint_topic(reader, source, joint_topic)
@@ -116,7 +109,7 @@ def convert_bag(
     ]
     if stops.n_without_poses:
         notes.append(f"left out {_count_stops(stops.n_without_poses)} without a pose")
-    return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
+    return _stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes
 
 
 def read_bag_joints(path: PathLike, joint_topic: str | None) -> JointSeries:

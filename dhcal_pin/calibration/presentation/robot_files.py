@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from .._typing import PathLike
-from ..exceptions import InvalidArgumentError, RefusedCalibrationError
-from ..io.measurement_files.fitted_rows import fitted_row_digests
-from ..io.robot import urdf_files
-from ..io.sidecar import NO_FINDINGS, Findings, Fitted
-from ..robot.chain import Chain
-from ..saving import write_files
-from .result import Result
+from ..._typing import PathLike
+from ...exceptions import InvalidArgumentError, RefusedCalibrationError
+from ...io.measurement_files.fitted_rows import fitted_row_digests
+from ...io.robot import urdf_files
+from ...io.sidecar import NO_FINDINGS, Findings, Fitted
+from ...robot.chain import Chain
+from ...saving import write_files
+from ..result import Result
 
 
 def findings_of(fit: Result, digests: Sequence[str] = ()) -> Findings:
