@@ -211,6 +211,18 @@ def read_robot_or_table(path: str, args: argparse.Namespace) -> Chain:
     return read_robot(path, tip, package_dirs=args.package_dir, root=root)
 
 
+def read_mounted_rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
+    """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
+    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ..measurements.mounting import mount_rig
+
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    rig = read_rig(path) if path else calibrated
+    if rig is not None and calibrated is not None:
+        rig = with_poses_of(rig, calibrated)
+    return mount_rig(rig, chain) if rig else None
+
+
 def read_data(
     args: argparse.Namespace, chain: Chain, servos: ServoFile | None, rig: MountedRig | None = None
 ) -> list[MeasurementFile]:

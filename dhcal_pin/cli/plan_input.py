@@ -17,13 +17,12 @@ from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import read_configurations, read_targets
 from ..io.measurement_files.targets import TARGETS
-from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
 from ..io.servo_file import read_servos
 from ..io.settings import read_priors
 from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
 from ..io.tables import read_table
 from ..measurements.base import Noise
-from ..measurements.mounting import MountedRig, mount_rig
+from ..measurements.mounting import MountedRig
 from ..planning.changes import N_VISITS, change_options, repeated_count
 from ..planning.planner import MAX_CANDIDATES
 from ..planning.views import PlannedImages, with_measured_poses, with_typical_lenses
@@ -32,7 +31,7 @@ from ..robot.collision import Obstacle, obstacles_from_urdf
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.urdf import read_urdf
 from ..units import ANGLES, LENGTHS, PIXELS, parse_noise
-from .options import read_data, split_commas
+from .options import read_data, read_mounted_rig, split_commas
 from .outputs import existing_sidecars
 from .plan_options import (
     DEFAULT_IMAGE_SIGMA,
@@ -60,7 +59,7 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
     """Return the keyword arguments of `plan`, and the rows (m,) of given candidates in their file, from 0."""
     space = workspace_constraints(args)
     candidates, rows = _read_candidates(args, chain)
-    rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
+    rig = read_mounted_rig(args.rig, existing_sidecar(args.robot), chain) if args.rig else None
     servos = read_servos(args.servos) if args.servos else None
     data = [file.data for file in read_data(args, chain, servos, rig)]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
@@ -135,13 +134,6 @@ def planned_kind(args: Namespace) -> str:
         if getattr(args, option) is not None:
             raise InvalidArgumentError(f"--{option}: needs --rig, the file with cameras and boards")
     return args.kind or "pose"
-
-
-def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
-    """Return the rig of a file, with the poses of a calibrated robot where it has none."""
-    rig, sidecar = read_rig(path), existing_sidecar(robot)
-    calibrated = read_calibrated_rig(sidecar) if sidecar else None
-    return mount_rig(with_poses_of(rig, calibrated) if calibrated else rig, chain)
 
 
 def _planned_images(

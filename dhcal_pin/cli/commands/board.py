@@ -33,8 +33,7 @@ def run(args: Namespace) -> int:
     from ...io.rig_file import only_entry, read_rig
     from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
@@ -49,6 +48,6 @@ def run(args: Namespace) -> int:
             "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length "
             f"to [board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a plate."
         )
-    console.show(Screen([files_block([args.output])]), args.verbosity)
+    console.show(files_screen([args.output]), args.verbosity)
     console.print_lines(advice)
     return 0

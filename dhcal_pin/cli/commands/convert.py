@@ -70,15 +70,14 @@ def run(args: Namespace) -> int:
     from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block, notes_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     others = [path for path in (args.robot, args.template) if path]
     inputs = [args.input, *others]
     require_writable_outputs([args.output, args.json], inputs)
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=list(notes))
-    console.show(Screen([notes_block(notes), files_block([args.output])]), args.verbosity)
+    console.show(files_screen([args.output], notes), args.verbosity)
     return 0
 
 

@@ -29,13 +29,12 @@ def run(args: Namespace) -> int:
     from ...model_code import model_code, require_code_ending  # lazy import, as the following
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     require_code_ending(args.output)
     inputs = [args.robot, *existing_sidecars([args.robot])]
     require_writable_outputs([args.output, args.json], inputs)
     text = model_code(read_one_robot(args.robot, args), args.output)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs)
-    console.show(Screen([files_block([args.output])]), args.verbosity)
+    console.show(files_screen([args.output]), args.verbosity)
     return 0

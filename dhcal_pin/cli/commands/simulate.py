@@ -89,8 +89,7 @@ def run(args: Namespace) -> int:
     from ...units import parse_noise
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -126,7 +125,7 @@ def run(args: Namespace) -> int:
     facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
-    console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
+    console.show(files_screen(contents), args.verbosity)
     return 0
 
 

@@ -21,12 +21,13 @@ from ..options import (
     add_table_options,
     add_urdf_options,
     read_data,
+    read_mounted_rig,
     read_robot_or_table,
 )
 from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
-    from ...measurements import Measurement, MountedRig
+    from ...measurements import Measurement
     from ...robot import Chain
 
 OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
@@ -87,8 +88,7 @@ def run(args: Namespace) -> int:
     from ...visualization import scene
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block, notes_block, warnings_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     if args.live and (args.html or args.open or args.json):
         raise InvalidArgumentError("--live writes no page; omit --html, --open and --json")
@@ -106,7 +106,7 @@ def run(args: Namespace) -> int:
     require_endings(chosen_files(vars(args), OUTPUTS))
     chains = [read_robot_or_table(path, args) for path in robots]
     sidecar = existing_sidecar(robots[-1])
-    rig = _rig(args.rig, sidecar, chains[-1])
+    rig = read_mounted_rig(args.rig, sidecar, chains[-1])
     servos = read_servos(args.servos) if args.servos else None
     files = read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
@@ -133,23 +133,11 @@ def run(args: Namespace) -> int:
     )
     findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
-    notes = notes_block([f"{file.source}: {text}" for file in files for text in file.notes])
-    console.show(Screen([notes, warnings_block(warnings), files_block([page])]), args.verbosity)
+    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
+    console.show(files_screen([page], notes, warnings), args.verbosity)
     if args.open if args.open is not None else not args.html:
         console.open_page(page)
     return 0
-
-
-def _rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
-    """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
-    from ...io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
-    from ...measurements import mount_rig
-
-    calibrated = read_calibrated_rig(sidecar) if sidecar else None
-    rig = read_rig(path) if path else calibrated
-    if rig is not None and calibrated is not None:
-        rig = with_poses_of(rig, calibrated)
-    return mount_rig(rig, chain) if rig else None
 
 
 def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Namespace) -> int:
