@@ -40,7 +40,22 @@ class Planned:
     @cached_property
     def moves(self) -> list[str]:
         """Sentences on the moves between the poses."""
-        return _move_texts(self.plan)
+        result = self.plan
+        if not result.is_way_free:
+            return []
+        blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
+        with_way_points = [str(i) for i, way in enumerate(result.ways, 1) if len(way)]
+        texts = []
+        if with_way_points:
+            listed = ", ".join(with_way_points)
+            texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
+        if blocked:
+            texts.append(
+                f"The straight moves to poses {', '.join(blocked)} collide; no way around was found."
+            )
+        return texts or [
+            "The straight moves in joint space are free of collisions as far as these are checked."
+        ]
 
     @cached_property
     def poses_text(self) -> str:
@@ -87,21 +102,6 @@ def _counts(done: Planned) -> list[str]:
         ]
         lines.append(f"counts of pose {number}: {', '.join(counts)}")
     return lines
-
-
-def _move_texts(result: Plan) -> list[str]:
-    """Describe the moves between the poses of a plan."""
-    if not result.is_way_free:
-        return []
-    blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
-    with_way_points = [str(i) for i, way in enumerate(result.ways, 1) if len(way)]
-    texts = []
-    if with_way_points:
-        listed = ", ".join(with_way_points)
-        texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
-    if blocked:
-        texts.append(f"The straight moves to poses {', '.join(blocked)} collide; no way around was found.")
-    return texts or ["The straight moves in joint space are free of collisions as far as these are checked."]
 
 
 def _program_content(done: Planned, path: str) -> str:
@@ -162,7 +162,7 @@ def content_makers(done: Planned) -> Makers:
 
 
 def plan_document(done: Planned) -> dict[str, Any]:
-    """Create the JSON document of a plan, in SI units."""
+    """Create the JSON document of a plan, in SI units; NaN becomes null when it is written."""
     result, noise = done.plan, done.plan.information.noise
     files = paths_by_name(chosen_files(vars(done.args), OUTPUTS))
     return {
@@ -201,15 +201,10 @@ def _view_entry(view: CameraViews) -> dict[str, Any]:
         "camera": view.camera,
         "images": view.n_images,
         "covered_share": view.covered_share,
-        "distance_min_m": _or_null(view.distances[0]),
-        "distance_max_m": _or_null(view.distances[1]),
-        "angle_max_rad": _or_null(view.max_angle),
+        "distance_min_m": view.distances[0],
+        "distance_max_m": view.distances[1],
+        "angle_max_rad": view.max_angle,
     }
-
-
-def _or_null(value: float) -> float | None:
-    """Return a number, or None in place of NaN."""
-    return value if value == value else None
 
 
 def _curve(sizes: Array, errors: Array) -> list[dict[str, float]]:

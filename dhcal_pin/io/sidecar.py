@@ -272,29 +272,32 @@ _HEADER = """\
 # What the URDF cannot hold. base: pose of the robot's base link in the measuring frame.
 # tool: pose of the measured point in the tip frame. Metres; rotation vectors in radians.
 """
-_LINK_HEADER = """\
+# Comments on single tables.
+_TABLE_HEADERS = {
+    "link": """\
 # link: what the complete model adds to the origin of the joint before each link, in the frame of that origin.
 # The URDF alone is the best robot without this file; with it, robot and file are the calibrated model.
-"""
-_JOINT_HEADER = """\
+""",
+    "joint": """\
 # joint: what is added to the commanded position q of a joint, by q and the torque of gravity. harmonics:
 # k and the factors of sin(k q) and cos(k q) in radians.
-"""
-_THERMAL_HEADER = """\
+""",
+    THERMAL: """\
 # thermal: relative growth of the length of each link per kelvin above the reference temperature.
-"""
-_UNCERTAINTY_HEADER = """\
+""",
+    "uncertainty": """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
 # a prior determine; frame_part: what of both is only another pose of base or tool, which the measurements
 # leave free. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then the
 # terms. Little-endian doubles in base64. information: samples and priors from which they follow, for hundreds
 # of terms.
-"""
-_MEASURED_HEADER = """\
+""",
+    "measured": """\
 # measured: configurations that represent the measured region of joint space. A configuration is in the region
 # if its distance to one of them, in spreads of the joints, is at most the radius. The accuracy beyond it was
 # judged up to the distance `reach`. Rows: the joints.
-"""
+""",
+}
 
 
 def sidecar_path(path: PathLike) -> str:
@@ -721,12 +724,7 @@ def sidecar_text(
     has_frames = not all(np.array_equal(pose, np.eye(4)) for pose in (chain.base, tool))
     if not (required or tables or has_frames):
         return None
-    header = _HEADER
-    header += _LINK_HEADER if "link" in tables else ""
-    header += _JOINT_HEADER if "joint" in tables else ""
-    header += _THERMAL_HEADER if THERMAL in tables else ""
-    header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
-    header += _MEASURED_HEADER if "measured" in tables else ""
+    header = _HEADER + "".join(text for key, text in _TABLE_HEADERS.items() if key in tables)
     frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
     content = {
         "tip": chain.tip,

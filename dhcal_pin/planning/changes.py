@@ -57,7 +57,7 @@ def with_repeats(
 ) -> Plan:
     """Return a plan with its most informative poses at the begin, in the middle and at the end."""
     rows, none = plan.information.rows(plan.q), np.zeros(0, int)
-    candidates = CandidateSet.from_rows(rows, scale_joint_units(chain, plan.q), 0.0)
+    candidates = CandidateSet(rows, scale_joint_units(chain, plan.q), 0.0)
     chosen = select_greedily(
         candidates,
         plan.information.prior_factor,

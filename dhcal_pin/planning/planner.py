@@ -462,10 +462,8 @@ def _candidate_set(
     q, sampler, coordinates = pool.q, pool.sampler, scale_joint_units(pool.chain, pool.q)
     rows, min_distance = information.rows(q), _min_distance(coordinates, count, rng)
     if sampler is not None:
-        return CandidateSet.from_rows(
-            rows, coordinates, min_distance, lambda i: sampler.is_feasible(q[i]), bin_columns
-        )
-    candidate_set = CandidateSet.from_rows(rows, coordinates, min_distance, bin_columns=bin_columns)
+        return CandidateSet(rows, coordinates, min_distance, lambda i: sampler.is_feasible(q[i]), bin_columns)
+    candidate_set = CandidateSet(rows, coordinates, min_distance, bin_columns=bin_columns)
     if pool.images is not None:
         candidate_set.infeasible[:] = ~pool.images.in_view(pool.chain.poses(q))
     return candidate_set

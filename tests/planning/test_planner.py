@@ -112,7 +112,7 @@ def check_plan_is_better(name: str, kind: str, candidates: int, draws: int) -> N
     assert found.log_det == pytest.approx(reached, abs=0.01)
     information = found.information
     q = random_configurations(chain, candidates, 4)
-    candidate_set = CandidateSet.from_rows(information.rows(q), q)
+    candidate_set = CandidateSet(information.rows(q), q)
     scores = []
     rng = np.random.default_rng(5)
     for _ in range(draws):

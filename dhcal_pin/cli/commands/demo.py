@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, add_open_option
-from ..screens.screen import Block, Screen, Verbosity
+from ..screens.screen import Block, Screen
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
@@ -38,25 +38,15 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run experiment and simulations."""
-    from ..outputs import require_writable_outputs
-    from ..screens import console  # lazy import, as the following: they load Pinocchio
-
-    require_writable_outputs([args.json], [])
-    document = run_demo(args.out, args.json, args.verbosity)
-    if args.open:
-        console.open_page(document["files"]["report"])
-    return 0
-
-
-def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) -> dict[str, Any]:
-    """Run experiment and simulations, show the results and write all files."""
     from ...calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
     from ...formatting import Table
     from ...paper import simulations
     from ...paper.experiment import run_experiment
+    from ..outputs import require_writable_outputs
     from ..screens import console
 
-    folder = os.fspath(folder)
+    require_writable_outputs([args.json], [])
+    folder = args.out
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
@@ -77,7 +67,7 @@ def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) ->
             simulations.SIMULATION_REMARKS,
         ),
     ]
-    document = _write_results(experiment, folder, [shown, *details], json_target)
+    document = _write_results(experiment, folder, [shown, *details], args.json)
     excluded = [f"Table 5: row {item.row} is excluded: {item.reason}" for item in experiment.unreachable_rows]
     names = [os.path.basename(path) for path in document["files"].values()]
     blocks = [
@@ -86,9 +76,11 @@ def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) ->
         Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
     ]
     console.show(
-        Screen(blocks, lambda: [block for section in details for block in section.blocks()]), verbosity
+        Screen(blocks, lambda: [block for section in details for block in section.blocks()]), args.verbosity
     )
-    return document
+    if args.open:
+        console.open_page(document["files"]["report"])
+    return 0
 
 
 class _Section(NamedTuple):
