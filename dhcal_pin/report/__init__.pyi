@@ -14,6 +14,7 @@ from .json_document import validation_to_dict as validation_to_dict
 from .plan import PlanReport as PlanReport
 from .plan import plan_page as plan_page
 from .provenance import Provenance as Provenance
+from .provenance import file_digests as file_digests
 from .validation import Validation as Validation
 from .validation import validation_page as validation_page
 from .workspace_map import map_content as map_content

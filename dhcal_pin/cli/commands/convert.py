@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 
+from ... import io
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 
@@ -83,8 +84,6 @@ def run(args: Namespace) -> int:
 
 def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of a robot in another format, and notes on it."""
-    from ...io.robot import convert_robot  # lazy import: loads Pinocchio
-
     for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
         if value:
             raise InvalidArgumentError(
@@ -94,7 +93,9 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
         raise InvalidArgumentError("--robot: only for a recording; omit it")
     if args.template_tip and not args.template:
         raise InvalidArgumentError("--template-tip: needs --template, the file that it is in")
-    return convert_robot(args.input, args.output, args.tip, args.convention, args.template, args.template_tip)
+    return io.convert_robot(
+        args.input, args.output, args.tip, args.convention, args.template, args.template_tip
+    )
 
 
 def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:

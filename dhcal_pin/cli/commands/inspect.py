@@ -6,6 +6,7 @@ import os
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
+from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
 from ..options import DATA, JSON, RIG, ROBOT, add_table_options, add_urdf_options, read_one_robot
 
@@ -37,15 +38,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Show the content of files."""
-    from ...io.bundle import is_bundle  # lazy import: not for help pages
-
-    if any(map(is_bundle, args.data)):
+    if any(map(io.is_bundle, args.data)):
         return _inspect_bundle(args)
-    from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
-    from ...io.rig_file import read_rig
-    from ...io.servo_file import read_servos
-    from ...measurements.mounting import mount_rig
-    from ...report.provenance import file_digests
+    from ...measurements.mounting import mount_rig  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import inspection_screen
@@ -59,9 +54,11 @@ def run(args: Namespace) -> int:
     require_writable_outputs([args.json], inputs)
     require_workbook(args.sheet, inputs)
     chain = read_one_robot(args.robot, args) if args.robot else None
-    rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
-    servos = read_servos(args.servos) if args.servos else None
-    inspections = [inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data]
+    rig = mount_rig(io.read_rig(args.rig), chain) if args.rig and chain is not None else None
+    servos = io.read_servos(args.servos) if args.servos else None
+    inspections = [
+        diagnostics.inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data
+    ]
     robot = None
     if chain is not None:
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}
@@ -69,7 +66,7 @@ def run(args: Namespace) -> int:
         "robot": robot,
         "files": [asdict(inspection) for inspection in inspections],
         "warnings": [f"{one.path}: {text}" for one in inspections for text in one.warnings],
-        "inputs": file_digests(inputs),
+        "inputs": report.file_digests(inputs),
     }
     write_outputs({}, args.json, document)
     about = ""
@@ -81,8 +78,7 @@ def run(args: Namespace) -> int:
 
 def _inspect_bundle(args: Namespace) -> int:
     """Show what a bundle holds."""
-    from ...io.bundle import read_bundle  # lazy import, as the following: not for help pages
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_outputs  # lazy import, as the following
     from ..screens import console
     from ..screens.result_screens import bundle_screen
 
@@ -90,7 +86,7 @@ def _inspect_bundle(args: Namespace) -> int:
         raise InvalidArgumentError(f"{args.data[0]}: a bundle is inspected alone; leave out other files")
     path = args.data[0]
     require_writable_outputs([args.json], [path])
-    bundle = read_bundle(path)
+    bundle = io.read_bundle(path)
     accuracy = {
         key: value
         for key, value in bundle.result.items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from ... import planning, report
 from ...exceptions import InvalidArgumentError
 from ..options import read_one_robot
 from ..plan_options import add_arguments as add_arguments
@@ -20,9 +21,7 @@ def run(args: Namespace) -> int:
     for option in ("cube", "cycles"):
         if getattr(args, option):
             raise InvalidArgumentError(f"--{option}: needs --iso9283")
-    from ...planning import plan, with_repeats  # lazy import, as the following: they are slow to load
-    from ...programs import require_program_ending
-    from ...report.provenance import file_digests
+    from ...programs import require_program_ending  # lazy import, as the following: they load Pinocchio
     from ..arm_types import with_arm_type
     from ..output_table import file_contents
     from ..outputs import checked_files, require_workbook, write_outputs
@@ -40,10 +39,10 @@ def run(args: Namespace) -> int:
     chain = with_arm_type(read_one_robot(args.robot, args), args.arm, args.servos, args.parameters)
     given, rows = read_input(args, chain, kind)
     with console.show_progress(f"choosing {count} poses") as progress:
-        result = plan(chain, count, progress=progress, **given)
+        result = planning.plan(chain, count, progress=progress, **given)
     if n_repeated:
-        result = with_repeats(result, chain, n_repeated, given["space"], given["margin"])
-    done = Planned(result, chain, given, rows, args, file_digests(inputs))
+        result = planning.with_repeats(result, chain, n_repeated, given["space"], given["margin"])
+    done = Planned(result, chain, given, rows, args, report.file_digests(inputs))
     contents = file_contents(files, content_makers(done))
     write_outputs(contents, args.json, plan_document(done))
     console.show(plan_screen(result, done.moves, contents), args.verbosity)

@@ -6,6 +6,7 @@ import os
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
+from ... import io, report, session
 from ...exceptions import InvalidArgumentError
 from ..options import (
     DATA,
@@ -63,21 +64,16 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Check whether a robot is still calibrated, write the answer and show it."""
-    from ... import report  # lazy import, as the following: they load Pinocchio
-    from ...io import existing_sidecar, read_instrument, read_servos, robot_name
-    from ...io.check_history import Check, history_text, read_history
+    from ...io.check_history import Check, history_text, read_history  # lazy import, as the following
     from ...io.measurement_files.reading import has_image_coordinates
-    from ...io.sidecar import read_uncertainty
     from ...measurements import Noise
-    from ...report.provenance import file_digests
-    from ...session import recheck
     from ...units import parse_noise
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import recheck_screen
 
-    sidecar = existing_sidecar(args.robot)
+    sidecar = io.existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
     outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
@@ -91,27 +87,29 @@ def run(args: Namespace) -> int:
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
             "NAME.calibration.toml"
         )
-    servos = read_servos(args.servos) if args.servos else None
+    servos = io.read_servos(args.servos) if args.servos else None
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
             raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
     files = read_data(args, chain, servos)
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
-    data, known = [file.data for file in files], read_instrument(sidecar)
+    data, known = [file.data for file in files], io.read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
     known = {name: value for name, value in known.items() if name in used}
-    result = recheck(chain, data, read_uncertainty(sidecar, chain), known=known, noise=noise, size=size)
+    result = session.recheck(
+        chain, data, io.read_uncertainty(sidecar, chain), known=known, noise=noise, size=size
+    )
     now = Check.of(result, args.robot, args.data)
     document: dict[str, Any] = result.to_dict() | {
         "time": now.time,
         "robot": args.robot,
         "files": paths_by_name(outputs),
-        "inputs": file_digests(inputs),
+        "inputs": report.file_digests(inputs),
     }
     checks = [*earlier, now]
     makers: Makers = {
         "history": lambda path: history_text(checks),
-        "plot": lambda path: report.history_page(robot_name(args.robot), checks),
+        "plot": lambda path: report.history_page(io.robot_name(args.robot), checks),
     }
     contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)

@@ -8,6 +8,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
 from ..options import (
     DATA,
@@ -28,7 +29,6 @@ from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
     from ...measurements import Measurement
-    from ...robot import Chain
 
 OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
@@ -81,11 +81,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
-    from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ...io import read_servos
-    from ...io.robot import robot_name
-    from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-    from ...visualization import scene
+    from ...visualization import scene  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import files_screen
@@ -98,27 +94,27 @@ def run(args: Namespace) -> int:
         )
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
+    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{io.robot_name(args.nominal)}.html")
     settings = filter(None, (args.rig, args.columns, args.servos))
     inputs = [*robots, *sidecars, *args.data, *settings]
     require_writable_outputs([page, args.json], inputs)
     require_workbook(args.sheet, inputs)
     require_endings(chosen_files(vars(args), OUTPUTS))
     chains = [read_robot_or_table(path, args) for path in robots]
-    sidecar = existing_sidecar(robots[-1])
+    sidecar = io.existing_sidecar(robots[-1])
     rig = read_mounted_rig(args.rig, sidecar, chains[-1])
-    servos = read_servos(args.servos) if args.servos else None
+    servos = io.read_servos(args.servos) if args.servos else None
     files = read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
-    known = read_instrument(sidecar) if sidecar else {}
-    predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
+    known = io.read_instrument(sidecar) if sidecar else {}
+    predictor = io.read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
     warnings = {}
     if args.fit_frames:
         predictor = None  # The uncertainty holds for base and tool as calibrated.
-        fits = [fit_frames(chain, data, known) for chain in chains]
+        fits = [diagnostics.fit_frames(chain, data, known) for chain in chains]
         chains, known = [fit.chain for fit in fits], known | fits[-1].instruments
-    elif data and frames_differ(chains[-1], data, known):
-        warnings[robots[-1]] = [FRAMES_WARNING]
+    elif data and diagnostics.frames_differ(chains[-1], data, known):
+        warnings[robots[-1]] = [diagnostics.FRAMES_WARNING]
     if args.live:
         return _serve_live(chains, data, args)
     text = scene.scene_html(
@@ -127,7 +123,7 @@ def run(args: Namespace) -> int:
         measurements=data,
         known=known,
         predictor=predictor,
-        title=" and ".join(robot_name(path) for path in robots),
+        title=" and ".join(io.robot_name(path) for path in robots),
         magnification=args.magnification,
         triangles=args.simplify,
     )
@@ -140,7 +136,7 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Namespace) -> int:
+def _serve_live(chains: Sequence[robot.Chain], data: Sequence[Measurement], args: Namespace) -> int:
     """Play the measured poses repeatedly in a live scene."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
