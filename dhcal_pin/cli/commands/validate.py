@@ -119,12 +119,14 @@ def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
     from ...report.provenance import file_digests  # lazy import, as the following: they load Pinocchio
     from ..output_table import file_contents, paths_by_name
-    from ..outputs import checked_files, require_workbook, write_outputs
+    from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or io.existing_sidecar(args.robot)
-    inputs = _input_paths(args, sidecar)
+    nominal = [args.nominal] if args.nominal else []
+    others = filter(None, (sidecar, args.columns, args.rig, args.servos))
+    inputs = [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
     outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
     given = _read_input(args, sidecar)
@@ -179,15 +181,6 @@ def run(args: Namespace) -> int:
     screen = validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
     console.show(screen, args.verbosity)
     return 0
-
-
-def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
-    """List the files that a validation reads."""
-    from ..outputs import existing_sidecars  # lazy import: loads Pinocchio
-
-    nominal = [args.nominal] if args.nominal else []
-    others = filter(None, (sidecar, args.columns, args.rig, args.servos))
-    return [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
 
 
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
