@@ -6,7 +6,6 @@ import sys
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from ... import diagnostics
 from ...messages import message_line
 from ..options import JSON
 
@@ -22,6 +21,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Check the installation and calibrate a small robot."""
     try:
+        from ...diagnostics.installation import check_installation  # lazy import: loads Pinocchio
         from ..outputs import require_writable_outputs, write_outputs
         from ..screens import console
     except ImportError as error:
@@ -30,7 +30,7 @@ def run(args: Namespace) -> int:
 
     require_writable_outputs([args.json], [])
     checks = []
-    for check in diagnostics.check_installation():
+    for check in check_installation():
         checks.append(check)
         console.print_lines(f"{check.status:6}  {check.name}: {check.text}", style=_STYLES[check.status])
     is_working = all(check.status != "failed" for check in checks)
