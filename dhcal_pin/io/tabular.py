@@ -52,13 +52,6 @@ def unreadable(path: PathLike, error: Exception, expected: str = "a file") -> Fi
     return FileFormatError(f"{path}: cannot read it: {reason}; give the path of {expected}")
 
 
-def missing_package(source: str, files: str, package: str, extra: str, remedy: str = "") -> FileFormatError:
-    """Make the error about files that an optional package reads, which is not installed."""
-    return FileFormatError(
-        f"{source}: reading {files} needs {package}; install it with pip install 'dhcal-pin[{extra}]'{remedy}"
-    )
-
-
 def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Read a text file."""
     data = read_bytes(path, max_bytes + 1)

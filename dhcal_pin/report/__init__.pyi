@@ -9,6 +9,7 @@ from .changes import difference_page as difference_page
 from .changes import history_page as history_page
 from .context import ReportContext as ReportContext
 from .json_document import json_text as json_text
+from .json_document import main_statistics as main_statistics
 from .json_document import result_to_dict as result_to_dict
 from .json_document import validation_to_dict as validation_to_dict
 from .plan import PlanReport as PlanReport

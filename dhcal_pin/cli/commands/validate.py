@@ -24,7 +24,6 @@ from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
     from ...measurements import MeasuredRegion, Measurement, MountedRig
-    from ...report.validation import Validation
 
 # Warning about a file that the calibration fitted.
 FITTED_WARNING = "by the calibration of this robot; other measurements have larger errors"
@@ -117,8 +116,7 @@ OUTPUTS = {
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...report.provenance import file_digests  # lazy import, as the following: they load Pinocchio
-    from ..output_table import file_contents, paths_by_name
+    from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
@@ -157,7 +155,7 @@ def run(args: Namespace) -> int:
         ],
         [f"{path}: {text}" for path, texts in warnings.items() for text in texts],
         notes,
-        file_digests(inputs),
+        report.file_digests(inputs),
         characteristics,
     )
     files = paths_by_name(outputs)
@@ -230,16 +228,14 @@ def _accuracy_on_all(
     return calibration.accuracy(fit.chain, data, {**known, **fit.instruments})
 
 
-def _document(report: Validation, judged: Judged) -> dict[str, Any]:
+def _document(done: report.Validation, judged: Judged) -> dict[str, Any]:
     """Create the part of the JSON document that a calibration has, too."""
-    from ...report.json_document import main_statistics, result_to_dict, validation_to_dict  # lazy import
-
     if judged.fit:
-        document = result_to_dict(judged.fit, {}, report.inputs, is_calibration=False)
+        document = report.result_to_dict(judged.fit, {}, done.inputs, is_calibration=False)
     else:
-        document = validation_to_dict(report.chain, report.data, report.inputs, report.known)
-    before, alone = main_statistics(judged.before), main_statistics(judged.alone)
-    after = main_statistics(list(judged.accuracies.values())[-1])
+        document = report.validation_to_dict(done.chain, done.data, done.inputs, done.known)
+    before, alone = report.main_statistics(judged.before), report.main_statistics(judged.alone)
+    after = report.main_statistics(list(judged.accuracies.values())[-1])
     return document | {"before": before, "after": after, "urdf_alone": {"before": before, "after": alone}}
 
 
@@ -344,10 +340,8 @@ def _input_warnings(
     args: Namespace, given: Given, judged: Judged, sidecar: str | None
 ) -> dict[str, list[str]]:
     """List the warnings about each file, rows that the robot cannot reach included; no row is excluded."""
-    from ...report.provenance import file_digests  # lazy import: loads Pinocchio
-
     fitted = io.read_fitted(sidecar) if sidecar else io.Fitted()
-    digests = file_digests(args.data)
+    digests = report.file_digests(args.data)
     warnings = {}
     for file in given.files:
         unreachable = [] if args.fit_frames else diagnostics.find_unreachable_rows(judged.chain, file)

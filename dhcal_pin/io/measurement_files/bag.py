@@ -24,7 +24,7 @@ from ...measurements.base import Measurement
 from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...robot.chain import Chain
-from ..tabular import csv_text, missing_package, require_usable_names
+from ..tabular import csv_text, require_usable_names
 from .standstills import JointSeries, PoseSeries, Stops, find_stops
 from .writing import joint_columns, value_columns
 
@@ -148,7 +148,9 @@ def _open_bag(source: str) -> Iterator[AnyReader]:
         from rosbags.highlevel import AnyReader  # lazy import: an optional package
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise missing_package(source, "recordings", "rosbags", "bags") from None
+        raise FileFormatError(
+            f"{source}: reading recordings needs rosbags; install it with pip install 'dhcal-pin[bags]'"
+        ) from None
     if not os.path.exists(source):
         raise FileFormatError(
             f"{source}: cannot read it: no such file or folder; give the path of a recording"

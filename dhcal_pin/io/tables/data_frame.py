@@ -14,7 +14,7 @@ import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
-from ..tabular import missing_package, unreadable
+from ..tabular import unreadable
 from .table import DataTable, require_few_rows
 from .text import TextLayout, detect_decimal
 
@@ -48,8 +48,10 @@ def read_parquet(path: PathLike, layout: TextLayout) -> DataTable:
         import pyarrow  # lazy import: an optional package
         import pyarrow.parquet
     except ImportError:
-        remedy = ", or save the table as CSV"
-        raise missing_package(source, "Parquet files", "pyarrow", "parquet", remedy) from None
+        raise FileFormatError(
+            f"{source}: reading Parquet files needs pyarrow; install it with "
+            "pip install 'dhcal-pin[parquet]', or save the table as CSV"
+        ) from None
     try:
         with pyarrow.parquet.ParquetFile(source) as file:
             require_few_rows(source, file.metadata.num_rows)

@@ -16,7 +16,7 @@ from zipfile import BadZipFile, ZipFile
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError, UnknownNameError
-from ..tabular import missing_package, unreadable
+from ..tabular import unreadable
 from .table import DataTable, units_under_header
 from .text import TextLayout, detect_decimal
 
@@ -31,8 +31,10 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
         from openpyxl import load_workbook  # lazy import: an optional package
         from openpyxl.utils.exceptions import InvalidFileException
     except ImportError:
-        remedy = ", or save the sheet as CSV"
-        raise missing_package(source, "Excel files", "openpyxl", "excel", remedy) from None
+        raise FileFormatError(
+            f"{source}: reading Excel files needs openpyxl; install it with pip install 'dhcal-pin[excel]', "
+            "or save the sheet as CSV"
+        ) from None
     try:
         _require_small(path, source)
         with warnings.catch_warnings():
