@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -50,14 +50,23 @@ def bundle_content(
     )
 
 
-def with_output_paths(job: Job, change: Any) -> Job:
+def with_output_paths(job: Job, change: Callable[[str], str]) -> Job:
     """Return a job with changed paths of its outputs; standard output stays what it is."""
+    names = [
+        option.name
+        for option in fields(Job)
+        if option.name in ("output", "camera_files") or option.metadata.get("output")
+    ]
+    return with_texts(job, names, lambda path: path if path == STDOUT else change(path))
+
+
+def with_texts(job: Job, names: Iterable[str], change: Callable[[str], str]) -> Job:
+    """Return a job with changed texts of some options, each of which has one text, several or none."""
     changed: dict[str, Any] = {}
-    for option in fields(Job):
-        value = getattr(job, option.name)
-        is_path = option.name in ("output", "camera_files") or option.metadata.get("output")
-        if value and is_path:
-            paths = value if isinstance(value, tuple) else (value,)
-            new = tuple(path if path == STDOUT else change(path) for path in paths)
-            changed[option.name] = new if isinstance(value, tuple) else new[0]
+    for name in names:
+        value = getattr(job, name)
+        if isinstance(value, tuple):
+            changed[name] = tuple(map(change, value))
+        elif isinstance(value, str) and value:
+            changed[name] = change(value)
     return replace(job, **changed)

@@ -23,7 +23,7 @@ from ..io.sidecar import sidecar_path
 from ..io.tabular import read_bytes
 from ..parallel import SERIAL, TaskExecutor
 from ..report.provenance import short_names
-from .bundle_content import with_output_paths
+from .bundle_content import with_output_paths, with_texts
 from .job import Job, given_options
 from .job_outputs import companion_paths
 from .run_job import CalibrationOutcome, checked_inputs, run_job
@@ -63,7 +63,8 @@ def run_any_job(
             copy = Path(copies, name)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(read_bytes(path))
-        shown = {os.path.abspath(path): path for path in _output_files(job)}
+        outputs = [*job.output_paths, *companion_paths(job.output, job.servos is not None)]
+        shown = {os.path.abspath(path): path for path in outputs}
         moved = with_output_paths(_renamed(job, names), os.path.abspath)
         moved = replace(moved, package_dir=tuple(map(os.path.abspath, job.package_dir)))
         with chdir(copies):
@@ -120,18 +121,5 @@ def _names(inputs: Sequence[str], robot: str, folder: str | None) -> dict[str, s
 
 def _renamed(job: Job, names: Mapping[str, str]) -> Job:
     """Return a job with other paths of its inputs."""
-    changed: dict[str, Any] = {}
-    for option in fields(Job):
-        value = getattr(job, option.name)
-        if "output" in option.metadata or isinstance(value, bool | int):
-            continue
-        if isinstance(value, tuple):
-            changed[option.name] = tuple(names.get(item, item) for item in value)
-        elif value is not None:
-            changed[option.name] = names.get(value, value)
-    return replace(job, **changed)
-
-
-def _output_files(job: Job) -> list[str]:
-    """List the paths of all outputs as they are given."""
-    return [*job.output_paths, *companion_paths(job.output, job.servos is not None)]
+    inputs = [option.name for option in fields(Job) if "output" not in option.metadata]
+    return with_texts(job, inputs, lambda path: names.get(path, path))

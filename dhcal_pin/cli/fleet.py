@@ -143,21 +143,18 @@ def _require_distinct_files(entries: Sequence[FleetJob], path: PathLike) -> None
     """Require that no job writes a file that another job reads or writes."""
     folder = os.path.dirname(os.path.abspath(path))
     writers: dict[str, int] = {}
-
-    def require(is_free: bool, number: int, file: str, writer: int) -> None:
-        if not is_free:
+    uses: list[tuple[int, str, int]] = []
+    for number, entry in enumerate(entries, 1):
+        for file in _output_paths(entry.job):
+            uses.append((number, file, writers.setdefault(_real_path(folder, file), number)))
+    for number, entry in enumerate(entries, 1):
+        for file in (entry.job.robot, *entry.job.data):
+            uses.append((number, file, writers.get(_real_path(folder, file), number)))
+    for number, file, writer in uses:
+        if writer != number:
             raise FileFormatError(
                 f"{path}: job {number} uses {file}, which job {writer} writes; every job needs its own output"
             )
-
-    for number, entry in enumerate(entries, 1):
-        for file in _output_paths(entry.job):
-            writer = writers.setdefault(_real_path(folder, file), number)
-            require(writer == number, number, file, writer)
-    for number, entry in enumerate(entries, 1):
-        for file in (entry.job.robot, *entry.job.data):
-            writer = writers.get(_real_path(folder, file), number)
-            require(writer == number, number, file, writer)
 
 
 def _real_path(folder: str, path: str) -> str:

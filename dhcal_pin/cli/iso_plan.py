@@ -14,15 +14,15 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..formatting import Table
 from ..io.measurement_files import configurations_text
-from ..io.robot import read_robot
 from ..iso9283.cube import CYCLES, N_CENTRES, SIDES, IsoCube, find_iso_cube
 from ..measurements.base import Noise
 from ..programs import Program, Stop, program_text, require_program_ending
 from ..report.provenance import file_digests, versions
 from ..robot.chain import Chain
 from ..units import parse_noise
-from .output_table import Output, chosen_files, file_contents, paths_by_name, require_endings
-from .outputs import require_writable_outputs, write_outputs
+from .options import read_one_robot
+from .output_table import Makers, Output, chosen_files, file_contents, paths_by_name
+from .outputs import checked_files, write_outputs
 from .plan_input import input_paths, parse_length, workspace_constraints
 from .plan_outputs import DEGREE_DECIMALS
 from .screens import console
@@ -70,6 +70,7 @@ class IsoPlanned:
 
 
 def _poses_text(done: IsoPlanned) -> str:
+    """Return the content of the file of poses."""
     units = done.args.joint_units
     comments = [done.title, "move to P5 before the first row: every point is approached from the one before"]
     decimals = DEGREE_DECIMALS if units == "deg" else None
@@ -77,6 +78,7 @@ def _poses_text(done: IsoPlanned) -> str:
 
 
 def _program_content(done: IsoPlanned, path: str) -> str:
+    """Make the program that visits the points."""
     poses = np.tile(replace(done.chain, base=np.eye(4)).poses(done.cube.q), (done.cycles, 1, 1))
     stops = [Stop(*each) for each in zip(done.labels, done.q, poses, strict=True)]
     stops[0] = replace(stops[0], way=(done.cube.q[-1],))
@@ -84,11 +86,7 @@ def _program_content(done: IsoPlanned, path: str) -> str:
     return program_text(Program(done.chain, done.title, warning, stops), path)
 
 
-OUTPUTS: dict[str, Output[IsoPlanned]] = {
-    "output": Output(lambda done, path: _poses_text(done), "poses", (".csv",)),
-    "json": Output(None),
-    "export": Output(_program_content),
-}
+OUTPUTS = {"output": Output("poses", (".csv",)), "json": Output(), "export": Output()}
 
 
 def run_iso_plan(args: Namespace) -> int:
@@ -96,20 +94,23 @@ def run_iso_plan(args: Namespace) -> int:
     for option, name in _EXCLUDED.items():
         if getattr(args, name):
             raise InvalidArgumentError(f"{option}: not allowed with --iso9283, which states all poses")
-    inputs, files = input_paths(args), chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in files], inputs)
-    require_endings(files)
+    inputs = input_paths(args)
+    files = checked_files(args, OUTPUTS, inputs)
     for path in args.export:
         require_program_ending(path)
     sides = [parse_length(args.cube, "--cube", "a side with a unit, such as 400mm")] if args.cube else SIDES
     if sides[0] <= 0:
         raise InvalidArgumentError(f"--cube {args.cube}: expected a side above zero, such as 400mm")
     space, margin = workspace_constraints(args), Noise(*parse_noise(args.margin, "--margin"))
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    chain = read_one_robot(args.robot, args)
     with console.show_progress("looking for a cube"):
         cube = find_iso_cube(chain, sides, space, margin, args.candidates or N_CENTRES, args.seed)
     done = IsoPlanned(cube, chain, args.cycles or CYCLES, args, file_digests(inputs))
-    contents = file_contents(files, done)
+    makers: Makers = {
+        "output": lambda path: _poses_text(done),
+        "export": lambda path: _program_content(done, path),
+    }
+    contents = file_contents(files, makers)
     write_outputs(contents, args.json, _document(done))
     rows = [[f"P{i}", *(f"{1e3 * value:.3f}" for value in row)] for i, row in enumerate(done.positions, 1)]
     blocks = [

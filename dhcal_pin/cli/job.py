@@ -158,46 +158,42 @@ class Job:
     map: str | None = job_option(
         "write the predicted position uncertainty and the hold-out errors over the workspace (.csv or .html)",
         "MAP",
-        output=Output(job_outputs.map_content, "a map", (".csv", ".html")),
+        output=Output("a map", (".csv", ".html")),
     )
     scene: str | None = job_option(
         "write the 3-D scene of the nominal and the calibrated robot (.html)",
         "SCENE.html",
-        output=Output(job_outputs.scene_content, "a scene", (".html",), (".htm",)),
+        output=Output("a scene", (".html",), (".htm",)),
     )
     curves: str | None = job_option(
         "write joint corrections for controllers that accept a table: joint, value and the angle "
         "to add to it before it is commanded, in steps of 1 degree (.csv)",
         "CURVES.csv",
-        output=Output(job_outputs.curves_content, "a table of corrections", (".csv",)),
+        output=Output("a table of corrections", (".csv",)),
     )
     residuals: str | None = job_option(
         "write the residuals of all measurements with their files and lines (.csv)",
         "R.csv",
-        output=Output(
-            job_outputs.residuals_content, "a table of residuals", (".csv",), is_written_if_refused=True
-        ),
+        output=Output("a table of residuals", (".csv",), is_written_if_refused=True),
     )
     json: str | None = field(
-        default=None, metadata={**options.JSON, "output": Output(None, is_written_if_refused=True)}
+        default=None, metadata={**options.JSON, "output": Output(is_written_if_refused=True)}
     )
     report: tuple[str, ...] = job_option(
         "write a report (.html or .md); may be repeated",
         "R.html",
         default=(),
-        output=Output(
-            job_outputs.report_content, "a report", (".html", ".md"), (".htm",), is_written_if_refused=True
-        ),
+        output=Output("a report", (".html", ".md"), (".htm",), is_written_if_refused=True),
     )
     certificate: str | None = job_option(
         "write a certificate for quality records, to print or save as PDF (.html)",
         "C.html",
-        output=Output(job_outputs.certificate_content, "a certificate", (".html",), (".htm",)),
+        output=Output("a certificate", (".html",), (".htm",)),
     )
     bundle: str | None = job_option(
         "write one file with all inputs, options and outputs, which --from repeats",
         f"NAME{BUNDLE_ENDING}",
-        output=Output(None, "a bundle", (BUNDLE_ENDING,), is_written_if_refused=True),
+        output=Output("a bundle", (BUNDLE_ENDING,), is_written_if_refused=True),
     )
     meta: tuple[str, ...] = job_option(
         "fact for the certificate: robot, serial, controller, instrument, temperature, location, "
@@ -217,7 +213,7 @@ class Job:
         return cls(**{"data": (), **given})
 
     @property
-    def outputs(self) -> list[OutputFile[job_outputs.Calibrated]]:
+    def outputs(self) -> list[OutputFile]:
         """Output files except the robot."""
         rows = {option.name: option.metadata.get("output") for option in fields(self)}
         return chosen_files(vars(self), {name: output for name, output in rows.items() if output})

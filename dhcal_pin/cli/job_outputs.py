@@ -1,14 +1,12 @@
-"""Contents of the output files of a calibration job.
+"""Files of the calibrated robot that a calibration job writes, by the ending of --output.
 
-A field of `Job` that names an output file holds its `Output`; `ROBOT_FORMATS` lists the files of the robot
-itself. Functions import what they need when they are called, because help pages load no NumPy.
+Functions import what they need when they are called, because help pages load no NumPy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..exceptions import InvalidArgumentError
@@ -19,76 +17,11 @@ if TYPE_CHECKING:
     from ..calibration.result import Result
     from ..io.camera_files import CameraFrame
     from ..io.servo_file import ServoFile
-    from ..report.provenance import Provenance
     from ..robot.chain import Chain
-
-
-@dataclass(frozen=True, eq=False)
-class Calibrated:
-    """Result of a job, from which its output files are made."""
-
-    fit: Result  # Result of the calibration
-    written: Result  # The same for the joint values of the files, with corrected zeros of servos
-    source: Provenance  # Files, command and settings
-    robot: str  # Path of the nominal robot
-    reports: tuple[str, ...]  # Paths of all reports
-    meta: tuple[str, ...]  # Facts for the certificate, `KEY=VALUE` each
-
-    @cached_property
-    def report_contents(self) -> dict[PathLike, str | bytes]:
-        """Contents of all reports, which have their figures in common."""
-        from ..report.calibration_report import report_files  # lazy import: only for reports
-
-        return report_files(self.fit, self.reports, self.source)
-
-
-def map_content(done: Calibrated, path: str) -> str:
-    """Make the map of uncertainty and hold-out errors."""
-    from ..report import workspace_map  # lazy import: only for maps
-
-    return workspace_map.map_content(path, done.fit, done.fit.holdout, done.fit.instruments)
-
-
-def scene_content(done: Calibrated, path: str) -> str:
-    """Make the 3-D scene of the nominal and the calibrated robot."""
-    from ..io.robot import robot_name  # lazy import, as the following: only for scenes
-    from ..visualization import scene
-
-    return scene.scene_html(done.fit.nominal_refitted, done.fit, title=robot_name(done.robot))
-
-
-def curves_content(done: Calibrated, path: str) -> str:
-    """Make the table of joint corrections."""
-    from ..io.tabular import csv_text  # lazy import, as the following: they load NumPy
-    from ..robot.correction_table import correction_columns, joint_corrections
-
-    return csv_text(correction_columns(joint_corrections(done.written.chain)))
-
-
-def residuals_content(done: Calibrated, path: str) -> str:
-    """Make the table of all residuals."""
-    from ..io.tabular import csv_text  # lazy import: loads NumPy
-
-    return csv_text(done.fit.residuals.file_columns())
-
-
-def report_content(done: Calibrated, path: str) -> str | bytes:
-    """Make one of the reports."""
-    return done.report_contents[path]
-
-
-def certificate_content(done: Calibrated, path: str) -> str:
-    """Make the certificate."""
-    from ..report import certificate  # lazy import: only for certificates
-
-    return certificate.certificate_page(done.fit, certificate.parse_meta(done.meta), done.source)
 
 
 # Ending of the corrected servo file.
 SERVO_ENDING = ".servos.toml"
-
-
-# --- files of the robot ----------------------------------------------------------------------------
 
 
 class RobotOutput(NamedTuple):
@@ -104,11 +37,7 @@ class RobotOutput(NamedTuple):
 
     help: str
     files: Callable[[Result, str, Mapping[str, Any]], dict[PathLike, str | bytes]]
-    require: Callable[[Chain, str, Mapping[str, Any]], None]
-
-
-def _any_robot(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
-    """Accept all robots and options."""
+    require: Callable[[Chain, str, Mapping[str, Any]], None] = lambda chain, output, options: None
 
 
 def _require_mjcf(chain: Chain, output: str, options: Mapping[str, Any]) -> None:
@@ -130,9 +59,7 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
     """Make the calibrated URDF and its sidecar; base and tool are moved into the URDF on request."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ..io.measurement_files.fitted_rows import fitted_row_digests
-    from ..io.robot import urdf_files
-    from ..io.sidecar import Fitted
+    from ..io.robot import findings_of, urdf_files
     from ..report.provenance import file_digests
     from ..robot import urdf_edit
 
@@ -157,16 +84,8 @@ def urdf_with_sidecar(fit: Result, output: str, options: Mapping[str, Any]) -> d
             data = urdf_edit.with_fixed_frame(data, frame.parent, frame.name, frame.pose, "--camera-frame")
         return data
 
-    contents = urdf_files(
-        written,
-        output,
-        fit.transferable_instruments,
-        fit.uncertainty,
-        fit.measured_region,
-        edit,
-        fit.rig,
-        Fitted(list(file_digests(options["data"]).values()), fitted_row_digests(fit.data)),
-    )
+    digests = list(file_digests(options["data"]).values())
+    contents = urdf_files(written, output, findings_of(fit, digests), edit)
     if options["camera_files"]:
         from ..io.camera_files import camera_files  # lazy import: only for cameras
 
@@ -216,15 +135,12 @@ def _urdf_beside(fit: Result, output: str, options: Mapping[str, Any]) -> dict[P
 
 # Formats of the calibrated robot by the ending of --output.
 ROBOT_FORMATS = {
-    ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar, _any_robot),
+    ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar),
     ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF (.xml)", urdf_with_sidecar, _require_mjcf),
-    ".json": RobotOutput(
-        "LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files, _any_robot
-    ),
+    ".json": RobotOutput("LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files),
     ".ros2_control.yaml": RobotOutput(
         "joint parameters of ros2_control drivers with their URDF (.ros2_control.yaml, needs --servos)",
         ros2_control_files,
-        _any_robot,
     ),
 }
 # Endings of the files of a robot, and what they are called in the JSON document.

@@ -20,31 +20,32 @@ from .options import CommandParser, HelpFormatter, add_verbosity_options
 class Command(NamedTuple):
     """One command of `dhcal`."""
 
-    name: str  # Word on the command line
-    module: str  # Module of `cli.commands` with `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`
+    # Word on the command line, and module of `cli.commands` with `EXAMPLE`, `add_arguments(parser)` and
+    # `run(args) -> int`.
+    name: str
     help: str  # One line for `dhcal --help`
 
 
 COMMANDS = (
-    Command("demo", "demo", "reproduce the experiment and the simulations of the paper"),
-    Command("calibrate", "calibrate", "estimate the errors of a robot and write the corrected URDF"),
-    Command("inspect", "inspect", "say what measurement files contain, without a fit"),
-    Command("validate", "validate", "compute the accuracy of a robot model on measurements"),
-    Command("diff", "diff", "compare two calibrations of one robot"),
-    Command("recheck", "recheck", "check with a few poses whether a robot is still calibrated"),
-    Command("convert", "convert", "convert a robot file to another format, or a bag of ROS to measurements"),
-    Command("view", "view", "show the nominal and the calibrated robot on one offline web page"),
-    Command("check", "check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
-    Command("plan", "plan", "choose the poses to measure and predict the resulting accuracy"),
-    Command("simulate", "simulate", "simulate measurements of a robot with known errors"),
-    Command("compensate", "compensate", "compute joint values and targets that correct the errors"),
-    Command("export", "export", "write the calibrated model as C or Python code for other programs"),
-    Command("detect", "detect", "find the corners of boards in images and write their image coordinates"),
-    Command("board", "board", "draw a board to print, at its true scale"),
-    Command("app", "app", "serve a page on this computer that calibrates a robot from dropped files"),
-    Command("doctor", "doctor", "say what is installed and whether it works"),
-    Command("completion", "completion", "print a completion script for bash, zsh or fish"),
-    Command("study", "study", "simulate calibrations over a grid of settings"),
+    Command("demo", "reproduce the experiment and the simulations of the paper"),
+    Command("calibrate", "estimate the errors of a robot and write the corrected URDF"),
+    Command("inspect", "say what measurement files contain, without a fit"),
+    Command("validate", "compute the accuracy of a robot model on measurements"),
+    Command("diff", "compare two calibrations of one robot"),
+    Command("recheck", "check with a few poses whether a robot is still calibrated"),
+    Command("convert", "convert a robot file to another format, or a bag of ROS to measurements"),
+    Command("view", "show the nominal and the calibrated robot on one offline web page"),
+    Command("check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
+    Command("plan", "choose the poses to measure and predict the resulting accuracy"),
+    Command("simulate", "simulate measurements of a robot with known errors"),
+    Command("compensate", "compute joint values and targets that correct the errors"),
+    Command("export", "write the calibrated model as C or Python code for other programs"),
+    Command("detect", "find the corners of boards in images and write their image coordinates"),
+    Command("board", "draw a board to print, at its true scale"),
+    Command("app", "serve a page on this computer that calibrates a robot from dropped files"),
+    Command("doctor", "say what is installed and whether it works"),
+    Command("completion", "print a completion script for bash, zsh or fish"),
+    Command("study", "simulate calibrations over a grid of settings"),
 )
 
 
@@ -124,7 +125,7 @@ def command_parsers() -> dict[str, argparse.ArgumentParser]:
 
 def _parser_options(command: Command) -> dict[str, Any]:
     """Return the arguments of the parser of a command."""
-    return {"module": command.module, "description": f"{command.help[0].upper()}{command.help[1:]}."}
+    return {"module": command.name, "description": f"{command.help[0].upper()}{command.help[1:]}."}
 
 
 class _NotedInterrupt:

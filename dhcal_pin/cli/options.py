@@ -15,14 +15,14 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from ..messages import message_line
 
 if TYPE_CHECKING:
     from ..io.measurement_files import MeasurementFile
-    from ..io.robot_format import RobotFormat
     from ..io.servo_file import ServoFile
     from ..measurements.mounting import MountedRig
     from ..robot.chain import Chain
@@ -149,9 +149,13 @@ ARM: dict[str, Any] = {
     "other (default)",
 }
 SKIP_BAD_ROWS: dict[str, Any] = {
-    "help": "skip rows that lack a number or a name, instead of an error that lists them"
+    "action": "store_true",
+    "help": "skip rows that lack a number or a name, instead of an error that lists them",
 }
-FIT_FRAMES: dict[str, Any] = {"help": "fit base and tool to the measurements first"}
+FIT_FRAMES: dict[str, Any] = {
+    "action": "store_true",
+    "help": "fit base and tool to the measurements first",
+}
 MEND: dict[str, Any] = {
     "metavar": "CHANGE",
     "help": "undo a mistake in the measurements, as a refused calibration names it, such as "
@@ -185,12 +189,38 @@ def add_urdf_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
 
 
+def add_table_options(parser: argparse.ArgumentParser) -> None:
+    """Add --columns, --sheet and --servos, which say how tables of measurements are read."""
+    parser.add_argument("--columns", **COLUMNS)
+    parser.add_argument("--sheet", **SHEET)
+    parser.add_argument("--servos", **SERVOS)
+
+
+def read_one_robot(path: str, args: argparse.Namespace, sidecar: str | None = None) -> Chain:
+    """Read a robot with the options of a URDF."""
+    from ..io.robot import read_robot  # lazy import: loads Pinocchio
+
+    return read_robot(path, args.tip, sidecar, args.package_dir, args.root)
+
+
 def read_robot_or_table(path: str, args: argparse.Namespace) -> Chain:
     """Read one of several robots; the options of a URDF do not concern a DH table."""
     from ..io.robot import has_dh_table, read_robot  # lazy import: loads Pinocchio
 
     tip, root = (None, None) if has_dh_table(path) else (args.tip, args.root)
     return read_robot(path, tip, package_dirs=args.package_dir, root=root)
+
+
+def read_mounted_rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
+    """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
+    from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
+    from ..measurements.mounting import mount_rig
+
+    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    rig = read_rig(path) if path else calibrated
+    if rig is not None and calibrated is not None:
+        rig = with_poses_of(rig, calibrated)
+    return mount_rig(rig, chain) if rig else None
 
 
 def read_data(
@@ -287,71 +317,29 @@ def _error_families() -> str:
     return "; ".join(f"{name} ({FAMILIES[name].description})" for name in EXTENSIONS)
 
 
-def _losses() -> str:
-    from ..estimation.robust import LOSSES  # lazy import: loads Pinocchio
-
-    return _described(LOSSES)
-
-
-def _criteria() -> str:
-    from ..planning import CRITERIA  # lazy import: loads Pinocchio
-
-    return _described(CRITERIA)
+def _format_list(property_name: str) -> str:
+    """List the file formats of robots that have a property, with their endings."""
+    formats = (each for each in _module("io.robot").FORMATS if getattr(each, property_name))
+    return ", ".join(f"{each.name} ({', '.join(each.endings)})" for each in formats)
 
 
-def _kinds() -> str:
-    from ..measurements import KINDS  # lazy import: loads Pinocchio
-
-    return ", ".join(KINDS)
-
-
-def _plannable_kinds() -> str:
-    from ..planning import plannable_kinds  # lazy import: loads Pinocchio
-
-    return ", ".join(plannable_kinds())
-
-
-def _robot_formats() -> str:
-    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
-
-    return _format_list(robot_format for robot_format in FORMATS if robot_format.is_readable)
-
-
-def _written_formats() -> str:
-    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
-
-    return _format_list(robot_format for robot_format in FORMATS if robot_format.convert)
-
-
-def _correction_formats() -> str:
-    from ..io.robot import FORMATS  # lazy import: loads Pinocchio
-
-    return _format_list(robot_format for robot_format in FORMATS if robot_format.correct)
-
-
-def _format_list(formats: Iterable[RobotFormat]) -> str:
-    """List file formats with their endings."""
-    return ", ".join(f"{item.name} ({', '.join(item.endings)})" for item in formats)
-
-
-def _shipped_studies() -> str:
-    from ..io.shipped_files import shipped_names  # lazy import: loads Pinocchio
-
-    return ", ".join(shipped_names(".study.toml"))
+def _module(name: str) -> Any:
+    """Import a module of the package when a help page needs it; most of them load Pinocchio."""
+    return import_module(f"..{name}", __package__)
 
 
 # Text of each placeholder; called only when a help page is printed.
 PLACEHOLDERS: dict[str, Callable[[], str]] = {
-    "correction_formats": _correction_formats,
-    "criteria": _criteria,
+    "correction_formats": lambda: _format_list("correct"),
+    "criteria": lambda: _described(_module("planning").CRITERIA),
     "error_families": _error_families,
-    "kinds": _kinds,
-    "losses": _losses,
+    "kinds": lambda: ", ".join(_module("measurements").KINDS),
+    "losses": lambda: _described(_module("estimation").LOSSES),
     "parameter_sets": _parameter_sets,
-    "plannable_kinds": _plannable_kinds,
-    "robot_formats": _robot_formats,
-    "shipped_studies": _shipped_studies,
-    "written_formats": _written_formats,
+    "plannable_kinds": lambda: ", ".join(_module("planning").plannable_kinds()),
+    "robot_formats": lambda: _format_list("is_readable"),
+    "shipped_studies": lambda: ", ".join(_module("io.shipped_files").shipped_names(".study.toml")),
+    "written_formats": lambda: _format_list("convert"),
 }
 
 

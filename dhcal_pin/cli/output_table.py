@@ -1,14 +1,10 @@
-"""Table of the output files of a command: their endings and the functions that make their contents.
-
-A row belongs to an option that names one file or several. Functions import what they need when they are
-called, because help pages load no NumPy.
-"""
+"""Table of the output files of a command: a row belongs to an option that names one file or several."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ..exceptions import InvalidArgumentError
 from .options import STDOUT
@@ -16,16 +12,14 @@ from .options import STDOUT
 if TYPE_CHECKING:
     from .._typing import PathLike
 
-# What a command has done, from which its files are made.
-Done = TypeVar("Done")
+# Functions that make the content of a file for its path, by the name of the option.
+Makers = Mapping[str, Callable[[str], str | bytes]]
 
 
 @dataclass(frozen=True)
-class Output(Generic[Done]):
+class Output:
     """Output file of a command."""
 
-    # Function that makes the content for a path; None for the JSON document, which is made last.
-    content: Callable[[Done, str], str | bytes] | None
     noun: str = ""  # What the file is, in the message on an unknown ending
     endings: tuple[str, ...] = ()  # Endings of its name; any if there are none
     other_endings: tuple[str, ...] = ()  # Endings that are accepted, too
@@ -33,17 +27,17 @@ class Output(Generic[Done]):
 
 
 @dataclass(frozen=True)
-class OutputFile(Generic[Done]):
+class OutputFile:
     """File that an option names."""
 
     option: str
-    output: Output[Done]  # Its row of the table
+    output: Output  # Its row of the table
     path: str  # Path of the file; `STDOUT` for a JSON document that is printed
 
 
-def chosen_files(options: Mapping[str, Any], table: Mapping[str, Output[Done]]) -> list[OutputFile[Done]]:
+def chosen_files(options: Mapping[str, Any], table: Mapping[str, Output]) -> list[OutputFile]:
     """List the files that options name, in the order of the table."""
-    found: list[OutputFile[Done]] = []
+    found: list[OutputFile] = []
     for option, output in table.items():
         value = options[option]
         paths = value if isinstance(value, (list, tuple)) else [value] if value else []
@@ -51,7 +45,7 @@ def chosen_files(options: Mapping[str, Any], table: Mapping[str, Output[Done]]) 
     return found
 
 
-def require_endings(files: Iterable[OutputFile[Any]]) -> None:
+def require_endings(files: Iterable[OutputFile]) -> None:
     """Require that the names of files have the endings of their rows."""
     for file in files:
         endings = file.output.endings
@@ -61,12 +55,12 @@ def require_endings(files: Iterable[OutputFile[Any]]) -> None:
             )
 
 
-def file_contents(files: Iterable[OutputFile[Done]], done: Done) -> dict[PathLike, str | bytes]:
-    """Make the contents of files by path, but for the JSON document."""
-    return {file.path: file.output.content(done, file.path) for file in files if file.output.content}
+def file_contents(files: Iterable[OutputFile], makers: Makers) -> dict[PathLike, str | bytes]:
+    """Make the contents of files by path; those of options without a function are made elsewhere."""
+    return {file.path: makers[file.option](file.path) for file in files if file.option in makers}
 
 
-def paths_by_name(files: Sequence[OutputFile[Any]]) -> dict[str, str]:
+def paths_by_name(files: Sequence[OutputFile]) -> dict[str, str]:
     """Return the paths of files by option, the second and later ones of an option with their numbers."""
     found: dict[str, str] = {}
     for option in dict.fromkeys(file.option for file in files):

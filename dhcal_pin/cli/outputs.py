@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
@@ -16,6 +17,7 @@ from ..report.json_document import json_text
 from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
+from .output_table import Output, OutputFile, chosen_files, require_endings
 
 
 def is_same_file(a: str, b: str) -> bool:
@@ -46,14 +48,17 @@ def require_workbook(sheet: str, inputs: Sequence[str]) -> None:
         )
 
 
+def checked_files(args: Namespace, table: Mapping[str, Output], inputs: Sequence[str]) -> list[OutputFile]:
+    """List the files that the options of a command name, and check their paths and endings."""
+    files = chosen_files(vars(args), table)
+    require_writable_outputs([file.path for file in files], inputs)
+    require_endings(files)
+    return files
+
+
 def existing_sidecars(robots: Sequence[str]) -> list[str]:
     """List the sidecars that exist beside robot files."""
     return [path for path in map(existing_sidecar, robots) if path]
-
-
-def json_path(target: str | None) -> str | None:
-    """Return the file that an option --json names, if it names one."""
-    return target if target != STDOUT else None
 
 
 # Files that this process has written for the current command, for the message after an interrupt.
@@ -76,15 +81,12 @@ def write_outputs(
     document: object,
 ) -> None:
     """Write all outputs of a command, all or none."""
-    if path := json_path(json_target):
-        contents = {**contents, path: json_text(document)}
-
-    def print_json() -> None:
-        print_to_stdout(json_text(document))
-
+    is_printed = json_target == STDOUT
+    if json_target and not is_printed:
+        contents = {**contents, json_target: json_text(document)}
     # An interrupt waits until the files are noted as written.
     with defer_signals():
-        write_files(contents, print_json if json_target == STDOUT else None)
+        write_files(contents, (lambda: print_to_stdout(json_text(document))) if is_printed else None)
         _written.extend(os.fspath(path) for path, content in contents.items() if content is not None)
 
 

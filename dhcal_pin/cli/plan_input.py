@@ -17,13 +17,12 @@ from ..estimation.parameters import LOW_COST
 from ..exceptions import InvalidArgumentError
 from ..io.measurement_files import read_configurations, read_targets
 from ..io.measurement_files.targets import TARGETS
-from ..io.rig_file import read_calibrated_rig, read_rig, with_poses_of
 from ..io.servo_file import read_servos
 from ..io.settings import read_priors
 from ..io.sidecar import existing_sidecar, read_instrument, read_uncertainty
 from ..io.tables import read_table
 from ..measurements.base import Noise
-from ..measurements.mounting import MountedRig, mount_rig
+from ..measurements.mounting import MountedRig
 from ..planning.changes import N_VISITS, change_options, repeated_count
 from ..planning.planner import MAX_CANDIDATES
 from ..planning.views import PlannedImages, with_measured_poses, with_typical_lenses
@@ -31,8 +30,8 @@ from ..robot.chain import Chain
 from ..robot.collision import Obstacle, obstacles_from_urdf
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.urdf import read_urdf
-from ..units import ANGLES, LENGTHS, parse_noise
-from .options import read_data, split_commas
+from ..units import ANGLES, LENGTHS, PIXELS, parse_noise
+from .options import read_data, read_mounted_rig, split_commas
 from .outputs import existing_sidecars
 from .plan_options import (
     DEFAULT_IMAGE_SIGMA,
@@ -60,7 +59,7 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
     """Return the keyword arguments of `plan`, and the rows (m,) of given candidates in their file, from 0."""
     space = workspace_constraints(args)
     candidates, rows = _read_candidates(args, chain)
-    rig = _mounted_rig(args.rig, args.robot, chain) if args.rig else None
+    rig = read_mounted_rig(args.rig, existing_sidecar(args.robot), chain) if args.rig else None
     servos = read_servos(args.servos) if args.servos else None
     data = [file.data for file in read_data(args, chain, servos, rig)]
     # The uncertainty of an earlier calibration would count twice beside its data, and replaces the priors.
@@ -135,13 +134,6 @@ def planned_kind(args: Namespace) -> str:
         if getattr(args, option) is not None:
             raise InvalidArgumentError(f"--{option}: needs --rig, the file with cameras and boards")
     return args.kind or "pose"
-
-
-def _mounted_rig(path: str, robot: str, chain: Chain) -> MountedRig:
-    """Return the rig of a file, with the poses of a calibrated robot where it has none."""
-    rig, sidecar = read_rig(path), existing_sidecar(robot)
-    calibrated = read_calibrated_rig(sidecar) if sidecar else None
-    return mount_rig(with_poses_of(rig, calibrated) if calibrated else rig, chain)
 
 
 def _planned_images(
@@ -219,21 +211,21 @@ def read_task(path: PathLike, chain: Chain) -> Array:
 
 def _parse_pixels(text: str, option: str, expected: str = "pixels above zero, such as 60px") -> float:
     """Parse a positive number of pixels."""
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*px\s*", text)
-    if not match or float(match[1]) <= 0:
+    pixels = _parse_numbers(text, "#", PIXELS)
+    if pixels is None or pixels[0] <= 0:
         raise InvalidArgumentError(f"{option} {text}: expected {expected}")
-    return float(match[1])
+    return float(pixels[0])
 
 
 def _parse_distances(text: str) -> tuple[float, float]:
     """Parse the smallest and the largest distance of a board [m]."""
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*:\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
-    if not match or match[3] not in LENGTHS:
+    distances = _parse_numbers(text, "#:#", LENGTHS)
+    if distances is None:
         raise InvalidArgumentError(
             f"--distance {text}: expected the smallest and the largest distance with a unit, such as "
             "300:900mm"
         )
-    low, high = (float(match[i]) / LENGTHS[match[3]] for i in (1, 2))
+    low, high = distances.tolist()
     if not 0 <= low < high:
         raise InvalidArgumentError(
             f"--distance {text}: the first distance must be at least 0 and less than the second"
@@ -243,8 +235,8 @@ def _parse_distances(text: str) -> tuple[float, float]:
 
 def _parse_angle(text: str, option: str, largest: float, what: str = "angle") -> float:
     """Parse an angle above zero and at most some degrees [rad]."""
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*(rad|deg)\s*", text)
-    angle = float(match[1]) / ANGLES[match[2]] if match else 0.0
+    angles = _parse_numbers(text, "#", {unit: ANGLES[unit] for unit in ("rad", "deg")})
+    angle = 0.0 if angles is None else float(angles[0])
     if not 0 < angle <= np.deg2rad(largest):
         raise InvalidArgumentError(
             f"{option} {text}: invalid {what}; expected at most {largest:g}deg, such as 30deg"
@@ -263,10 +255,10 @@ def _floor(text: str | None, root: str | None) -> float | None:
 
 def parse_length(text: str, option: str, expected: str) -> float:
     """Parse a length with its unit [m]."""
-    match = re.fullmatch(rf"\s*({_NUMBER})\s*([a-zµμ]+)\s*", text)
-    if not match or match[2] not in LENGTHS:
+    lengths = _parse_numbers(text, "#", LENGTHS)
+    if lengths is None:
         raise InvalidArgumentError(f"{option} {text}: expected {expected}")
-    return float(match[1]) / LENGTHS[match[2]]
+    return float(lengths[0])
 
 
 def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
@@ -281,11 +273,23 @@ def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
 
 def _parse_points(text: str, option: str, example: str, count: int, expected: str = "x,y,z") -> Array:
     """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
-    point = rf"\s*{_NUMBER}\s*,\s*{_NUMBER}\s*,\s*{_NUMBER}\s*"
-    match = re.fullmatch(rf"({point}(?::{point}){{{count - 1}}})([a-zµμ]+)\s*", text)
-    if not match or match[2] not in LENGTHS:
+    points = _parse_numbers(text, ":".join(["#,#,#"] * count), LENGTHS)
+    if points is None:
         raise InvalidArgumentError(
             f"{option} {text}: invalid coordinates; expected {expected} with a unit at the end, such as "
             f"{example}"
         )
-    return np.array(re.findall(_NUMBER, match[1]), float).reshape(count, 3) / LENGTHS[match[2]]
+    return points.reshape(count, 3)
+
+
+def _parse_numbers(text: str, form: str, units: Mapping[str, float]) -> Array | None:
+    """Parse numbers with one unit at the end, in SI units; None if the text has another form.
+
+    The form has # in place of each number, such as #:# for 300:900mm.
+    """
+    numbers = rf"\s*({_NUMBER})\s*".join(form.split("#"))
+    match = re.fullmatch(rf"{numbers}([a-zµμ]+)\s*", text)
+    if not match or match.groups()[-1] not in units:
+        return None
+    *values, unit = match.groups()
+    return np.array(values, float) / units[unit]

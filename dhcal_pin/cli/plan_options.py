@@ -157,7 +157,7 @@ def _add_calibration_options(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--columns", **options.COLUMNS)
     parser.add_argument("--sheet", **options.SHEET)
-    parser.add_argument("--skip-bad-rows", action="store_true", **options.SKIP_BAD_ROWS)
+    parser.add_argument("--skip-bad-rows", **options.SKIP_BAD_ROWS)
 
 
 def _add_search_options(parser: ArgumentParser) -> None:

@@ -20,7 +20,7 @@ from ..planning.views import CameraViews
 from ..programs import Program, Stop, program_text
 from ..report.provenance import versions
 from ..robot.chain import Chain
-from .output_table import Output, chosen_files, paths_by_name
+from .output_table import Makers, Output, chosen_files, paths_by_name
 
 # Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
 DEGREE_DECIMALS = 4
@@ -40,7 +40,22 @@ class Planned:
     @cached_property
     def moves(self) -> list[str]:
         """Sentences on the moves between the poses."""
-        return _move_texts(self.plan)
+        result = self.plan
+        if not result.is_way_free:
+            return []
+        blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
+        with_way_points = [str(i) for i, way in enumerate(result.ways, 1) if len(way)]
+        texts = []
+        if with_way_points:
+            listed = ", ".join(with_way_points)
+            texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
+        if blocked:
+            texts.append(
+                f"The straight moves to poses {', '.join(blocked)} collide; no way around was found."
+            )
+        return texts or [
+            "The straight moves in joint space are free of collisions as far as these are checked."
+        ]
 
     @cached_property
     def poses_text(self) -> str:
@@ -89,21 +104,6 @@ def _counts(done: Planned) -> list[str]:
     return lines
 
 
-def _move_texts(result: Plan) -> list[str]:
-    """Describe the moves between the poses of a plan."""
-    if not result.is_way_free:
-        return []
-    blocked = [str(i) for i, is_free in enumerate(result.is_way_free, 1) if not is_free]
-    with_way_points = [str(i) for i, way in enumerate(result.ways, 1) if len(way)]
-    texts = []
-    if with_way_points:
-        listed = ", ".join(with_way_points)
-        texts.append(f"Way points lead around collisions to poses {listed} (--export, --html).")
-    if blocked:
-        texts.append(f"The straight moves to poses {', '.join(blocked)} collide; no way around was found.")
-    return texts or ["The straight moves in joint space are free of collisions as far as these are checked."]
-
-
 def _program_content(done: Planned, path: str) -> str:
     """Make the program that visits the poses."""
     plan = done.plan
@@ -121,7 +121,7 @@ def _program_content(done: Planned, path: str) -> str:
     return program_text(Program(done.chain, "poses to measure, by dhcal plan", warning, stops), path)
 
 
-def _report_content(done: Planned, path: str) -> str:
+def _report_content(done: Planned) -> str:
     """Make the report with the poses."""
     from ..report.plan import PlanReport, plan_page  # lazy import: only for reports
 
@@ -142,17 +142,27 @@ def _report_content(done: Planned, path: str) -> str:
     )
 
 
-OUTPUTS: dict[str, Output[Planned]] = {
-    "output": Output(lambda done, path: done.poses_text, "poses", (".csv",)),
-    "json": Output(None),
-    "export": Output(_program_content),
-    "html": Output(lambda done, path: done.scene, "a scene", (".html",), (".htm",)),
-    "report": Output(_report_content, "the report of a plan", (".html",), (".htm",)),
+OUTPUTS = {
+    "output": Output("poses", (".csv",)),
+    "json": Output(),
+    "export": Output(),
+    "html": Output("a scene", (".html",), (".htm",)),
+    "report": Output("the report of a plan", (".html",), (".htm",)),
 }
 
 
+def content_makers(done: Planned) -> Makers:
+    """Return the functions that make the output files."""
+    return {
+        "output": lambda path: done.poses_text,
+        "export": lambda path: _program_content(done, path),
+        "html": lambda path: done.scene,
+        "report": lambda path: _report_content(done),
+    }
+
+
 def plan_document(done: Planned) -> dict[str, Any]:
-    """Create the JSON document of a plan, in SI units."""
+    """Create the JSON document of a plan, in SI units; NaN becomes null when it is written."""
     result, noise = done.plan, done.plan.information.noise
     files = paths_by_name(chosen_files(vars(done.args), OUTPUTS))
     return {
@@ -191,15 +201,10 @@ def _view_entry(view: CameraViews) -> dict[str, Any]:
         "camera": view.camera,
         "images": view.n_images,
         "covered_share": view.covered_share,
-        "distance_min_m": _or_null(view.distances[0]),
-        "distance_max_m": _or_null(view.distances[1]),
-        "angle_max_rad": _or_null(view.max_angle),
+        "distance_min_m": view.distances[0],
+        "distance_max_m": view.distances[1],
+        "angle_max_rad": view.max_angle,
     }
-
-
-def _or_null(value: float) -> float | None:
-    """Return a number, or None in place of NaN."""
-    return value if value == value else None
 
 
 def _curve(sizes: Array, errors: Array) -> list[dict[str, float]]:

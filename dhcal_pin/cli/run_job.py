@@ -13,14 +13,14 @@ A job runs in these steps. Invalid input is found before anything is written.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
-from .. import io, plausibility
+from .. import io, plausibility, report, visualization
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images
@@ -46,14 +46,13 @@ from ..parallel import TaskExecutor
 from ..report.json_document import result_to_dict
 from ..report.provenance import Provenance, content_digests, file_digests, short_names
 from ..robot.chain import Chain
-from ..robot.correction_table import joint_corrections
+from ..robot.correction_table import correction_columns, joint_corrections
 from .arm_types import with_arm_type
 from .bundle_content import bundle_content
 from .job import REGION, Job
 from .job_outputs import (
     ROBOT_FORMATS,
     SERVO_ENDING,
-    Calibrated,
     companion_paths,
     name_robot_files,
     require_servos,
@@ -61,7 +60,7 @@ from .job_outputs import (
     robot_stem,
 )
 from .options import split_commas
-from .output_table import file_contents, paths_by_name, require_endings
+from .output_table import Makers, file_contents, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
     is_same_file,
@@ -82,32 +81,65 @@ NO_CORRECTIONS = (
 MAX_FILE_ROWS = 200_000
 
 
+@dataclass(frozen=True)
+class JobData:
+    """Measurements of a job, and what was found when they were read."""
+
+    fitted: dict[str, Measurement]  # Measurements that are fitted, by file
+    held_out: list[tuple[str, Measurement]]  # Hold-out measurements, each with its file
+    n_rows: dict[str, int]  # Number of rows that were read, by file
+    # Rows that the robot cannot reach, by file; excluded from everything.
+    unreachable: dict[str, list[UnreachableRow]]
+    warnings: dict[str, list[str]]  # Warnings about the input, by file
+    notes: dict[str, list[str]]  # What of the input is not used, by file
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationOutcome:
     """Result of a calibration job whose files are written."""
 
     fit: Result
-    make_document: Callable[[], dict[str, Any]]  # Function that collects the result as a JSON document
+    data: JobData
+    source: Provenance  # Files, command and settings
     robot: str  # Path of the robot; with a bundle, the names of all inputs are those in the bundle
-    settings: Mapping[str, str]  # Choices as text, by name
     files: dict[str, str]  # Paths of the files written, by what they are
-    n_rows: dict[str, int]  # Number of rows that were read, by measurement file
-    fitted: dict[str, Measurement]  # Measurements that were fitted, by file
-    held_out: list[tuple[str, Measurement]]  # Measurements that were held out, each with its file
-    # Rows that the robot cannot reach, by measurement file; excluded from everything.
-    unreachable: dict[str, list[UnreachableRow]]
     outliers: dict[str, list[int]]  # Lines of fitted outliers, by measurement file
     rejected: dict[str, list[int]]  # Lines with zero weight in the fit, by measurement file
     held_out_outliers: dict[str, list[int]]  # Lines of outliers that were held out, by measurement file
-    warnings: dict[str, list[str]]  # Warnings about the input, by file
-    notes: dict[str, list[str]]  # What of the input is not used, by file
     moved_zeros: list[str]  # How the zeros of servos move
-    hint: str  # Suggestion to use --extend; empty if there is none
 
     @cached_property
     def document(self) -> dict[str, Any]:
         """Result as a JSON document, collected on first use."""
-        return self.make_document()
+        data, source = self.data, self.source
+        rows = {
+            path: sorted(
+                [
+                    *(item.row for item in unreachable),
+                    *self.outliers.get(path, []),
+                    *self.held_out_outliers.get(path, []),
+                ]
+            )
+            for path, unreachable in data.unreachable.items()
+        }
+        rows = {path: numbers for path, numbers in rows.items() if numbers}
+        # Without the bundle, which holds the document: a repetition without one gives an equal document.
+        files = {name: path for name, path in self.files.items() if name != "bundle"}
+        document = result_to_dict(
+            self.fit, files, source.inputs, [row for numbers in rows.values() for row in numbers]
+        )
+        return document | {
+            "outliers_by_file": rows,
+            "warnings": [
+                f"{path}: {text}"
+                for by_file in (data.notes, data.warnings)
+                for path, texts in by_file.items()
+                for text in texts
+            ],
+            "command": source.command,
+            "settings": source.settings,
+            "hint": source.hint,
+        }
 
 
 def run_job(
@@ -130,15 +162,15 @@ def run_job(
     sets = job.parameters if job.parameters is not None else MIXED_SETS if job.rig else chain.parameters
     data = _read_data(chain, job, servos, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
     if job.parameters is None:
-        sets = default_sets(chain, list(data.fit.values()))
-    restrictions: dict[str, Any] = {
+        sets = default_sets(chain, list(data.fitted.values()))
+    settings: dict[str, Any] = {
+        "method": job.method,
+        "extend": None if job.extend == "auto" else job.extend,
         "bounds": read_bounds(job.bounds),
         "fix": split_commas(job.fix),
         "free": split_commas(job.free),
-    }
-    options: dict[str, Any] = {
         "priors": read_priors(job.priors),
-        "holdout": [item for _, item in data.holdout],
+        "holdout": [item for _, item in data.held_out],
         "known": read_instrument(job.instrument) if job.instrument else None,
         "loss": job.loss,
         "max_iterations": job.max_iterations,
@@ -146,9 +178,8 @@ def run_job(
         "session": "unordered" if job.unordered and job.session == "auto" else job.session,
         "executor": executor,
     }
-    measurements = list(data.fit.values())
-    _require_cameras(job, measurements)
-    fit = _calibrate(job, chain, data, restrictions, options, progress)
+    _require_cameras(job, list(data.fitted.values()))
+    fit = _calibrate(job, chain, data, settings, progress)
     on_images = fit.input_warnings
     fit = replace(
         fit,
@@ -166,19 +197,6 @@ def run_job(
 
 
 # --- input -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _JobData:
-    """Measurements of a job, and what was found when they were read."""
-
-    fit: dict[str, Measurement]  # Measurements to fit, by file
-    holdout: list[tuple[str, Measurement]]  # Hold-out measurements with their file
-    n_rows: dict[str, int]  # Number of rows that were read, by file
-    # Rows that the robot cannot reach, by file; in neither of the two.
-    unreachable: dict[str, list[UnreachableRow]]
-    warnings: dict[str, list[str]]  # Warnings about the input, by file
-    notes: dict[str, list[str]]  # What of the input is not used, by file
 
 
 def _holdout_file(job: Job) -> str | None:
@@ -215,11 +233,9 @@ def checked_inputs(job: Job) -> list[str]:
     require_writable_outputs([*job.output_paths, *companions], protected)
     require_endings(job.outputs)
     if job.meta:
-        from ..report import certificate  # lazy import: only for certificates
-
         if not job.certificate:
             raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
-        certificate.parse_meta(job.meta)
+        report.parse_meta(job.meta)
     return inputs
 
 
@@ -242,7 +258,7 @@ def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> Meas
     return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
 
 
-def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_frames: bool) -> _JobData:
+def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_frames: bool) -> JobData:
     """Read all measurements and split them by their `set` columns and by --holdout."""
     holdout_file = _holdout_file(job)
     fit: list[Measurement] = []
@@ -300,7 +316,7 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
         )
     held_out = [(path, item) for path, item in holdout if len(item.rows)]
     n_rows = {path: len(item.rows) for path, item in by_file.items()}
-    return _JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
+    return JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
 
 
 def _require_both_parts(
@@ -334,11 +350,11 @@ def _require_cameras(job: Job, data: Sequence[Measurement]) -> None:
         )
 
 
-def _held_out_images(data: _JobData) -> str:
+def _held_out_images(data: JobData) -> str:
     """Say how many images are held out and cannot determine anything; empty without images among them."""
     fitted, held_out = (
         len(partition.different_configurations([each for each in items if each.kind == "camera"])[0])
-        for items in (data.fit.values(), [item for _, item in data.holdout])
+        for items in (data.fitted.values(), [item for _, item in data.held_out])
     )
     if not held_out:
         return ""
@@ -351,21 +367,14 @@ def _held_out_images(data: _JobData) -> str:
 def _calibrate(
     job: Job,
     chain: Chain,
-    data: _JobData,
-    restrictions: Mapping[str, Any],
-    options: Mapping[str, Any],
+    data: JobData,
+    settings: Mapping[str, Any],
     progress: Progress | None,
 ) -> Result:
     """Calibrate the robot, and repeat it without each region of joint space on request."""
-    settings: dict[str, Any] = {
-        "method": job.method,
-        "extend": None if job.extend == "auto" else job.extend,
-        **restrictions,
-        **options,
-    }
     try:
         fit = procedure.calibrate(
-            chain, list(data.fit.values()), job.parameters, progress=progress, **settings
+            chain, list(data.fitted.values()), job.parameters, progress=progress, **settings
         )
     except UnknownNameError as error:
         sources = {"bounds": job.bounds, "priors": job.priors, "known": job.instrument}
@@ -389,9 +398,9 @@ def _calibrate(
     return fit
 
 
-def _add_warnings(job: Job, fit: Result, data: _JobData, sets: str, on_images: Sequence[str]) -> str:
+def _add_warnings(job: Job, fit: Result, data: JobData, sets: str, on_images: Sequence[str]) -> str:
     """Add warnings about the fit to those about the data; return the hint on joint error families."""
-    fitted = dict(zip(data.fit, fit.data, strict=True))
+    fitted = dict(zip(data.fitted, fit.data, strict=True))
     for path, texts in poorly_fitted_files(fit.chain, fitted, fit.instruments).items():
         # A warning about the columns of a file already explains a poor fit.
         data.warnings[path] += texts if not data.warnings[path] else []
@@ -403,7 +412,7 @@ def _add_warnings(job: Job, fit: Result, data: _JobData, sets: str, on_images: S
     return hint
 
 
-def _family_hint(fit: Result, data: _JobData, sets: str, job: Job) -> str:
+def _family_hint(fit: Result, data: JobData, sets: str, job: Job) -> str:
     """Suggest --extend only if there are no warnings and parameters of the robot itself are estimated."""
     is_default = job.method == "lm" and job.priors != "none" and job.extend == "none"
     if not is_default or any(data.warnings.values()) or set(split_commas(sets)) <= {"base", "tool"}:
@@ -423,7 +432,7 @@ def _write_job(
     job: Job,
     fit: Result,
     sets: str,
-    data: _JobData,
+    data: JobData,
     inputs: Sequence[str],
     hint: str,
     servos: io.ServoFile | None,
@@ -441,38 +450,20 @@ def _write_job(
         data.notes.setdefault(job.robot, []).extend(moved_zeros)
     source = _provenance(job, sets, data, inputs, contents, hint)
     files = name_robot_files(map(str, contents), job.output)
-    done = Calibrated(fit, written, source, job.robot, job.report, job.meta)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
     files = {name: shown.get(path, path) for name, path in files.items()}
-    contents |= file_contents(outputs, done)
-    outliers = dict(zip(data.fit, (rows.tolist() for rows in fit.outliers), strict=True))
+    contents |= file_contents(outputs, _content_makers(job, fit, written, source))
+    outliers = dict(zip(data.fitted, (rows.tolist() for rows in fit.outliers), strict=True))
     zero_weight = (
         item.rows[weight <= ZERO_WEIGHT] for item, weight in zip(fit.data, fit.weights, strict=True)
     )
-    rejected = dict(zip(data.fit, (rows.tolist() for rows in zero_weight), strict=True))
+    rejected = dict(zip(data.fitted, (rows.tolist() for rows in zero_weight), strict=True))
     held_out: dict[str, list[int]] = {}
-    for (path, _), rows in zip(data.holdout, fit.holdout_outliers, strict=True):
+    for (path, _), rows in zip(data.held_out, fit.holdout_outliers, strict=True):
         held_out.setdefault(path, []).extend(rows.tolist())
-    # Without the bundle, which holds the document, so that a repetition without one gives an equal document.
-    listed = {name: path for name, path in files.items() if name != "bundle"}
     outcome = CalibrationOutcome(
-        fit=fit,
-        make_document=partial(_job_document, fit, data, (outliers, held_out), listed, source),
-        robot=job.robot,
-        settings=source.settings,
-        files=files,
-        n_rows=data.n_rows,
-        fitted=data.fit,
-        held_out=data.holdout,
-        unreachable=data.unreachable,
-        outliers=outliers,
-        rejected=rejected,
-        held_out_outliers=held_out,
-        warnings=data.warnings,
-        notes=data.notes,
-        moved_zeros=moved_zeros,
-        hint=hint,
+        fit, data, source, job.robot, files, outliers, rejected, held_out, moved_zeros
     )
     if job.bundle:
         contents[job.bundle] = bundle_content(job, fit.chain, inputs, contents, outcome.document)
@@ -480,10 +471,33 @@ def _write_job(
     return outcome
 
 
+def _content_makers(job: Job, fit: Result, written: Result, source: Provenance) -> Makers:
+    """Return the functions that make the output files beside those of the robot; modules load on first use.
+
+    `written` is the result for the joint values of the files, with corrected zeros of servos.
+    """
+
+    @cache
+    def reports() -> dict[PathLike, str | bytes]:
+        # They have their figures in common.
+        return report.report_files(fit, job.report, source)
+
+    return {
+        "map": lambda path: report.map_content(path, fit, fit.holdout, fit.instruments),
+        "scene": lambda path: visualization.scene_html(
+            fit.nominal_refitted, fit, title=io.robot_name(job.robot)
+        ),
+        "curves": lambda path: io.csv_text(correction_columns(joint_corrections(written.chain))),
+        "residuals": lambda path: io.csv_text(fit.residuals.file_columns()),
+        "report": lambda path: reports()[path],
+        "certificate": lambda path: report.certificate_page(fit, report.parse_meta(job.meta), source),
+    }
+
+
 def _provenance(
     job: Job,
     sets: str,
-    data: _JobData,
+    data: JobData,
     inputs: Sequence[str],
     robot_contents: Mapping[PathLike, str | bytes],
     hint: str,
@@ -503,8 +517,8 @@ def _provenance(
         command=job.command(names),
         inputs=file_digests(inputs),
         outputs=content_digests(robot_contents),
-        names=list(data.fit),
-        holdout_names=[path for path, _ in data.holdout],
+        names=list(data.fitted),
+        holdout_names=[path for path, _ in data.held_out],
         settings=settings,
         excluded_rows={
             names[path]: {item.row: item.reason for item in rows} for path, rows in data.unreachable.items()
@@ -513,35 +527,3 @@ def _provenance(
         notes={names[path]: texts for path, texts in data.notes.items()},
         hint=hint,
     )
-
-
-def _job_document(
-    fit: Result,
-    data: _JobData,
-    outliers: Sequence[Mapping[str, Sequence[int]]],
-    files: Mapping[str, str],
-    source: Provenance,
-) -> dict[str, Any]:
-    """Create the JSON document of a job."""
-    rows = {
-        path: sorted(
-            [*(item.row for item in unreachable), *(row for rows in outliers for row in rows.get(path, []))]
-        )
-        for path, unreachable in data.unreachable.items()
-    }
-    rows = {path: numbers for path, numbers in rows.items() if numbers}
-    document = result_to_dict(
-        fit, files, source.inputs, [row for numbers in rows.values() for row in numbers]
-    )
-    return document | {
-        "outliers_by_file": rows,
-        "warnings": [
-            f"{path}: {text}"
-            for by_file in (data.notes, data.warnings)
-            for path, texts in by_file.items()
-            for text in texts
-        ],
-        "command": source.command,
-        "settings": source.settings,
-        "hint": source.hint,
-    }

@@ -1,5 +1,7 @@
 """Public names of dhcal_pin.io; `__init__.py` loads each on first use."""
 
+from .bundle import is_bundle as is_bundle
+from .bundle import read_bundle as read_bundle
 from .dh_file import dh_text as dh_text
 from .dh_file import read_dh as read_dh
 from .measurement_files import MeasurementFile as MeasurementFile
@@ -14,6 +16,11 @@ from .measurement_files import read_targets as read_targets
 from .origins_file import joint_origins as joint_origins
 from .origins_file import origin_table as origin_table
 from .origins_file import origins_text as origins_text
+from .rig_file import only_entry as only_entry
+from .rig_file import read_calibrated_rig as read_calibrated_rig
+from .rig_file import read_rig as read_rig
+from .rig_file import rig_text as rig_text
+from .rig_file import with_estimates_of as with_estimates_of
 from .robot import FORMATS as FORMATS
 from .robot import convert_robot as convert_robot
 from .robot import read_robot as read_robot
@@ -30,9 +37,12 @@ from .settings import read_bounds as read_bounds
 from .settings import read_priors as read_priors
 from .shipped_files import shipped_file as shipped_file
 from .shipped_files import shipped_names as shipped_names
+from .sidecar import Fitted as Fitted
 from .sidecar import existing_sidecar as existing_sidecar
+from .sidecar import read_fitted as read_fitted
 from .sidecar import read_instrument as read_instrument
 from .sidecar import read_measured_region as read_measured_region
+from .sidecar import read_tool as read_tool
 from .sidecar import read_uncertainty as read_uncertainty
 from .sidecar import sidecar_path as sidecar_path
 from .tabular import csv_text as csv_text

@@ -19,6 +19,7 @@ from ..cameras.rig import TIP, Camera
 from ..formatting import Quantity
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
+from .tabular import yaml_number
 
 # Names of the distortion models in ROS by lens model.
 _ROS_MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
@@ -94,15 +95,9 @@ def _matrix(camera: Camera) -> Array:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _number(value: float) -> str:
-    """Write a number that reads back exactly; readers of YAML 1.1 take 1e-05 without a point for a word."""
-    text = repr(float(value))
-    return text if "." in text else text.replace("e", ".0e")
-
-
 def _numbers(values: Array) -> str:
     """Write numbers as a YAML list."""
-    return f"[{', '.join(map(_number, values.ravel()))}]"
+    return f"[{', '.join(map(yaml_number, values.ravel()))}]"
 
 
 def _ros_matrix(name: str, values: Array) -> list[str]:
@@ -164,5 +159,5 @@ def hand_eye_text(frame: CameraFrame, position_std: float | None = None) -> str:
     lines = [*comment, "parameters:", *(f"  {key}: {json.dumps(value)}" for key, value in parameters.items())]
     lines.append("transformation:")
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    lines += [f"  {name}: {_number(value)}" for name, value in zip(names, values, strict=True)]
+    lines += [f"  {name}: {yaml_number(value)}" for name, value in zip(names, values, strict=True)]
     return "\n".join(lines) + "\n"

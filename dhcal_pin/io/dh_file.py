@@ -42,7 +42,7 @@ from . import toml_table as toml
 from .robot_format import ConvertedRobot, RobotSource
 from .sidecar import existing_sidecar
 from .tables import Column, DataTable, TextLayout, read_table
-from .tabular import parse_number, require_usable_names
+from .tabular import csv_text, parse_number, require_usable_names
 from .toml_table import Key, TomlTable
 
 # Columns of numbers with their units, those among them that are required, and the limits with their defaults.
@@ -280,14 +280,14 @@ def dh_text(table: DHTable, path: PathLike) -> str:
 
 def _csv_text(convention: str, poses: Mapping[str, Array], keys: list[str], rows: list[_Row]) -> str:
     units = {"d": "m", "a": "m", "lower": "rad|m", "upper": "rad|m"}
-    lines = [f"# convention: {convention}"]
-    for key, pose in poses.items():
-        lines.append(f"# {key}: {' '.join(map(repr, se3.position_and_rotvec(pose).tolist()))}")
-    lines.append(",".join(["joint", "type", *(f"{key}[{units.get(key, 'rad')}]" for key in keys)]))
-    for name, joint_type, values in rows:
-        cells = (repr(value) if math.isfinite(value) else "" for value in values.values())
-        lines.append(",".join([name, joint_type, *cells]))
-    return "\n".join(lines) + "\n"
+    frames = {key: " ".join(map(repr, se3.position_and_rotvec(pose).tolist())) for key, pose in poses.items()}
+    comments = [f"{key}: {text}" for key, text in ({"convention": convention} | frames).items()]
+    names, types, values = zip(*rows, strict=True)
+    columns = {
+        f"{key}[{units.get(key, 'rad')}]": [each[key] if math.isfinite(each[key]) else "" for each in values]
+        for key in keys
+    }
+    return csv_text({"joint": names, "type": types} | columns, comments)
 
 
 def _toml_text(convention: str, poses: Mapping[str, Array], keys: list[str], rows: list[_Row]) -> str:

@@ -11,17 +11,13 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from .. import se3
 from .._typing import Array, PathLike
-from ..estimation.uncertainty import Uncertainty
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError, RefusedCalibrationError
-from ..measurements.base import Measurement
-from ..measurements.measured_region import MeasuredRegion
-from ..measurements.mounting import MountedRig
 from ..messages import escape_control_characters, quote
 from ..robot.chain import Chain, without_mimics
 from ..robot.dh import Convention, DHTable
@@ -39,7 +35,7 @@ from .origins_file import convert_to_origins, joint_origins, without_negligible_
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import Fitted, existing_sidecar, sidecar_path, sidecar_text, with_sidecar
+from .sidecar import NO_FINDINGS, Findings, Fitted, existing_sidecar, sidecar_path, sidecar_text, with_sidecar
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -309,12 +305,8 @@ def with_written_origins(urdf: Urdf, origins: Mapping[str, Array], path: PathLik
 def urdf_files(
     chain: Chain,
     path: PathLike,
-    instrument: Mapping[str, float] | None = None,
-    uncertainty: Uncertainty | None = None,
-    measured_region: MeasuredRegion | None = None,
+    findings: Findings = NO_FINDINGS,
     edit: Callable[[bytes], bytes] = lambda data: data,
-    rig: MountedRig | None = None,
-    fitted: Fitted | None = None,
 ) -> dict[PathLike, str | bytes]:
     """Return the contents of a calibrated URDF and its sidecar, without writing them.
 
@@ -366,84 +358,26 @@ def urdf_files(
     is_replaced = existing_sidecar(path) is not None
     # The sidecar of an MJCF belongs to its translation.
     hashed = urdf.data if isinstance(urdf, Mjcf) else data
-    sidecar = sidecar_text(
-        chain,
-        tool,
-        hashed,
-        instrument,
-        uncertainty,
-        measured_region,
-        rig,
-        additions,
-        fitted,
-        required=is_replaced,
-    )
+    sidecar = sidecar_text(chain, tool, hashed, findings, additions, required=is_replaced)
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar
     return contents
 
 
-class Judgement(Protocol):
-    """What `write_urdf` needs of the verdict on a calibration."""
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether the calibrated robot must not be used."""
-        ...
-
-    @property
-    def reasons(self) -> Sequence[str]:
-        """Sentences."""
-        ...
+def findings_of(fit: Any, digests: Sequence[str] = ()) -> Findings:
+    """Return what a sidecar says of a `Result`; `digests` are those of the measurement files."""
+    fitted = Fitted(digests, fitted_row_digests(fit.data))
+    return Findings(fit.transferable_instruments, fit.uncertainty, fit.measured_region, fit.rig, fitted)
 
 
-class CalibratedRobot(Protocol):
-    """What `write_urdf` needs of a calibration result."""
-
-    @property
-    def verdict(self) -> Judgement:
-        """Whether the calibrated robot may be used."""
-        ...
-
-    @property
-    def chain(self) -> Chain:
-        """Calibrated chain."""
-        ...
-
-    @property
-    def transferable_instruments(self) -> Mapping[str, float]:
-        """Instrument parameters that hold for other measurements too, by name [m or rad]."""
-        ...
-
-    @property
-    def uncertainty(self) -> Uncertainty | None:
-        """Uncertainty of the calibrated chain."""
-        ...
-
-    @property
-    def measured_region(self) -> MeasuredRegion | None:
-        """Region of joint space that was measured for the calibration."""
-        ...
-
-    @property
-    def rig(self) -> MountedRig | None:
-        """Cameras and boards with their estimated poses and lenses."""
-        ...
-
-    @property
-    def data(self) -> Sequence[Measurement]:
-        """Fitted measurements."""
-        ...
-
-
-def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False) -> None:
+def write_urdf(fit: Any, path: PathLike, force: bool = False) -> None:
     """Write a calibrated URDF and its sidecar.
 
     Only the origins of joints that moved change; every other byte is that of the nominal file. `urdf_files`
     says when a sidecar is written.
 
     Args:
-        fit: Result of a calibration, or a chain alone.
+        fit: `Result` of a calibration, or a chain alone.
         path: Path of the file to write, `.urdf`; `.xml` if the nominal robot is an MJCF.
         force: Write the robot even if the verdict on its calibration is "refused".
 
@@ -461,16 +395,5 @@ def write_urdf(fit: CalibratedRobot | Chain, path: PathLike, force: bool = False
     nominal = chain.urdf.source
     if os.path.exists(path) and os.path.exists(nominal) and os.path.samefile(path, nominal):
         raise InvalidArgumentError(f"{os.fspath(path)}: is the nominal robot itself; write to another file")
-    if isinstance(fit, Chain):
-        contents = urdf_files(chain, path)
-    else:
-        contents = urdf_files(
-            chain,
-            path,
-            fit.transferable_instruments,
-            fit.uncertainty,
-            fit.measured_region,
-            rig=fit.rig,
-            fitted=Fitted(rows=fitted_row_digests(fit.data)),
-        )
-    write_files(contents)
+    findings = NO_FINDINGS if isinstance(fit, Chain) else findings_of(fit)
+    write_files(urdf_files(chain, path, findings))

@@ -272,29 +272,32 @@ _HEADER = """\
 # What the URDF cannot hold. base: pose of the robot's base link in the measuring frame.
 # tool: pose of the measured point in the tip frame. Metres; rotation vectors in radians.
 """
-_LINK_HEADER = """\
+# Comments on single tables.
+_TABLE_HEADERS = {
+    "link": """\
 # link: what the complete model adds to the origin of the joint before each link, in the frame of that origin.
 # The URDF alone is the best robot without this file; with it, robot and file are the calibrated model.
-"""
-_JOINT_HEADER = """\
+""",
+    "joint": """\
 # joint: what is added to the commanded position q of a joint, by q and the torque of gravity. harmonics:
 # k and the factors of sin(k q) and cos(k q) in radians.
-"""
-_THERMAL_HEADER = """\
+""",
+    THERMAL: """\
 # thermal: relative growth of the length of each link per kelvin above the reference temperature.
-"""
-_UNCERTAINTY_HEADER = """\
+""",
+    "uncertainty": """\
 # uncertainty: square root of the covariance of the errors, and directions that neither the measurements nor
 # a prior determine; frame_part: what of both is only another pose of base or tool, which the measurements
 # leave free. Rows: six per link (motion in m and rad; the base link's in the measuring frame), then the
 # terms. Little-endian doubles in base64. information: samples and priors from which they follow, for hundreds
 # of terms.
-"""
-_MEASURED_HEADER = """\
+""",
+    "measured": """\
 # measured: configurations that represent the measured region of joint space. A configuration is in the region
 # if its distance to one of them, in spreads of the joints, is at most the radius. The accuracy beyond it was
 # judged up to the distance `reach`. Rows: the joints.
-"""
+""",
+}
 
 
 def sidecar_path(path: PathLike) -> str:
@@ -364,6 +367,19 @@ class Fitted(NamedTuple):
 
     files: Sequence[str] = ()  # SHA-256 of the measurement files
     rows: bytes = b""  # Digests of the rows, see `fitted_rows`; empty if they are not known
+
+
+class Findings(NamedTuple):
+    """What a calibration found beside the robot itself."""
+
+    instrument: Mapping[str, float] = {}  # Instrument parameters by name [m or rad]
+    uncertainty: Uncertainty | None = None
+    measured_region: MeasuredRegion | None = None
+    rig: MountedRig | None = None  # Cameras and boards with their estimated poses and lenses
+    fitted: Fitted = Fitted()
+
+
+NO_FINDINGS = Findings()
 
 
 def read_fitted(path: PathLike) -> Fitted:
@@ -528,7 +544,7 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     if missing := [key for key in ("sqrt_covariance", "unbounded_directions") if values[key] is None]:
         raise table.error(missing[0], "expected base64 text, or a table [uncertainty.information]")
     columns = {
-        key: _decode_rows(values[key], n_rows, f"{table.where}: {key}")
+        key: _as_rows(_decode(values[key], f"{table.where}: {key}"), n_rows, "<f8", f"{table.where}: {key}")
         for key in ("sqrt_covariance", "unbounded_directions", "frame_part")
         if values[key] is not None
     }
@@ -660,11 +676,6 @@ def _coefficient_indices(chain: Chain) -> dict[str, int]:
     }
 
 
-def _decode_rows(text: Any, n_rows: int, where: str) -> Array:
-    """Decode base64 text to an array of doubles with n rows."""
-    return _as_rows(_decode(text, where), n_rows, "<f8", where)
-
-
 def _decode(text: Any, where: str) -> bytes:
     """Decode base64 text."""
     try:
@@ -693,41 +704,32 @@ def sidecar_text(
     chain: Chain,
     tool: Array,
     urdf: bytes,
-    instrument: Mapping[str, float] | None = None,
-    uncertainty: Uncertainty | None = None,
-    measured_region: MeasuredRegion | None = None,
-    rig: MountedRig | None = None,
-    additions: Mapping[str, Array] | None = None,
-    fitted: Fitted | None = None,
+    findings: Findings,
+    additions: Mapping[str, Array],
     *,
     required: bool = False,
 ) -> str | None:
     """Return the text of the sidecar of a calibrated robot."""
     tables = {
-        "link": {name: toml.pose_content(pose) for name, pose in (additions or {}).items()},
+        "link": {name: toml.pose_content(pose) for name, pose in additions.items()},
         "payload": _payload_content(chain.payload),
         "joint": _transmission_content(chain),
         **_link_content(chain),
-        "instrument": {name: float(value) for name, value in (instrument or {}).items()},
-        "uncertainty": _uncertainty_content(uncertainty),
-        "measured": _measured_content(chain, measured_region),
-        **(rig_content(rig.cameras, rig.boards) if rig else {}),
+        "instrument": {name: float(value) for name, value in findings.instrument.items()},
+        "uncertainty": _uncertainty_content(findings.uncertainty),
+        "measured": _measured_content(chain, findings.measured_region),
+        **(rig_content(rig.cameras, rig.boards) if (rig := findings.rig) else {}),
     }
     tables = {key: table for key, table in tables.items() if table}
     has_frames = not all(np.array_equal(pose, np.eye(4)) for pose in (chain.base, tool))
     if not (required or tables or has_frames):
         return None
-    header = _HEADER
-    header += _LINK_HEADER if "link" in tables else ""
-    header += _JOINT_HEADER if "joint" in tables else ""
-    header += _THERMAL_HEADER if THERMAL in tables else ""
-    header += _UNCERTAINTY_HEADER if "uncertainty" in tables else ""
-    header += _MEASURED_HEADER if "measured" in tables else ""
+    header = _HEADER + "".join(text for key, text in _TABLE_HEADERS.items() if key in tables)
     frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
     content = {
         "tip": chain.tip,
         **frames,
-        "manifest": _manifest_content(urdf, chain.tip, fitted or Fitted()),
+        "manifest": _manifest_content(urdf, chain.tip, findings.fitted),
         **tables,
     }
     # tomli_w writes each number on a line of its own; one line per harmonic is easier to read.

@@ -123,6 +123,12 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
+def yaml_number(value: float) -> str:
+    """Write a number that reads back exactly; readers of YAML 1.1 take 1e-05 without a point for a word."""
+    text = repr(float(value))
+    return text if "." in text else text.replace("e", ".0e")
+
+
 def csv_text(columns: Mapping[str, Iterable[Any]], comments: Iterable[str] = ()) -> str:
     """Return the text of a CSV file."""
     out = io.StringIO()

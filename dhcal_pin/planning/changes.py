@@ -23,7 +23,7 @@ from ..robot.sampling import WorkspaceConstraints, limits_with_margin, scale_joi
 from .criteria import DOptimality
 from .exchange import CandidateSet, select_greedily
 from .planner import Plan
-from .tour import find_way, is_move_free
+from .tour import connected
 
 # Sizes of changes that a check must reveal [m, rad].
 CHANGE = Noise(5e-4, np.deg2rad(0.05))
@@ -57,7 +57,7 @@ def with_repeats(
 ) -> Plan:
     """Return a plan with its most informative poses at the begin, in the middle and at the end."""
     rows, none = plan.information.rows(plan.q), np.zeros(0, int)
-    candidates = CandidateSet.from_rows(rows, scale_joint_units(chain, plan.q), 0.0)
+    candidates = CandidateSet(rows, scale_joint_units(chain, plan.q), 0.0)
     chosen = select_greedily(
         candidates,
         plan.information.prior_factor,
@@ -72,11 +72,11 @@ def with_repeats(
     limits = limits_with_margin(chain, margin.rotation, margin.position)
     checker = CollisionChecker.from_chain(chain, space.environment)
     ways, is_free, rng = [plan.q[:0]], [True], np.random.default_rng(0)
+    can_turn = np.zeros(chain.n_joints, bool)
     for start, end in zip(plan.q[order[:-1]], plan.q[order[1:]], strict=True):
-        is_direct = is_move_free(checker, start, end)
-        way = plan.q[:0] if is_direct else find_way(checker, start, end, *limits, rng)
+        _, way, is_this_free = connected(checker, start, end[None], *limits, can_turn, rng)
         ways.append(way)
-        is_free.append(is_direct or len(way) > 0)
+        is_free.append(is_this_free)
     firsts = np.flatnonzero(order == chosen[0]) + 1
     ranges = [str(i) if n_repeated == 1 else f"{i} to {i + n_repeated - 1}" for i in firsts]
     return replace(

@@ -76,7 +76,7 @@ def _larger_plan(goal: DesignGoal, found: Selection, plan_rows: Array) -> Array:
     gains[found.selected] = -np.inf
     promising = np.argsort(-gains)[: min(exchange.MAX_EXCHANGE_CANDIDATES, int(np.isfinite(gains).sum()))]
     # The plan's poses come first and are feasible.
-    extended = exchange.CandidateSet.from_rows(
+    extended = exchange.CandidateSet(
         np.concatenate([plan_rows, candidates.rows[:, :, promising]], 2),
         np.concatenate([coordinates, candidates.coordinates[promising]]),
         candidates.min_distance,

@@ -48,11 +48,6 @@ def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
     return lapack.dtrtri(r)[0]
 
 
-def _always_feasible(_: int) -> bool:
-    """Accept every candidate."""
-    return True
-
-
 @dataclass(frozen=True, eq=False)
 class CandidateSet:
     """Candidates of a design."""
@@ -64,24 +59,16 @@ class CandidateSet:
     coordinates: Array
     min_distance: float = 0.0  # Smallest distance of two selected candidates
     # Expensive test of a candidate by its index; called only for candidates that are about to be selected.
-    is_feasible: Callable[[int], bool] = _always_feasible
+    is_feasible: Callable[[int], bool] = lambda candidate: True
     # Columns of the coordinates that are joint values whose bins are filled evenly; none by default.
-    bin_columns: Array = field(default_factory=lambda: np.zeros(0, int))
+    bin_columns: Array | Sequence[int] = field(default_factory=lambda: np.zeros(0, int))
     # Candidates that failed the test so far, shape (m,); updated in place.
     infeasible: Array = field(default_factory=lambda: np.zeros(0, bool))
 
-    @classmethod
-    def from_rows(
-        cls,
-        rows: Array,
-        coordinates: Array,
-        min_distance: float = 0.0,
-        is_feasible: Callable[[int], bool] = _always_feasible,
-        bin_columns: Sequence[int] | Array = (),
-    ) -> CandidateSet:
-        """Create a set of candidates of which none is known to be infeasible."""
-        columns, infeasible = np.array(bin_columns, int), np.zeros(rows.shape[2], bool)
-        return cls(rows, coordinates, min_distance, is_feasible, columns, infeasible)
+    def __post_init__(self) -> None:
+        """Take all candidates as feasible until one fails the test."""
+        if not self.infeasible.size:
+            object.__setattr__(self, "infeasible", np.zeros(self.rows.shape[2], bool))
 
     def rows_of(self, selected: Array) -> Array:
         """Return the rows of selected candidates."""

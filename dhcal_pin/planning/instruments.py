@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -48,51 +47,12 @@ class PresentModel:
     values: Array  # Values of the s instrument parameters, shape (s,) [m, rad, px or 1]
 
 
-class Instrument(Protocol):
-    """Source of the measurements that are planned."""
-
-    @property
-    def noise(self) -> Noise:
-        """Standard deviations that measurements of different configurations do not share [m, rad]."""
-        ...
-
-    @property
-    def position_sigma(self) -> float:
-        """Standard deviation along each axis of a position by this instrument [m]."""
-        ...
-
-    @property
-    def assumption(self) -> str:
-        """What is assumed about this instrument, for messages; empty if all of it is stated."""
-        ...
-
-    def template(self, chain: Chain, q: Array) -> Measurement:
-        """Return measurements whose instrument parameters have initial values."""
-        ...
-
-    def jacobians(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute the whitened Jacobian of measurements."""
-        ...
-
-    def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute derivatives of d coordinates of the measured points by errors and instrument parameters.
-
-        Their shapes are (p, d, m) and (s, d, m) [m]. The sum of their squares is the mean square over the
-        measured points.
-        """
-        ...
-
-    def frame_displacements(self, model: PresentModel, q: Array) -> Array:
-        """Compute derivatives (c, d, m) of these coordinates by poses that have no meaning for the task."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class SimulatedInstrument:
     """Instrument of a kind of measurement, in a sensible place."""
 
     kind: type[Measurement]
-    noise: Noise  # Standard deviations of a measurement [m, rad]
+    noise: Noise  # Standard deviations that measurements of different configurations do not share [m, rad]
 
     @property
     def position_sigma(self) -> float:
@@ -101,7 +61,7 @@ class SimulatedInstrument:
 
     @property
     def assumption(self) -> str:
-        """What is assumed about this instrument."""
+        """What is assumed about this instrument, for messages; empty if all of it is stated."""
         return self.kind.simulated_instrument
 
     def template(self, chain: Chain, q: Array) -> Measurement:
@@ -118,13 +78,17 @@ class SimulatedInstrument:
         return by_errors, data.instrument_jacobian(frames, u)
 
     def displacements(self, model: PresentModel, q: Array) -> tuple[Array, Array]:
-        """Compute displacements of the tool point in the measuring frame."""
+        """Compute derivatives of d coordinates of the measured points by errors and instrument parameters.
+
+        Their shapes are (p, d, m) and (s, d, m) [m]. The sum of their squares is the mean square over the
+        measured points: here the tool point in the measuring frame.
+        """
         frames = model.chain.forward_kinematics(q)
         jacobian = model.chain.tool_jacobian(frames, model.bodies, model.twists)[:, :3]
         return jacobian, np.zeros((len(model.values), 3, len(q)))
 
     def frame_displacements(self, model: PresentModel, q: Array) -> Array:
-        """Compute displacements of the tool point by poses of base and tool."""
+        """Compute derivatives (c, d, m) of these coordinates by poses of base and tool."""
         return position_frame_effects(model.chain, q).transpose(2, 1, 0)
 
 
@@ -326,3 +290,7 @@ class _End:
             linear=np.hstack([self.linear, rotation @ by_points[:3]]),
             angular=np.hstack([self.angular, rotation @ by_points[3:]]),
         )
+
+
+# Source of the measurements that are planned.
+Instrument = SimulatedInstrument | CameraInstrument

@@ -30,6 +30,7 @@ from ..estimation.qr import null_space
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, Noise
+from ..measurements.camera import CameraCorners
 from ..plausibility.signs import simulate_decision
 from ..plots import plot_plan_curve
 from ..robot.chain import Chain
@@ -42,10 +43,10 @@ from .exchange import CandidateSet, compute_sqrt_covariance, improve_by_exchange
 from .information import Information, PlannedCalibration, add_joint_scatter
 from .named_criteria import CriterionOption, parse_criterion
 from .refinement import DesignGoal, Selection, refine
-from .sources import ImageSource, MeasurementSource, ToolSource
 from .task_error import TaskError
 from .tour import find_tour
-from .views import CameraViews, PlannedImages
+from .view_sampler import ViewSampler
+from .views import CameraViews, PlannedImages, summarize_views
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -241,18 +242,27 @@ def plan(
     next(phases)
     rng = np.random.default_rng(seed)
     margin, space = margin or Noise(MARGIN_LENGTH, MARGIN_ANGLE), space or WorkspaceConstraints()
-    source = ToolSource(kind) if images is None else ImageSource(images)
-    pool = _collect_pool(chain, source, candidates, task, space, margin, rng)
+    pool = _collect_pool(chain, images, candidates, task, space, margin, rng)
     if option.omitted_sets and noise is not None:
         noise = add_joint_scatter(chain, pool.q, noise)
     planned = PlannedCalibration(
-        chain, source.kind, noise, parameters, priors, fix, free, data, known or {}, prior_uncertainty, images
+        chain,
+        CameraCorners.kind if images else kind,
+        noise,
+        parameters,
+        priors,
+        fix,
+        free,
+        data,
+        known or {},
+        prior_uncertainty,
+        images,
     )
     bin_columns = _bin_columns(chain, criterion) if fills_bins else np.zeros(0, int)
     searched = _without_curves(planned) if fills_bins else planned
     goal, candidate_set, notes = _prepare(searched, pool, option, bin_columns, count, rng)
     next(phases)
-    candidate_set, greedy = _select(goal, candidate_set, count, source)
+    candidate_set, greedy = _select(goal, candidate_set, count, images)
     next(phases)
     prior_factor = goal.full_information.prior_factor
     selected = improve_by_exchange(candidate_set, prior_factor, greedy, goal.criterion, goal.existing)
@@ -310,7 +320,7 @@ class _Pool:
         chain: Nominal robot.
         q: Joint positions, shape (m, n) [rad or m].
         task_q: Joint positions of the task, shape (t, n) [rad or m].
-        source: What is measured in them.
+        images: Cameras and boards; a board must be in view. None for other measurements of the tool.
         sampler: Sampler that has drawn them; None if they are given.
         collision: Collision checks of the robot.
         notes: What is not checked and why.
@@ -319,7 +329,7 @@ class _Pool:
     chain: Chain
     q: Array
     task_q: Array
-    source: MeasurementSource
+    images: PlannedImages | None
     sampler: ConfigurationSampler | None
     collision: CollisionChecker
     notes: tuple[str, ...]
@@ -327,7 +337,7 @@ class _Pool:
 
 def _collect_pool(
     chain: Chain,
-    source: MeasurementSource,
+    images: PlannedImages | None,
     candidates: int | Array,
     task: Array | None,
     space: WorkspaceConstraints,
@@ -339,16 +349,16 @@ def _collect_pool(
         q = chain.validated_q(candidates)
         task_q = q if task is None else chain.validated_q(task)
         checker = CollisionChecker.from_chain(chain, space.environment)
-        return _Pool(chain, q, task_q, source, None, checker, (checker.note,) if checker.note else ())
+        return _Pool(chain, q, task_q, images, None, checker, (checker.note,) if checker.note else ())
     everywhere = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
-    sampler = source.restrict(everywhere)
+    sampler = ViewSampler.from_sampler(everywhere, images) if images else everywhere
     q = sampler.draw(candidates, rng)
     if task is None:
         above_floor = replace(everywhere, workspace=WorkspaceConstraints(floor=space.floor))
         task_q = above_floor.draw(N_TASK_SAMPLES, rng)
     else:
         task_q = chain.validated_q(task)
-    return _Pool(chain, q, task_q, source, sampler, sampler.collision, sampler.notes)
+    return _Pool(chain, q, task_q, images, sampler, sampler.collision, sampler.notes)
 
 
 def _bin_columns(chain: Chain, criterion: str) -> Array:
@@ -452,11 +462,10 @@ def _candidate_set(
     q, sampler, coordinates = pool.q, pool.sampler, scale_joint_units(pool.chain, pool.q)
     rows, min_distance = information.rows(q), _min_distance(coordinates, count, rng)
     if sampler is not None:
-        return CandidateSet.from_rows(
-            rows, coordinates, min_distance, lambda i: sampler.is_feasible(q[i]), bin_columns
-        )
-    candidate_set = CandidateSet.from_rows(rows, coordinates, min_distance, bin_columns=bin_columns)
-    candidate_set.infeasible[:] = ~pool.source.can_measure(pool.chain.poses(q))
+        return CandidateSet(rows, coordinates, min_distance, lambda i: sampler.is_feasible(q[i]), bin_columns)
+    candidate_set = CandidateSet(rows, coordinates, min_distance, bin_columns=bin_columns)
+    if pool.images is not None:
+        candidate_set.infeasible[:] = ~pool.images.in_view(pool.chain.poses(q))
     return candidate_set
 
 
@@ -478,7 +487,7 @@ def _min_distance(coordinates: Array, count: int, rng: np.random.Generator) -> f
 
 
 def _select(
-    goal: DesignGoal, candidates: CandidateSet, count: int, source: MeasurementSource
+    goal: DesignGoal, candidates: CandidateSet, count: int, images: PlannedImages | None
 ) -> tuple[CandidateSet, Array]:
     """Select candidates greedily, near ones only if there are no others; return candidates and selection."""
     prior_factor, criterion, existing = goal.full_information.prior_factor, goal.criterion, goal.existing
@@ -488,9 +497,10 @@ def _select(
         candidates = replace(candidates, min_distance=0.0)
         greedy = select_greedily(candidates, prior_factor, count - len(greedy), criterion, greedy, existing)
     if len(greedy) < count:
+        condition = "; a board must be in view, and nothing may hide it" if images else ""
         raise InvalidArgumentError(
             f"only {len(greedy)} of {candidates.rows.shape[2]} candidates are feasible; expected at least "
-            f"{count}: relax the constraints or use more candidates{source.condition}"
+            f"{count}: relax the constraints or use more candidates{condition}"
         )
     return candidates, greedy
 
@@ -570,5 +580,5 @@ def _in_order_of_tour(plan: Plan, pool: _Pool, limits: tuple[Array, Array], rng:
         index=None if plan.index is None else plan.index[tour.order],
         ways=tour.ways,
         is_way_free=() if pool.collision.geometry is None else tour.is_way_free,
-        views=pool.source.summarize(pool.chain.poses(tour.q)),
+        views=summarize_views(pool.images, pool.chain.poses(tour.q)) if pool.images else (),
     )

@@ -70,7 +70,7 @@ def refine(
     for round_number in range(N_ROUNDS):
         nearby = sampler.perturb(q, STEP * SHRINK_FACTOR**round_number, N_NEIGHBOURS, rng)
         is_feasible = lambda i, nearby=nearby: sampler.is_feasible(nearby[i])  # noqa: E731
-        candidates = CandidateSet.from_rows(
+        candidates = CandidateSet(
             information.rows(nearby), scale_joint_units(sampler.chain, nearby), min_distance, is_feasible
         )
         candidates.infeasible[:] = ~sampler.in_workspace(nearby)

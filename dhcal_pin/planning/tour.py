@@ -72,12 +72,10 @@ def find_tour(
     longest = max(range(len(parts)), key=lambda i: parts[i][1] - parts[i][0])
     ways, is_way_free = [q[:0]] * len(q), [True] * len(q)
     for first, end in parts[longest + 1 :]:
-        found = _connected(checker, q[first - 1], q[first:end], low, high, can_turn, rng)
+        found = connected(checker, q[first - 1], q[first:end], low, high, can_turn, rng)
         q[first:end], ways[first], is_way_free[first] = found
     for first, end in parts[:longest][::-1]:
-        part, way, is_way_free[end] = _connected(
-            checker, q[end], q[first:end][::-1], low, high, can_turn, rng
-        )
+        part, way, is_way_free[end] = connected(checker, q[end], q[first:end][::-1], low, high, can_turn, rng)
         q[first:end], ways[end] = part[::-1], way[::-1]
     return Tour(order, q, tuple(ways), tuple(is_way_free))
 
@@ -123,7 +121,7 @@ def _order_with_fewest_collisions(q: Array, checker: CollisionChecker) -> tuple[
     return best, best_is_free
 
 
-def _connected(
+def connected(
     checker: CollisionChecker,
     start: Array,
     part: Array,

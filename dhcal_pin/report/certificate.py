@@ -5,6 +5,7 @@ The user states as metadata what the calibration does not know: serial number, i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from ..exceptions import InvalidArgumentError
 from ..saving import write_files
 from .calibration_report import calibration_document
 from .context import ReportContext
-from .html import check_html_ending, html_certificate
+from .html import html_certificate, is_html
 from .provenance import Provenance, short_names, versions
 
 # Metadata that a quality record usually needs, in their order; others follow.
@@ -44,7 +45,8 @@ def write_certificate(
             `META_LABELS` for the keys with labels. Other keys are their own labels.
         source: Files, hashes and settings, which a result does not contain.
     """
-    check_html_ending(path, "a certificate")
+    if not is_html(path):
+        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write a certificate as .html")
     write_files({path: certificate_page(fit, meta or {}, source or Provenance())})
 
 

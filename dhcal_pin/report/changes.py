@@ -37,10 +37,10 @@ def difference_table(difference: Difference) -> Table:
 def difference_page(names: Sequence[str], difference: Difference, inputs: Mapping[str, str]) -> str:
     """Render the page of a difference of two robot files."""
     table = difference_table(difference)
+    joints = [[name, f"{value:.0f}"] for name, value in difference.joints.items()]
+    tables = [table, *([Table(["joint", "part of chi-square"], joints)] if joints else [])]
     sections = [
-        Section(
-            "difference", "Distance of the tools", difference.sentences, tables=[table, *_joints(difference)]
-        ),
+        Section("difference", "Distance of the tools", difference.sentences, tables=tables),
         Section("map", "Over the workspace", figures=partial(_maps, difference)),
         Section("scene", "Both robots", figures=partial(_scene, difference)),
         Section("provenance", "Provenance", tables=origin_tables(inputs)),
@@ -48,12 +48,6 @@ def difference_page(names: Sequence[str], difference: Difference, inputs: Mappin
     title = f"Difference of {names[0]} and {names[1]}"
     values = [("", row[0], f"{row[1]} RMS") for row in table.texts]
     return html_page(Document(title, sections, heading=difference.verdict, eyebrow=title, values=values))
-
-
-def _joints(difference: Difference) -> list[Table]:
-    """Return a table of the joints that differ."""
-    rows = [[name, f"{value:.0f}"] for name, value in difference.joints.items()]
-    return [Table(["joint", "part of chi-square"], rows)] if rows else []
 
 
 def _maps(difference: Difference) -> list[FigureGroup]:

@@ -290,7 +290,8 @@ def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array)
     panels = []
     median, p95 = (Quantity.error(float(np.quantile(finite, q)), "m") for q in (0.5, 0.95))
     # Both sorts of maps fit into the scale, except for a few large errors, which may be outliers.
-    both = plots.std_levels(workspace.std), plots.std_levels(_without_largest(errors))
+    most = np.sort(errors)[: math.ceil(0.95 * len(errors))]
+    both = plots.std_levels(workspace.std), plots.std_levels(most)
     levels = max(both, key=lambda edges: edges[-1])
     region = np.concatenate([workspace.points, points])
     for plane, view in (("xy", "from above"), ("xz", "from the side")):
@@ -327,11 +328,6 @@ def level_legend(levels: Array) -> list[LegendEntry]:
 def plane_points(plane: str) -> tuple[str, ...]:
     """Return the coordinates of samples in a plane of the base frame, such as "xy"."""
     return tuple(f"base:{'xyz'.index(axis)}" for axis in plane)
-
-
-def _without_largest(errors: Array) -> Array:
-    """Return the errors (m,) without the largest 5 %."""
-    return np.sort(errors)[: math.ceil(0.95 * len(errors))]
 
 
 def scene_figures(context: ReportContext) -> list[FigureGroup]:

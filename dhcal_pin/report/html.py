@@ -10,7 +10,6 @@ import os
 
 from .. import formatting
 from .._typing import PathLike
-from ..exceptions import InvalidArgumentError
 from ..plots import svg_panels
 from .document import Document, Panel
 
@@ -18,12 +17,6 @@ from .document import Document, Panel
 def is_html(path: PathLike) -> bool:
     """Return whether a path has the ending of an HTML file."""
     return os.fspath(path).lower().endswith((".html", ".htm"))
-
-
-def check_html_ending(path: PathLike, content: str) -> None:
-    """Raise an error if a path is not that of an HTML file."""
-    if not is_html(path):
-        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; write {content} as .html")
 
 
 def html_page(document: Document) -> str:

@@ -207,13 +207,9 @@ def result_samples(fit: Result, data_names: Sequence[str], holdout_names: Sequen
         role=np.where(table.is_holdout, "hold-out", "fitted"),
         is_outlier=table.is_outlier,
     ).take(table.file_order)
-    texts = {"residuals.csv": residuals_text(fit, samples.file), "parameters.csv": parameters_text(fit)}
-    return replace(samples, downloads=texts)
-
-
-def residuals_text(fit: Result, names: Array) -> str:
-    """Render the residuals of a calibration as CSV, as --residuals writes them."""
-    return csv_text(fit.residuals.file_columns() | {"file": names.tolist()})
+    # As --residuals writes them.
+    residuals = csv_text(table.file_columns() | {"file": samples.file.tolist()})
+    return replace(samples, downloads={"residuals.csv": residuals, "parameters.csv": parameters_text(fit)})
 
 
 def parameters_text(fit: Result) -> str:

@@ -416,10 +416,6 @@ def _outlier_section(context: ReportContext) -> Section:
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 
 
-def _sample_section(context: ReportContext) -> Section:
-    return samples.samples_section(context.samples)
-
-
 def _scene_section(context: ReportContext) -> Section:
     draw = partial(figures.scene_figures, context)
     return Section("scene", "Nominal and calibrated robot", figures=draw)
@@ -554,7 +550,7 @@ SECTIONS: Sequence[tuple[Callable[[ReportContext], Section | None], Sequence[Ren
     (_parameter_section, _REPORT),
     (_observability_section, _REPORT),
     (_outlier_section, _REPORT),
-    (_sample_section, _REPORT),
+    (lambda context: samples.samples_section(context.samples), _REPORT),
     (_provenance_section, _REPORT),
     (_numbers_section, ("terminal",)),
     (_definition_section, ("terminal",)),

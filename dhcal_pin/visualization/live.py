@@ -30,7 +30,7 @@ from ..calibration.result import Result
 from ..exceptions import DhcalError
 from ..robot.chain import Chain
 from .meshes import Visuals, visuals_of
-from .scene import MAX_TRIANGLES, kinematic_tree, with_shared_frames
+from .scene import MAX_TRIANGLES, kinematic_tree, reach, with_shared_frames
 
 # Longest time for one command of the server [ms].
 TIMEOUT_MS = 2000
@@ -85,7 +85,7 @@ def serve(
         view = meshcat.Visualizer(window=window)[name]
         view.set_transform(se3.inverse(arm.base))
         _draw(view, STYLES[name], visuals, len(bodies) - 1)
-    size = float(np.linalg.norm(arm.origins[:, :3, 3], axis=1).sum())
+    size = reach(arm)
     page = meshcat.Visualizer(window=window)
     page["/Cameras/default/rotated/<object>"].set_property("position", [0.7 * size, 0.4 * size, 0.8 * size])
     page["/Background"].set_property("top_color", [0.97, 0.98, 0.99])

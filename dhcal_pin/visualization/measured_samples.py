@@ -59,34 +59,28 @@ def measured_samples(
     sets: Sequence[Array],
 ) -> MeasuredSamples:
     """Collect the measured positions and their residuals."""
-    n = arms[0].n_joints
-    parts: dict[str, list[Array]] = {
-        "q": [np.empty((0, n))],
-        "points": [np.empty((0, 3))],
-        "residuals": [np.empty((0, 3))],
-        "nominal_residuals": [np.empty((0, 3))],
-        "sets": [np.empty(0, int)],
-        "files": [np.empty(0, object)],
-        "lines": [np.empty(0, int)],
-    }
+    nothing = np.empty((0, 3))
+    parts = [
+        MeasuredSamples(
+            q=np.empty((0, arms[0].n_joints)),
+            points=nothing,
+            residuals=nothing,
+            nominal_residuals=nothing,
+            sets=np.empty(0, int),
+            files=np.empty(0, object),
+            lines=np.empty(0, int),
+        )
+    ]
     for item, item_sets in zip(measurements, sets, strict=True):
-        if not len(item.positions()):
-            continue
-        before, after = (
-            _position_residuals(chain, item, values) for chain, values in zip(arms, known, strict=True)
-        )
-        columns = (
-            arms[0].validated_q(item.q),
-            item.positions(),
-            after,
-            before,
-            item_sets,
-            np.full(len(item.rows), Path(item.source).name, object),
-            item.rows,
-        )
-        for part, column in zip(parts.values(), columns, strict=True):
-            part.append(column)
-    return MeasuredSamples(**{name: np.concatenate(part) for name, part in parts.items()})
+        if len(item.positions()):
+            before, after = (
+                _position_residuals(chain, item, values) for chain, values in zip(arms, known, strict=True)
+            )
+            files = np.full(len(item.rows), Path(item.source).name, object)
+            q = arms[0].validated_q(item.q)
+            parts.append(MeasuredSamples(q, item.positions(), after, before, item_sets, files, item.rows))
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return MeasuredSamples(*map(np.concatenate, columns))
 
 
 def _position_residuals(chain: Chain, item: Measurement, known: Mapping[str, float]) -> Array:

@@ -159,14 +159,10 @@ def _load_visuals(
             ElementTree.SubElement(single, "link", name="single").append(visual)
             single_text = ElementTree.tostring(single, "unicode")
             name = "a shape" if mesh is None else mesh.get("filename", "")
-            if name in too_large or not _can_load(single_text, folders):
+            if name in too_large or _load_geometry(_build_model(single_text), single_text, folders) is None:
                 link.remove(visual)
                 missing.setdefault(link.get("name", ""), []).append(name)
     return _load_geometry(model, ElementTree.tostring(robot, "unicode"), folders) or [], missing
-
-
-def _can_load(text: str, folders: Sequence[str]) -> bool:
-    return _load_geometry(_build_model(text), text, folders) is not None
 
 
 def _build_model(text: str) -> pin.Model:

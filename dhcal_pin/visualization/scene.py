@@ -46,7 +46,7 @@ from ..subsampling import evenly_spaced_indices
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .rig_lines import rig_lines
-from .uncertainty_cells import UncertaintyCells, uncertainty_cells
+from .uncertainty_cells import uncertainty_cells
 
 # Largest number of measured points and of configurations to play; more would make the page slow.
 MAX_POINTS = 2000
@@ -128,8 +128,7 @@ def scene_html(
         )
     if triangles < MIN_TRIANGLES:
         raise InvalidArgumentError(f"{triangles} triangles: expected at least {MIN_TRIANGLES}")
-    nominal_known = known
-    sets = None
+    nominal_known, sets = known, None
     if isinstance(calibrated, Result):
         predictor, rig = predictor or calibrated, rig or calibrated.rig
         if measurements is None:
@@ -195,9 +194,11 @@ def scene_html(
         "sets": drawn.sets.tolist(),
         "files": drawn.files.tolist(),
         "lines": drawn.lines.tolist(),
-        "rig": rig_lines(rig, base, _reach(shown)) if rig else {"parts": [], "rays": []},
+        "rig": rig_lines(rig, base, reach(shown)) if rig else {"parts": [], "rays": []},
         "ellipsoids": ellipsoids,
-        "cells": _cells_data(cells) if cells else None,
+        "cells": {"size": cells.size, "index": cells.index.tolist(), "std": np.round(cells.std, 9).tolist()}
+        if cells
+        else None,
         "shapes": visuals.shapes,
         "meshes": [mesh.encoded() for mesh in (*visuals.meshes, *obstacle_meshes)],
         **tree,
@@ -213,7 +214,7 @@ def scene_html(
     return re.sub(marks, lambda mark: replacements[mark[0]], PAGE.read_text("utf-8"))
 
 
-def _reach(chain: Chain) -> float:
+def reach(chain: Chain) -> float:
     """Return the sum of the lengths of the links [m]."""
     return float(np.linalg.norm(chain.origins[:, :3, 3], axis=1).sum())
 
@@ -396,15 +397,6 @@ def _sliders(chain: Chain, configurations: Array) -> list[dict[str, Any]]:
     columns = (chain.joint_names, is_prismatic, lower.tolist(), upper.tolist(), start.tolist())
     keys = ("name", "is_prismatic", "lower", "upper", "start")
     return [dict(zip(keys, values, strict=True)) for values in zip(*columns, strict=True)]
-
-
-def _cells_data(cells: UncertaintyCells) -> dict[str, Any]:
-    """Return the cells for the page."""
-    return {
-        "size": cells.size,
-        "index": cells.index.tolist(),
-        "std": np.round(cells.std, 9).tolist(),
-    }
 
 
 def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]:

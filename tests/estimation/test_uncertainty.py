@@ -20,7 +20,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.io.dh_file import read_dh
 from dhcal_pin.io.robot import read_robot, write_urdf
-from dhcal_pin.io.sidecar import read_uncertainty, sidecar_path, sidecar_text
+from dhcal_pin.io.sidecar import Findings, read_uncertainty, sidecar_path, sidecar_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.pose import Pose
 from dhcal_pin.measurements.position import Position
@@ -110,7 +110,7 @@ def test_errors_that_the_model_lacks_are_added_and_kept_in_the_sidecar(ur10, tmp
     expected = np.diag([4e-8, 4e-8, 4e-8, 9e-8, 9e-8, 9e-8])
     np.testing.assert_allclose(added, np.tile(expected, (20, 1, 1)), atol=1e-15)
     urdf = robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes()
-    text = sidecar_text(plain.chain, np.eye(4), urdf, uncertainty=with_model)
+    text = sidecar_text(plain.chain, np.eye(4), urdf, Findings(uncertainty=with_model), {})
     assert text is not None
     (tmp_path / "arm.calibration.toml").write_text(text)
     known = read_uncertainty(tmp_path / "arm.calibration.toml", plain.chain)

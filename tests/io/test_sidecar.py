@@ -20,9 +20,9 @@ from dhcal_pin.io import (
     read_robot,
     read_uncertainty,
     urdf_files,
-    write_urdf,
 )
-from dhcal_pin.io.sidecar import sidecar_text
+from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io.sidecar import Findings, sidecar_text
 from dhcal_pin.measurements import MeasuredRegion
 from dhcal_pin.robot import Transmission
 from dhcal_pin.robot.error_families import JOINT_TERMS
@@ -65,7 +65,9 @@ def test_elasticity_of_a_joint_that_gravity_does_not_load_is_read_back(tmp_path)
     arm = arm.with_transmission(Transmission.zero(arm.loads))
     root = np.random.default_rng(0).normal(size=(6 * 7 + 6, 3))
     known = Uncertainty(arm, terms, root, root[:, :0])
-    path = write(tmp_path, "a.toml", sidecar_text(arm, np.eye(4), arm.urdf.data, uncertainty=known) or "")
+    path = write(
+        tmp_path, "a.toml", sidecar_text(arm, np.eye(4), arm.urdf.data, Findings(uncertainty=known), {}) or ""
+    )
     read = read_uncertainty(path, arm)
     assert read is not None
     np.testing.assert_array_equal(read.entries, terms)
@@ -86,7 +88,7 @@ def test_an_invalid_sidecar_is_an_error(tmp_path, text, words, scara):
 
 def test_sidecar_text_is_toml(scara):
     urdf = b'<robot name="r"><link name="a &quot;b&quot;"/></robot>'
-    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), urdf, required=True)
+    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), urdf, Findings(), {}, required=True)
     assert text is not None
     content = tomllib.loads(text)
     assert set(content) == {"tip", "base", "tool", "manifest"}
@@ -107,7 +109,7 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     known = Uncertainty(scara, np.array([], int), rows[0], rows[1], fit=stated)
     q = np.random.default_rng(1).normal(size=(9, scara.n_joints))
     region = MeasuredRegion.from_configurations(q, scara.is_prismatic).with_reach(q, q.T > 0)
-    for path, content in urdf_files(scara, tmp_path / "out.urdf", values, known, region).items():
+    for path, content in urdf_files(scara, tmp_path / "out.urdf", Findings(values, known, region)).items():
         write(tmp_path, str(path), content)
     side = tmp_path / "out.calibration.toml"
     assert {name: value.hex() for name, value in read_instrument(side).items()} == {

@@ -16,11 +16,11 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import dh_text, read_robot
 from dhcal_pin.io.makers.ur_kinematics import (
-    _yaml_number,
     read_ur_kinematics,
     ur_kinematics,
     ur_kinematics_text,
 )
+from dhcal_pin.io.tabular import yaml_number
 from dhcal_pin.robot import Chain, DHTable
 
 FACTORY = DATA / "ur_factory/ur10_delta_dh.csv"
@@ -124,7 +124,7 @@ def test_written_files_are_read_back(tmp_path):
 @pytest.mark.parametrize("value", [1e-5, -1e-5, 1e-300, 5e-324, 1.0000000000000002e-7, 1e16, 1e22, 0.25, 0.0])
 def test_written_numbers_are_numbers_of_yaml(tmp_path, value):
     """YAML 1.1 reads 1e-05 as a text."""
-    entry = "".join(f"\n    {key}: {_yaml_number(value)}" for key in ("x", "y", "z", "roll", "pitch", "yaw"))
+    entry = "".join(f"\n    {key}: {yaml_number(value)}" for key in ("x", "y", "z", "roll", "pitch", "yaw"))
     assert yaml.safe_load(f"shoulder: {entry}")["shoulder"]["x"] == value
 
 

@@ -65,7 +65,7 @@ def test_criterion_decides_between_equally_even_designs():
     rng = np.random.default_rng(3)
     q = np.deg2rad(10 * rng.integers(0, 4, (14, 2)))
     rows = rng.standard_normal((4, 2, 14)) * rng.lognormal(size=14)
-    candidates = CandidateSet.from_rows(rows, q, bin_columns=[0, 1])
+    candidates = CandidateSet(rows, q, bin_columns=[0, 1])
     existing, start = np.deg2rad([[0.0, 30.0]]), np.zeros(0, int)
     selected = select_greedily(candidates, np.eye(4), 5, DOptimality(), start, existing)
     selected = improve_by_exchange(candidates, np.eye(4), selected, DOptimality(), existing)

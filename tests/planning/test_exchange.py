@@ -21,7 +21,7 @@ NONE = np.empty((0, 1))
 def draw_candidates(p: int, k: int, m: int, seed: int = 0) -> CandidateSet:
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((p, k, m)) * rng.lognormal(size=m)
-    return CandidateSet.from_rows(rows, np.arange(m, dtype=float)[:, None])
+    return CandidateSet(rows, np.arange(m, dtype=float)[:, None])
 
 
 def information(candidates: CandidateSet, selected) -> np.ndarray:
@@ -118,9 +118,7 @@ def test_exchange_comes_close_to_the_best_of_all_sets(name, seed):
 def test_infeasible_and_close_candidates_are_not_selected():
     rng = np.random.default_rng(0)
     coordinates = rng.uniform(0, 1, (200, 2))
-    candidates = CandidateSet.from_rows(
-        rng.standard_normal((5, 2, 200)), coordinates, 0.15, lambda i: i % 3 > 0
-    )
+    candidates = CandidateSet(rng.standard_normal((5, 2, 200)), coordinates, 0.15, lambda i: i % 3 > 0)
     selection = select_greedily(candidates, np.eye(5), 8, DOptimality(), np.zeros(0, int), coordinates[:1])
     selection = improve_by_exchange(candidates, np.eye(5), selection, DOptimality(), coordinates[:1])
     assert (selection % 3 > 0).all()
@@ -130,9 +128,7 @@ def test_infeasible_and_close_candidates_are_not_selected():
 
 
 def test_fewer_are_selected_if_no_more_are_feasible():
-    candidates = CandidateSet.from_rows(
-        draw_candidates(5, 2, 20).rows, np.zeros((20, 1)), 0.0, lambda i: i < 3
-    )
+    candidates = CandidateSet(draw_candidates(5, 2, 20).rows, np.zeros((20, 1)), 0.0, lambda i: i < 3)
     assert sorted(select_greedily(candidates, np.eye(5), 8, DOptimality(), np.zeros(0, int), NONE)) == [
         0,
         1,
@@ -145,9 +141,7 @@ def test_weak_priors_do_not_cost_digits():
     candidates = draw_candidates(5, 3, 10)
     scaled = np.concatenate([1e8 * candidates.rows[:3], candidates.rows[3:]])
     selected = np.arange(6)
-    root = compute_sqrt_covariance(
-        np.eye(5), CandidateSet.from_rows(scaled, candidates.coordinates).rows_of(selected)
-    )
+    root = compute_sqrt_covariance(np.eye(5), CandidateSet(scaled, candidates.coordinates).rows_of(selected))
     wide = information(candidates, selected) - np.eye(5) + np.diag([1e-16] * 3 + [1.0] * 2)
     expected = -(np.linalg.slogdet(wide)[1] + 2 * 3 * np.log(1e8)) / 5
     assert DOptimality().value(root) == pytest.approx(expected, rel=1e-9)

@@ -15,7 +15,8 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_configurations, read_robot, read_uncertainty, write_urdf
+from dhcal_pin.io import read_configurations, read_robot, read_uncertainty
+from dhcal_pin.io.robot import write_urdf
 from dhcal_pin.measurements import (
     KINDS,
     Inclination,
@@ -111,7 +112,7 @@ def check_plan_is_better(name: str, kind: str, candidates: int, draws: int) -> N
     assert found.log_det == pytest.approx(reached, abs=0.01)
     information = found.information
     q = random_configurations(chain, candidates, 4)
-    candidate_set = CandidateSet.from_rows(information.rows(q), q)
+    candidate_set = CandidateSet(information.rows(q), q)
     scores = []
     rng = np.random.default_rng(5)
     for _ in range(draws):

@@ -2,6 +2,7 @@
 
 Each module has `EXAMPLE`, `add_arguments(parser)` and `run(args)`, and a row of `COMMANDS` in `cli/main.py`.
 
-Modules import only light modules at their top; everything that loads NumPy or Pinocchio is imported inside
-functions ("lazy import"), so that help pages and argument errors appear at once.
+Modules import only light modules at their top, and packages that load their public names on first use, such
+as `io`. Everything else that loads NumPy or Pinocchio is imported inside functions ("lazy import"), so that
+help pages and argument errors appear at once.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
+from ... import detection, io
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, RIG
 
@@ -29,19 +30,16 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Draw a board."""
-    from ...detection import board_pdf  # lazy import, as the following
-    from ...io.rig_file import only_entry, read_rig
-    from ..outputs import require_writable_outputs, write_with_json
+    from ..outputs import require_writable_outputs, write_with_json  # lazy import, as the following
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
         raise InvalidArgumentError(f"{args.output}: unknown ending; write the board as .pdf")
-    rig = read_rig(args.rig)
-    board = only_entry(rig.boards, args.board, "board", args.rig)
-    page = board_pdf(board, args.paper)
+    rig = io.read_rig(args.rig)
+    board = io.only_entry(rig.boards, args.board, "board", args.rig)
+    page = detection.board_pdf(board, args.paper)
     write_with_json({args.output: page}, args.json, {"output": args.output}, [args.rig], board=board.name)
     advice = "Print it at 100 %, without fitting it to the page, and measure a square afterwards."
     if args.paper:
@@ -49,6 +47,6 @@ def run(args: Namespace) -> int:
             "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length "
             f"to [board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a plate."
         )
-    console.show(Screen([files_block([args.output])]), args.verbosity)
+    console.show(files_screen([args.output]), args.verbosity)
     console.print_lines(advice)
     return 0

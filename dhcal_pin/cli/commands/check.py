@@ -5,7 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
-from ..options import JSON, ROBOT, add_urdf_options
+from ... import paper
+from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal check arm.dh.toml"
 
@@ -19,14 +20,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Compute the Jacobian in several ways and show the differences."""
-    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ...paper.jacobian_check import crosscheck
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_outputs  # lazy import, as the following
     from ..screens import console
     from ..screens.result_screens import crosscheck_screen
 
     require_writable_outputs([args.json], [args.robot])
-    rows = crosscheck(read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root))
+    rows = paper.crosscheck(read_one_robot(args.robot, args))
     all_agree = all(row.agrees for row in rows)
     routes = [asdict(row) | {"agrees": row.agrees} for row in rows]
     write_outputs({}, args.json, {"agree": all_agree, "routes": routes})

@@ -8,15 +8,14 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ... import io, robot
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, ROBOT, add_motion_options, add_urdf_options, read_robot_or_table
 
 if TYPE_CHECKING:
     from ..._typing import Array
     from ...compensation import Compensation
-    from ...io import TargetPoses
     from ...programs import Program
-    from ...robot import Chain
 
 EXAMPLE = "dhcal compensate ur10.urdf ur10_calibrated.urdf targets.csv --tip tool0 -o corrected.csv"
 
@@ -65,7 +64,6 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Correct targets, write them, and show which could not be reached."""
     from ...compensation import compensate  # lazy import, as the following: they load Pinocchio
-    from ...io import read_targets
     from ...programs import program_text, require_program_ending
     from ..output_table import numbered
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
@@ -79,7 +77,7 @@ def run(args: Namespace) -> int:
     for path in args.export:
         require_program_ending(path)
     nominal, calibrated = read_robots(args)
-    targets = read_targets(args.targets, calibrated)
+    targets = io.read_targets(args.targets, calibrated)
     with console.progress_bar("compensating", len(targets.values)) as progress:
         result = compensate(nominal, calibrated, targets.values, targets.near, progress, targets.conditions)
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
@@ -110,13 +108,11 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def read_robots(args: Namespace) -> tuple[Chain, Chain]:
+def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
     """Read both robots, with the base and the tool that the targets refer to."""
     from dataclasses import replace  # lazy import, as the following: they are slow to load
 
     import numpy as np
-
-    from ...io.sidecar import read_tool
 
     nominal, calibrated = (read_robot_or_table(path, args) for path in (args.nominal, args.calibrated))
     if nominal.tip != calibrated.tip and args.tip is None:
@@ -135,13 +131,13 @@ def read_robots(args: Namespace) -> tuple[Chain, Chain]:
                 "the tip, or a TOML file with xyz_m and rotvec_rad"
             )
         chains = tuple(
-            replace(chain, tool=chain.pose_in_tip(args.tcp) if is_link else read_tool(args.tcp))
+            replace(chain, tool=chain.pose_in_tip(args.tcp) if is_link else io.read_tool(args.tcp))
             for chain in chains
         )
     return chains[0], chains[1]
 
 
-def _tool_text(args: Namespace, chain: Chain) -> str:
+def _tool_text(args: Namespace, chain: robot.Chain) -> str:
     """Describe the tool that reaches the targets."""
     if args.tcp:
         return f"the tool {args.tcp}"
@@ -150,14 +146,14 @@ def _tool_text(args: Namespace, chain: Chain) -> str:
 
 def _frame_hint(args: Namespace, result: Compensation) -> str:
     """Suggest --frame measuring if most targets are not reached, and the sidecar says where the base is."""
-    from ...io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
-
-    if args.frame != BASE or result.reached.mean() >= 0.5 or not existing_sidecar(args.calibrated):
+    if args.frame != BASE or result.reached.mean() >= 0.5 or not io.existing_sidecar(args.calibrated):
         return ""
     return "are the targets in the measuring frame of the calibration? then add --frame measuring"
 
 
-def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, calibrated: Chain) -> str:
+def exchange_warning(
+    nominal_path: str, calibrated_path: str, nominal: robot.Chain, calibrated: robot.Chain
+) -> str:
     """Return a warning if the nominal and the calibrated robot look exchanged.
 
     They do in two cases. Only the nominal robot has a sidecar, which a calibration writes. Or both or none
@@ -165,9 +161,7 @@ def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, ca
     are not in the calibrated one. A number is computed if it has at least 15 significant digits and is not a
     multiple of 15 degrees: a calibration writes all digits, and people do not.
     """
-    from ...io.sidecar import existing_sidecar  # lazy import: loads Pinocchio
-
-    has_sidecar = [existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
+    has_sidecar = [io.existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
     if has_sidecar == [True, False]:
         reason = f"it has a sidecar, and {calibrated_path} has none"
     elif has_sidecar == [False, True] or not _looks_computed(nominal, calibrated):
@@ -177,7 +171,7 @@ def exchange_warning(nominal_path: str, calibrated_path: str, nominal: Chain, ca
     return f"nominal and calibrated robot look exchanged: {reason}; the nominal robot comes first"
 
 
-def _looks_computed(first: Chain, second: Chain) -> bool:
+def _looks_computed(first: robot.Chain, second: robot.Chain) -> bool:
     """Return whether the numbers that differ are mostly computed in the first URDF only."""
     import numpy as np  # lazy import: it is slow to load
 
@@ -200,7 +194,7 @@ def _is_computed(number: float) -> bool:
     return len(digits) >= _COMPUTED_DIGITS and distance > _DESIGN_TOL
 
 
-def _program(result: Compensation, nominal: Chain) -> Program:
+def _program(result: Compensation, nominal: robot.Chain) -> Program:
     """Create the program that visits all targets that are reached."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
@@ -214,14 +208,15 @@ def _program(result: Compensation, nominal: Chain) -> Program:
     )
 
 
-def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joint_units: str) -> str:
+def corrected_text(
+    result: Compensation, chain: robot.Chain, targets: io.TargetPoses, joint_units: str
+) -> str:
     """Format corrected targets."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ... import se3
     from ...io.measurement_files.columns import QUATERNION, ROTVEC
     from ...io.measurement_files.writing import joint_columns
-    from ...io.tabular import csv_text
     from ...units import ANGLES, LENGTHS
 
     columns: dict[str, Sequence[str]] = {
@@ -245,7 +240,7 @@ def corrected_text(result: Compensation, chain: Chain, targets: TargetPoses, joi
     columns[f"miss_position[{unit}]"] = _cells(result.residual_error[:, 0] * LENGTHS[unit])
     if targets.values.ndim == 3:
         columns["miss_rotation[deg]"] = _cells(result.residual_error[:, 1] * ANGLES["deg"])
-    return csv_text(columns | {"status": result.status})
+    return io.csv_text(columns | {"status": result.status})
 
 
 def _cells(values: Array) -> list[str]:

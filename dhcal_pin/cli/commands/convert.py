@@ -5,8 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 
+from ... import io
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_urdf_options
+from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -70,22 +71,19 @@ def run(args: Namespace) -> int:
     from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block, notes_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     others = [path for path in (args.robot, args.template) if path]
     inputs = [args.input, *others]
     require_writable_outputs([args.output, args.json], inputs)
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=list(notes))
-    console.show(Screen([notes_block(notes), files_block([args.output])]), args.verbosity)
+    console.show(files_screen([args.output], notes), args.verbosity)
     return 0
 
 
 def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of a robot in another format, and notes on it."""
-    from ...io.robot import convert_robot  # lazy import: loads Pinocchio
-
     for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
         if value:
             raise InvalidArgumentError(
@@ -95,22 +93,19 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
         raise InvalidArgumentError("--robot: only for a recording; omit it")
     if args.template_tip and not args.template:
         raise InvalidArgumentError("--template-tip: needs --template, the file that it is in")
-    return convert_robot(args.input, args.output, args.tip, args.convention, args.template, args.template_tip)
+    return io.convert_robot(
+        args.input, args.output, args.tip, args.convention, args.template, args.template_tip
+    )
 
 
 def _convert_bag(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of the stops of a recording, and notes on them."""
-    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ...io.measurement_files.bag import convert_bag
+    from ...io.measurement_files.bag import convert_bag  # lazy import: loads Pinocchio
 
     if not args.output.lower().endswith(".csv"):
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
     for option, value in (("--convention", args.convention), ("--template", args.template)):
         if value:
             raise InvalidArgumentError(f"{option}: a recording has none; omit it")
-    chain = (
-        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-        if args.robot
-        else None
-    )
+    chain = read_one_robot(args.robot, args) if args.robot else None
     return convert_bag(args.input, args.pose_topic, args.joint_topic, chain)

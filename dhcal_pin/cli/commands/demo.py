@@ -11,14 +11,14 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ... import io, paper, report, visualization
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, add_open_option
-from ..screens.screen import Block, Screen, Verbosity
+from ..screens.screen import Block, Screen
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
     from ...formatting import Table
-    from ...paper import PaperExperiment
 
 EXAMPLE = "dhcal demo -o demo"
 
@@ -38,30 +38,19 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run experiment and simulations."""
-    from ..outputs import require_writable_outputs
-    from ..screens import console  # lazy import, as the following: they load Pinocchio
-
-    require_writable_outputs([args.json], [])
-    document = run_demo(args.out, args.json, args.verbosity)
-    if args.open:
-        console.open_page(document["files"]["report"])
-    return 0
-
-
-def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) -> dict[str, Any]:
-    """Run experiment and simulations, show the results and write all files."""
     from ...calibration.summary import estimate_table  # lazy import, as the following: they load Pinocchio
     from ...formatting import Table
     from ...paper import simulations
-    from ...paper.experiment import run_experiment
+    from ..outputs import require_writable_outputs
     from ..screens import console
 
-    folder = os.fspath(folder)
+    require_writable_outputs([args.json], [])
+    folder = args.out
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
         raise InvalidArgumentError(f"{folder}: cannot create this folder: {error.strerror}") from error
-    experiment = run_experiment()
+    experiment = paper.run_experiment()
     header = ["position RMS in mm", "fitted", "leave-one-out"]
     shown = _Section(
         f"The experiment, {len(experiment.data.q)} of {len(experiment.measurements.data.q)} rows",
@@ -77,7 +66,7 @@ def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) ->
             simulations.SIMULATION_REMARKS,
         ),
     ]
-    document = _write_results(experiment, folder, [shown, *details], json_target)
+    document = _write_results(experiment, folder, [shown, *details], args.json)
     excluded = [f"Table 5: row {item.row} is excluded: {item.reason}" for item in experiment.unreachable_rows]
     names = [os.path.basename(path) for path in document["files"].values()]
     blocks = [
@@ -86,9 +75,11 @@ def run_demo(folder: PathLike, json_target: str | None, verbosity: Verbosity) ->
         Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
     ]
     console.show(
-        Screen(blocks, lambda: [block for section in details for block in section.blocks()]), verbosity
+        Screen(blocks, lambda: [block for section in details for block in section.blocks()]), args.verbosity
     )
-    return document
+    if args.open:
+        console.open_page(document["files"]["report"])
+    return 0
 
 
 class _Section(NamedTuple):
@@ -106,7 +97,7 @@ class _Section(NamedTuple):
         ]
 
 
-def experiment_remarks(experiment: PaperExperiment) -> list[str]:
+def experiment_remarks(experiment: paper.PaperExperiment) -> list[str]:
     """Say in sentences what the experiment shows."""
     mm = {key: f"{1e3 * value:.1f} mm" for key, value in experiment.figures.items()}
     n_points, n_parameters = len(experiment.data.q), len(experiment.fit.parameters)
@@ -122,15 +113,10 @@ def experiment_remarks(experiment: PaperExperiment) -> list[str]:
 
 
 def _write_results(
-    experiment: PaperExperiment, folder: str, sections: Sequence[_Section], json_target: str | None
+    experiment: paper.PaperExperiment, folder: str, sections: Sequence[_Section], json_target: str | None
 ) -> dict[str, Any]:
     """Write URDFs, JSON, summary, scene and report; return the JSON document."""
     from ...formatting import markdown_table  # lazy import, as the following: they load Pinocchio
-    from ...io import shipped_file, urdf_files
-    from ...report.calibration_report import report_files
-    from ...report.json_document import json_text, result_to_dict
-    from ...report.provenance import Provenance, file_digests
-    from ...visualization import scene_html
     from ..outputs import write_outputs
 
     names = {
@@ -142,10 +128,10 @@ def _write_results(
         "report": "report.html",
     }
     files = {key: os.path.join(folder, name) for key, name in names.items()}
-    inputs = [shipped_file("experiment.dh.toml"), shipped_file("experiment_table5.csv")]
-    digests = zip(inputs, file_digests(inputs).values(), strict=True)
+    inputs = [io.shipped_file("experiment.dh.toml"), io.shipped_file("experiment_table5.csv")]
+    digests = zip(inputs, report.file_digests(inputs).values(), strict=True)
     excluded = {item.row: item.reason for item in experiment.unreachable_rows}
-    source = Provenance(
+    source = report.Provenance(
         command="dhcal demo",
         inputs={path.name: digest for path, digest in digests},
         names=[inputs[1].name],
@@ -154,20 +140,20 @@ def _write_results(
         remarks=experiment_remarks(experiment),
         comparison=experiment.comparison,
     )
-    document = result_to_dict(experiment.fit, files, source.inputs, list(excluded))
+    document = report.result_to_dict(experiment.fit, files, source.inputs, list(excluded))
     document |= {"experiment_m": experiment.figures}
     summary = ["# The paper's robot, calibrated"]
     summary += [f"Row {row} of Table 5 is excluded: {reason}." for row, reason in excluded.items()]
     for section in sections:
         summary += [f"## {section.title}", markdown_table(section.table), *section.remarks]
     contents: dict[PathLike, str | bytes | None] = {
-        **urdf_files(experiment.fit.chain, files["urdf"]),
+        **io.urdf_files(experiment.fit.chain, files["urdf"]),
         files["nominal"]: experiment.chain.urdf.data,
-        **report_files(experiment.fit, [files["report"]], source),
-        files["scene"]: scene_html(
+        **report.report_files(experiment.fit, [files["report"]], source),
+        files["scene"]: visualization.scene_html(
             experiment.chain, experiment.fit, title="The paper's robot, before and after"
         ),
-        files["json"]: json_text(document),
+        files["json"]: report.json_text(document),
         files["summary"]: "\n\n".join([*summary, ""]),
     }
     write_outputs(contents, json_target, document)

@@ -9,13 +9,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+from ... import detection, io
 from ...exceptions import InvalidArgumentError
 from ..options import JSON, POSITIVE_INTEGER, RIG
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
     from ...cameras import Camera
-    from ...detection import BoardDetection
     from ...io.measurement_files import ImageJoints
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
@@ -83,10 +83,8 @@ def run(args: Namespace) -> int:
 
 def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
     """Return images with the stills of videos, saved in `folder`, in their place, and notes on the videos."""
-    from ...detection import is_video, save_stills  # lazy import: slow to load
-
     paths, notes = [], []
-    videos = [path for path in args.images if is_video(path)]
+    videos = [path for path in args.images if detection.is_video(path)]
     if args.stills and not videos:
         raise InvalidArgumentError("--stills: needs a video among the images; omit it")
     for path in args.images:
@@ -95,7 +93,7 @@ def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
             continue
         if not os.path.isfile(path):
             raise InvalidArgumentError(f"{path}: no such file; expected a video")
-        stills = save_stills(path, folder)
+        stills = detection.save_stills(path, folder)
         paths += [file for file, _ in stills]
         times = ", ".join(f"{time:.1f}" for _, time in stills)
         notes.append(f"{path}: {len(stills)} pauses, with stills at {times} s")
@@ -104,23 +102,20 @@ def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
 
 def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Sequence[str]) -> int:
     """Find the corners in images and write them."""
-    from ...detection import corner_columns, detect_boards, image_files  # lazy import, as the following
-    from ...io.measurement_files.columns import IN_ORDER
-    from ...io.rig_file import only_entry, read_rig
-    from ...io.tabular import csv_text
+    from ...io.measurement_files.columns import IN_ORDER  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
     from ..screens import console
     from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
-    paths = image_files(images)
+    paths = detection.image_files(images)
     stills = [path for path in paths if os.path.dirname(path) == folder]
     videos = [path for path in args.images if os.path.isfile(path) and path not in paths]
     inputs = [args.rig, *files, *(path for path in paths if path not in stills), *videos]
     require_writable_outputs([args.output, args.json], inputs)
-    rig = read_rig(args.rig)
-    camera = only_entry(rig.cameras, args.camera, "camera", args.rig)
+    rig = io.read_rig(args.rig)
+    camera = io.only_entry(rig.cameras, args.camera, "camera", args.rig)
     read = _joints(args, paths)
     joints, notes = (read.joints, [*video_notes, *read.notes]) if read else (None, [*video_notes])
     comments = [f"corners of boards in images of camera {camera.name}, found by dhcal detect"]
@@ -129,15 +124,15 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
         paths.sort(key=lambda path: place[os.path.basename(path)])
         comments.append(IN_ORDER)
     with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
-        detections = detect_boards(rig, camera, paths, on_progress, args.jobs)
-    columns = corner_columns(rig, camera, detections, joints)
+        detections = detection.detect_boards(rig, camera, paths, on_progress, args.jobs)
+    columns = detection.corner_columns(rig, camera, detections, joints)
     used = {image.path for each in detections for image in each.used}
     if read and read.is_ordered and (left_out := [path for path in paths if path not in used]):
         notes.append(
             f"{args.joints}: {os.path.basename(left_out[0])} shows no board; directions of approach by the "
             "order of the images are wrong for the next one if a joint turned back in between"
         )
-    contents: dict[PathLike, str | bytes] = {args.output: csv_text(columns, comments)}
+    contents: dict[PathLike, str | bytes] = {args.output: io.csv_text(columns, comments)}
     if args.overlay:
         pictures, remarks = _overlays(args.overlay, camera, detections, paths)
         contents |= pictures
@@ -183,17 +178,16 @@ def _joints(args: Namespace, paths: Sequence[str]) -> ImageJoints | None:
 
 
 def _overlays(
-    folder: str, camera: Camera, detections: Sequence[BoardDetection], paths: Sequence[str]
+    folder: str, camera: Camera, detections: Sequence[detection.BoardDetection], paths: Sequence[str]
 ) -> tuple[Mapping[PathLike, str | bytes], list[str]]:
     """Return the pictures of --overlay, whose folder is created, and notes on them."""
-    from ...detection import camera_with_intrinsics, overlay_files  # lazy import, as the following: slow
-    from ..outputs import require_writable_outputs
+    from ..outputs import require_writable_outputs  # lazy import: loads Pinocchio
 
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise InvalidArgumentError(f"--overlay {folder}: is a file; expected a folder")
     pictures: dict[PathLike, str | bytes] = {}
-    known = camera_with_intrinsics(camera, detections)
-    pictures.update(overlay_files(folder, known, detections))
+    known = detection.camera_with_intrinsics(camera, detections)
+    pictures.update(detection.overlay_files(folder, known, detections))
     if len(pictures) < len(paths):
         raise InvalidArgumentError(
             f"--overlay {folder}: two images have the same name but for the ending; rename one of them"

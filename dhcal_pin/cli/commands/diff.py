@@ -3,35 +3,15 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING, NamedTuple
 
-from ..options import JSON, ROBOT, add_urdf_options
+from ... import diagnostics, io, report
+from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 from ..output_table import Output
-
-if TYPE_CHECKING:
-    from ...diagnostics import Calibrated, Difference
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
 
 
-class Compared(NamedTuple):
-    """Result of a comparison, from which its output files are made."""
-
-    difference: Difference
-    names: list[str]
-    inputs: dict[str, str]
-
-
-def _report_content(done: Compared, path: str) -> str:
-    from ...report.changes import difference_page  # lazy import: only for reports
-
-    return difference_page(done.names, done.difference, done.inputs)
-
-
-OUTPUTS: dict[str, Output[Compared]] = {
-    "json": Output(None),
-    "report": Output(_report_content, "the report of a difference", (".html",), (".htm",)),
-}
+OUTPUTS = {"json": Output(), "report": Output("the report of a difference", (".html",), (".htm",))}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -46,37 +26,30 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Compare two robots, write the difference and show it."""
-    from ...diagnostics import compare  # lazy import, as the following: they load Pinocchio
-    from ...io import robot_name
-    from ...report.provenance import file_digests
-    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import existing_sidecars, require_writable_outputs, write_outputs
+    from ..output_table import file_contents, paths_by_name  # lazy import, as the following
+    from ..outputs import checked_files, existing_sidecars, write_outputs
     from ..screens import console
     from ..screens.result_screens import difference_screen
 
     robots = [args.first, args.second]
-    inputs, outputs = [*robots, *existing_sidecars(robots)], chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in outputs], inputs)
-    require_endings(outputs)
-    difference = compare(*(_read(path, args) for path in robots))
-    done = Compared(difference, [robot_name(path) for path in robots], file_digests(inputs))
-    files = paths_by_name(outputs)
-    document = difference.to_dict() | {"files": files, "inputs": done.inputs}
-    write_outputs(file_contents(outputs, done), args.json, document)
-    shown = [path for name, path in files.items() if name != "json"]
-    console.show(difference_screen(difference, shown), args.verbosity)
+    inputs = [*robots, *existing_sidecars(robots)]
+    outputs = checked_files(args, OUTPUTS, inputs)
+    difference = diagnostics.compare(*(_read(path, args) for path in robots))
+    names, digests = [io.robot_name(path) for path in robots], report.file_digests(inputs)
+    document = difference.to_dict() | {"files": paths_by_name(outputs), "inputs": digests}
+    contents = file_contents(
+        outputs, {"report": lambda path: report.difference_page(names, difference, digests)}
+    )
+    write_outputs(contents, args.json, document)
+    console.show(difference_screen(difference, contents), args.verbosity)
     return 0
 
 
-def _read(path: str, args: Namespace) -> Calibrated:
+def _read(path: str, args: Namespace) -> diagnostics.Calibrated:
     """Read a robot and what its sidecar says of its calibration."""
-    from ...diagnostics import Calibrated  # lazy import, as the following: they load Pinocchio
-    from ...io import existing_sidecar, read_measured_region, read_robot, read_uncertainty
-
-    chain, sidecar = (
-        read_robot(path, args.tip, package_dirs=args.package_dir, root=args.root),
-        existing_sidecar(path),
-    )
+    chain, sidecar = read_one_robot(path, args), io.existing_sidecar(path)
     if sidecar is None:
-        return Calibrated(chain, source=path)
-    return Calibrated(chain, read_uncertainty(sidecar, chain), read_measured_region(sidecar, chain), path)
+        return diagnostics.Calibrated(chain, source=path)
+    return diagnostics.Calibrated(
+        chain, io.read_uncertainty(sidecar, chain), io.read_measured_region(sidecar, chain), path
+    )

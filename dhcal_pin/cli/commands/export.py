@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 
-from ..options import JSON, ROBOT, add_urdf_options
+from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal export ur10_calibrated.urdf --tip tool0 -o model.h"
 
@@ -26,17 +26,15 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Write the source code."""
-    from ...io import read_robot  # lazy import, as the following: they load Pinocchio
-    from ...model_code import model_code, require_code_ending
+    from ...model_code import model_code, require_code_ending  # lazy import, as the following
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     require_code_ending(args.output)
     inputs = [args.robot, *existing_sidecars([args.robot])]
     require_writable_outputs([args.output, args.json], inputs)
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-    write_with_json({args.output: model_code(chain, args.output)}, args.json, {"output": args.output}, inputs)
-    console.show(Screen([files_block([args.output])]), args.verbosity)
+    text = model_code(read_one_robot(args.robot, args), args.output)
+    write_with_json({args.output: text}, args.json, {"output": args.output}, inputs)
+    console.show(files_screen([args.output]), args.verbosity)
     return 0

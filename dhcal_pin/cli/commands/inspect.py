@@ -6,10 +6,17 @@ import os
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 
+from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, RIG, ROBOT, SERVOS, SHEET, add_urdf_options
+from ..options import DATA, JSON, RIG, ROBOT, add_table_options, add_urdf_options, read_one_robot
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
+# Why some options need the robot.
+_ROBOT_REASONS = {
+    "columns": "as the map names its joints",
+    "rig": "whose links carry the cameras and boards",
+    "servos": "whose joints the servos move",
+}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -18,9 +25,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
     )
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
+    add_table_options(parser)
     parser.add_argument("--rig", **RIG)
     parser.add_argument(
         "--skip-bad-rows",
@@ -33,39 +38,27 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Show the content of files."""
-    from ...io.bundle import is_bundle  # lazy import: not for help pages
-
-    if any(map(is_bundle, args.data)):
+    if any(map(io.is_bundle, args.data)):
         return _inspect_bundle(args)
-    from ...diagnostics import inspect_file  # lazy import, as the following: they load Pinocchio
-    from ...io import read_robot
-    from ...io.rig_file import read_rig
-    from ...io.servo_file import read_servos
-    from ...measurements.mounting import mount_rig
-    from ...report.provenance import file_digests
+    from ...measurements.mounting import mount_rig  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
     from ..screens import console
     from ..screens.result_screens import inspection_screen
 
-    if args.columns and not args.robot:
-        raise InvalidArgumentError("--columns: needs --robot, as the map names its joints")
-    if args.rig and not args.robot:
-        raise InvalidArgumentError("--rig: needs --robot, whose links carry the cameras and boards")
-    if args.servos and not args.robot:
-        raise InvalidArgumentError("--servos: needs --robot, whose joints the servos move")
+    for option, reason in _ROBOT_REASONS.items():
+        if getattr(args, option) and not args.robot:
+            raise InvalidArgumentError(f"--{option}: needs --robot, {reason}")
     robots = [args.robot] if args.robot else []
     settings = [path for path in (args.columns, args.rig, args.servos) if path]
     inputs = [*robots, *existing_sidecars(robots), *args.data, *settings]
     require_writable_outputs([args.json], inputs)
     require_workbook(args.sheet, inputs)
-    chain = (
-        read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-        if args.robot
-        else None
-    )
-    rig = mount_rig(read_rig(args.rig), chain) if args.rig and chain is not None else None
-    servos = read_servos(args.servos) if args.servos else None
-    inspections = [inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data]
+    chain = read_one_robot(args.robot, args) if args.robot else None
+    rig = mount_rig(io.read_rig(args.rig), chain) if args.rig and chain is not None else None
+    servos = io.read_servos(args.servos) if args.servos else None
+    inspections = [
+        diagnostics.inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data
+    ]
     robot = None
     if chain is not None:
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}
@@ -73,7 +66,7 @@ def run(args: Namespace) -> int:
         "robot": robot,
         "files": [asdict(inspection) for inspection in inspections],
         "warnings": [f"{one.path}: {text}" for one in inspections for text in one.warnings],
-        "inputs": file_digests(inputs),
+        "inputs": report.file_digests(inputs),
     }
     write_outputs({}, args.json, document)
     about = ""
@@ -85,8 +78,7 @@ def run(args: Namespace) -> int:
 
 def _inspect_bundle(args: Namespace) -> int:
     """Show what a bundle holds."""
-    from ...io.bundle import read_bundle  # lazy import, as the following: not for help pages
-    from ..outputs import require_writable_outputs, write_outputs
+    from ..outputs import require_writable_outputs, write_outputs  # lazy import, as the following
     from ..screens import console
     from ..screens.result_screens import bundle_screen
 
@@ -94,7 +86,7 @@ def _inspect_bundle(args: Namespace) -> int:
         raise InvalidArgumentError(f"{args.data[0]}: a bundle is inspected alone; leave out other files")
     path = args.data[0]
     require_writable_outputs([args.json], [path])
-    bundle = read_bundle(path)
+    bundle = io.read_bundle(path)
     accuracy = {
         key: value
         for key, value in bundle.result.items()

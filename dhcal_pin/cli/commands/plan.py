@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from argparse import Namespace
 
+from ... import planning, report
 from ...exceptions import InvalidArgumentError
+from ..options import read_one_robot
 from ..plan_options import add_arguments as add_arguments
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
@@ -19,34 +21,29 @@ def run(args: Namespace) -> int:
     for option in ("cube", "cycles"):
         if getattr(args, option):
             raise InvalidArgumentError(f"--{option}: needs --iso9283")
-    from ...io import read_robot  # lazy import, as the following: they are slow to load
-    from ...planning import plan, with_repeats
-    from ...programs import require_program_ending
-    from ...report.provenance import file_digests
+    from ...programs import require_program_ending  # lazy import, as the following: they load Pinocchio
     from ..arm_types import with_arm_type
-    from ..output_table import chosen_files, file_contents, require_endings
-    from ..outputs import require_workbook, require_writable_outputs, write_outputs
+    from ..output_table import file_contents
+    from ..outputs import checked_files, require_workbook, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
-    from ..plan_outputs import OUTPUTS, Planned, plan_document
+    from ..plan_outputs import OUTPUTS, Planned, content_makers, plan_document
     from ..screens import console
     from ..screens.result_screens import plan_screen
 
     count, n_repeated = planned_count(args)
-    kind, inputs, files = planned_kind(args), input_paths(args), chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in files], inputs)
+    kind, inputs = planned_kind(args), input_paths(args)
+    files = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    require_endings(files)
     for path in args.export:
         require_program_ending(path)
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
-    chain = with_arm_type(chain, args.arm, args.servos, args.parameters)
+    chain = with_arm_type(read_one_robot(args.robot, args), args.arm, args.servos, args.parameters)
     given, rows = read_input(args, chain, kind)
     with console.show_progress(f"choosing {count} poses") as progress:
-        result = plan(chain, count, progress=progress, **given)
+        result = planning.plan(chain, count, progress=progress, **given)
     if n_repeated:
-        result = with_repeats(result, chain, n_repeated, given["space"], given["margin"])
-    done = Planned(result, chain, given, rows, args, file_digests(inputs))
-    contents = file_contents(files, done)
+        result = planning.with_repeats(result, chain, n_repeated, given["space"], given["margin"])
+    done = Planned(result, chain, given, rows, args, report.file_digests(inputs))
+    contents = file_contents(files, content_makers(done))
     write_outputs(contents, args.json, plan_document(done))
     console.show(plan_screen(result, done.moves, contents), args.verbosity)
     return 0

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
+from ... import io, report, session
 from ...exceptions import InvalidArgumentError
-from ..options import COLUMNS, DATA, JSON, ROBOT, SERVOS, SHEET, SKIP_BAD_ROWS, add_urdf_options, read_data
-from ..output_table import Output
-
-if TYPE_CHECKING:
-    from ...io.check_history import Check
+from ..options import (
+    DATA,
+    JSON,
+    ROBOT,
+    SKIP_BAD_ROWS,
+    add_table_options,
+    add_urdf_options,
+    read_data,
+    read_one_robot,
+)
+from ..output_table import Makers, Output
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
@@ -19,29 +26,10 @@ EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
 
-class Checked(NamedTuple):
-    """Result of a check, from which its output files are made."""
-
-    robot: str
-    checks: list[Check]  # The checks of the history and this one
-
-
-def _history_content(done: Checked, path: str) -> str:
-    from ...io.check_history import history_text  # lazy import: only for histories
-
-    return history_text(done.checks)
-
-
-def _plot_content(done: Checked, path: str) -> str:
-    from ...report.changes import history_page  # lazy import: only for pages
-
-    return history_page(done.robot, done.checks)
-
-
-OUTPUTS: dict[str, Output[Checked]] = {
-    "json": Output(None),
-    "history": Output(_history_content, "a history", (".jsonl",)),
-    "plot": Output(_plot_content, "a plot of the history", (".html",), (".htm",)),
+OUTPUTS = {
+    "json": Output(),
+    "history": Output("a history", (".jsonl",)),
+    "plot": Output("a plot of the history", (".html",), (".htm",)),
 }
 
 
@@ -50,10 +38,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("robot", **{**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"})
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    add_table_options(parser)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sigma",
         metavar="LENGTH[,ANGLE]",
@@ -78,62 +64,55 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Check whether a robot is still calibrated, write the answer and show it."""
-    from ...io import (
-        existing_sidecar,
-        read_instrument,
-        read_robot,
-        read_servos,
-        robot_name,
-    )
-    from ...io.check_history import Check, read_history
+    from ...io.check_history import Check, history_text, read_history  # lazy import, as the following
     from ...io.measurement_files.reading import has_image_coordinates
-    from ...io.sidecar import read_uncertainty  # lazy import, as the following: they load Pinocchio
     from ...measurements import Noise
-    from ...report.provenance import file_digests
-    from ...session import recheck
     from ...units import parse_noise
-    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_workbook, require_writable_outputs, write_outputs
+    from ..output_table import file_contents, paths_by_name
+    from ..outputs import checked_files, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import recheck_screen
 
-    sidecar = existing_sidecar(args.robot)
+    sidecar = io.existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
-    outputs = chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in outputs], inputs)
+    outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    require_endings(outputs)
     if args.plot and not args.history:
         raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")
     noise = Noise(*parse_noise(args.sigma, "--sigma")) if args.sigma else None
     size = parse_noise(args.size, "--size")[0]
-    chain = read_robot(args.robot, args.tip, package_dirs=args.package_dir, root=args.root)
+    chain = read_one_robot(args.robot, args)
     if sidecar is None:
         raise InvalidArgumentError(
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
             "NAME.calibration.toml"
         )
-    servos = read_servos(args.servos) if args.servos else None
+    servos = io.read_servos(args.servos) if args.servos else None
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
             raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
     files = read_data(args, chain, servos)
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
-    data, known = [file.data for file in files], read_instrument(sidecar)
+    data, known = [file.data for file in files], io.read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
     known = {name: value for name, value in known.items() if name in used}
-    result = recheck(chain, data, read_uncertainty(sidecar, chain), known=known, noise=noise, size=size)
+    result = session.recheck(
+        chain, data, io.read_uncertainty(sidecar, chain), known=known, noise=noise, size=size
+    )
     now = Check.of(result, args.robot, args.data)
-    written = paths_by_name(outputs)
     document: dict[str, Any] = result.to_dict() | {
         "time": now.time,
         "robot": args.robot,
-        "files": written,
-        "inputs": file_digests(inputs),
+        "files": paths_by_name(outputs),
+        "inputs": report.file_digests(inputs),
     }
-    contents = file_contents(outputs, Checked(robot_name(args.robot), [*earlier, now]))
+    checks = [*earlier, now]
+    makers: Makers = {
+        "history": lambda path: history_text(checks),
+        "plot": lambda path: report.history_page(io.robot_name(args.robot), checks),
+    }
+    contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)
-    shown = [path for name, path in written.items() if name != "json"]
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(recheck_screen(result, notes, shown), args.verbosity)
+    console.show(recheck_screen(result, notes, contents), args.verbosity)
     return STATUS[result.verdict]

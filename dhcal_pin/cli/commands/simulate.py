@@ -7,6 +7,7 @@ import re
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
+from ... import estimation, io, robot
 from ...exceptions import InvalidArgumentError, UnknownNameError
 from ..options import (
     JSON,
@@ -19,7 +20,6 @@ from ..options import (
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
-    from ...robot import Chain, Conditions
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
@@ -82,15 +82,11 @@ def run(args: Namespace) -> int:
     """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ...io import measurement_text, read_robot
-    from ...io.rig_file import rig_text
     from ...measurements import KINDS, Noise
-    from ...robot.sampling import joint_range
     from ...units import parse_noise
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -101,7 +97,7 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
-    nominal = truth = read_robot(args.robot, args.tip, root=args.root)
+    nominal = truth = io.read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
         truth = read_robot_or_table(args.truth, args)
         if truth.joint_names != nominal.joint_names:
@@ -112,38 +108,36 @@ def run(args: Namespace) -> int:
     elif args.errors:
         truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
-    q = rng.uniform(*joint_range(nominal), (args.samples, nominal.n_joints))
+    q = rng.uniform(*robot.joint_range(nominal), (args.samples, nominal.n_joints))
     data = KINDS[args.kind].simulate(truth, _conditions(truth, q, args.seed), noise, rng)
     errors = f" with random errors {args.errors}" if args.errors else ""
     comment = (
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
     )
-    contents: dict[PathLike, str | bytes] = {args.output: measurement_text(data, nominal, [comment])}
+    contents: dict[PathLike, str | bytes] = {args.output: io.measurement_text(data, nominal, [comment])}
     if data.rig is not None:
         rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
         require_writable_outputs([rig_path], [*robots, args.output])
-        contents[rig_path] = rig_text(data.rig.cameras, data.rig.boards)
+        contents[rig_path] = io.rig_text(data.rig.cameras, data.rig.boards)
     facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
-    console.show(Screen([files_block([str(path) for path in contents])]), args.verbosity)
+    console.show(files_screen(contents), args.verbosity)
     return 0
 
 
-def _conditions(truth: Chain, q: Array, seed: int) -> Conditions:
+def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
     """Return joint positions with random values of the conditions that the robot depends on."""
     import numpy as np  # lazy import, as the following: they are slow to load
-
-    from ...robot import CONDITIONS, Conditions
 
     rng = np.random.default_rng([seed, 2])
     needed = {family.condition for family in truth.error_families}
     drawn = {
         name: condition.draw(rng, q.shape, truth.reference_temperature)
-        for name, condition in CONDITIONS.items()
+        for name, condition in robot.CONDITIONS.items()
         if name in needed and condition.draw
     }
-    return Conditions(q, **drawn)
+    return robot.Conditions(q, **drawn)
 
 
 def _length_of_pixels(noise: str) -> str:
@@ -151,13 +145,11 @@ def _length_of_pixels(noise: str) -> str:
     return re.sub(r"^([0-9.eE+-]+)\s*px$", r"\1mm", noise.strip())
 
 
-def _with_random_errors(nominal: Chain, length: float, angle: float, seed: int) -> Chain:
+def _with_random_errors(nominal: robot.Chain, length: float, angle: float, seed: int) -> robot.Chain:
     """Move every joint origin by normally distributed errors, with standard deviations in m and rad."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ...estimation import select_parameters
-
-    errors = select_parameters(nominal, "placement")
+    errors = estimation.select_parameters(nominal, "placement")
     std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])
     # A separate generator, so that the robot does not depend on the number of samples.
     return errors.at(std * np.random.default_rng([seed, 1]).standard_normal(len(std)))

@@ -9,12 +9,9 @@ from __future__ import annotations
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from ... import io, studies
 from ..options import JSON, add_execution_options
-
-if TYPE_CHECKING:
-    from ...studies import StudyGrid, StudyJournal
 
 EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
@@ -35,15 +32,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run a study, or the blocks that an interrupted run has left."""
-    from ... import studies  # lazy import, as the following: they load Pinocchio
-    from ...io import shipped_file
-    from ...parallel import open_executor
+    from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from ...saving import complete_interrupted_save
     from ..outputs import existing_sidecars, require_writable_outputs, written_files
     from ..screens import console
 
     is_file = os.path.exists(args.study) or args.study.endswith(".toml")
-    path = args.study if is_file else shipped_file(f"{args.study}.study.toml")
+    path = args.study if is_file else io.shipped_file(f"{args.study}.study.toml")
     journal_path = f"{args.output}.part"
     study = studies.read_study(path)
     inputs = [os.fspath(path), *study.robots, *existing_sidecars(study.robots)]
@@ -79,12 +74,12 @@ def _figure_path(output: str) -> str:
     return f"{os.path.splitext(output)[0]}.svg"
 
 
-def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace, inputs: Sequence[str]) -> None:
+def _write_results(
+    study: studies.StudyGrid, journal: studies.StudyJournal, args: Namespace, inputs: Sequence[str]
+) -> None:
     """Write table and plot of a finished study, remove its journal, and show the table."""
     from dataclasses import fields  # lazy import, as the following: they load Pinocchio
 
-    from ... import studies
-    from ...io.tabular import csv_text
     from ...plots import study_svg
     from ..outputs import write_with_json
     from ..screens import console
@@ -93,7 +88,7 @@ def _write_results(study: StudyGrid, journal: StudyJournal, args: Namespace, inp
     header, rows = studies.result_table(study, journal.blocks)
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
     columns = dict(zip(header, zip(*rows, strict=True), strict=True))
-    contents = {args.output: csv_text(columns)} | ({_figure_path(args.output): drawing} if drawing else {})
+    contents = {args.output: io.csv_text(columns)} | ({_figure_path(args.output): drawing} if drawing else {})
     named: dict[str, str] = dict(zip(("output", "figure"), contents, strict=False))
     settings = [dict(zip(header, row, strict=True)) for row in rows]
     facts = {"title": study.title, "settings": settings}

@@ -6,31 +6,24 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
 from ..options import (
-    COLUMNS,
     DATA,
     FIT_FRAMES,
     JSON,
     RIG,
     ROBOT,
-    SERVOS,
-    SHEET,
     SKIP_BAD_ROWS,
+    add_table_options,
     add_urdf_options,
     read_data,
+    read_one_robot,
 )
-from ..output_table import Output
+from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
-    from ...calibration import Accuracy, Result
-    from ...estimation.uncertainty import Predictor
-    from ...io import MeasurementFile
-    from ...io.servo_file import ServoFile
-    from ...io.sidecar import Fitted
     from ...measurements import MeasuredRegion, Measurement, MountedRig
-    from ...report.validation import Validation
-    from ...robot import Chain
 
 # Warning about a file that the calibration fitted.
 FITTED_WARNING = "by the calibration of this robot; other measurements have larger errors"
@@ -45,14 +38,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("robot", **ROBOT)
     parser.add_argument("data", **DATA)
     add_urdf_options(parser)
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
+    add_table_options(parser)
     parser.add_argument(
         "--rig",
         **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
     )
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--sidecar",
         metavar="S.toml",
@@ -65,7 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
     )
-    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
+    parser.add_argument("--fit-frames", **FIT_FRAMES)
     parser.add_argument(
         "--map",
         metavar="MAP",
@@ -86,13 +77,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 class Given(NamedTuple):
     """Robot and measurements of a validation, as the files state them."""
 
-    chain: Chain
-    files: list[MeasurementFile]
+    chain: robot.Chain
+    files: list[io.MeasurementFile]
     known: dict[str, float]  # Values of instrument parameters that the calibration estimated [m or rad]
     rig: MountedRig | None
     estimated: list[str]  # Cameras and boards of the rig that the calibration estimated
     region: MeasuredRegion | None  # Measured region of the calibration
-    predictor: Predictor | None  # Uncertainty of the robot, for maps
+    predictor: estimation.Predictor | None  # Uncertainty of the robot, for maps
 
     @property
     def data(self) -> list[Measurement]:
@@ -103,72 +94,53 @@ class Given(NamedTuple):
 class Judged(NamedTuple):
     """Robot with the base and tool that it is judged with, and the accuracies that are compared."""
 
-    chain: Chain
+    chain: robot.Chain
     known: Mapping[str, float]  # Values of instrument parameters [m or rad]
-    fit: Result | None  # Fit of base and tool, on request
-    before: Accuracy
-    accuracies: dict[str, Accuracy]  # Accuracy by the name of the model; the last one is that of `chain`
-    alone: Accuracy  # Accuracy of the URDF alone, with base and tool fitted if the sidecar has joint errors
-    reference: tuple[Chain, Mapping[str, float]] | None = None  # Nominal robot and its instrument parameters
+    fit: calibration.Result | None  # Fit of base and tool, on request
+    before: calibration.Accuracy
+    # Accuracy by the name of the model; the last one is that of `chain`.
+    accuracies: dict[str, calibration.Accuracy]
+    # Accuracy of the URDF alone, with base and tool fitted if the sidecar has joint errors.
+    alone: calibration.Accuracy
+    # Nominal robot and its instrument parameters.
+    reference: tuple[robot.Chain, Mapping[str, float]] | None = None
     remarks: Sequence[str] = ()
 
 
-class Validated(NamedTuple):
-    """Result of a validation, from which its output files are made."""
-
-    report: Validation
-    predictor: Predictor | None
-
-
-def _map_content(done: Validated, path: str) -> str:
-    from ...report.workspace_map import map_content  # lazy import: only for maps
-
-    assert done.predictor is not None
-    return map_content(path, done.predictor, done.report.data, done.report.known)
-
-
-def _report_content(done: Validated, path: str) -> str:
-    from ...report.validation import validation_page  # lazy import: only for reports
-
-    return validation_page(done.report)
-
-
-OUTPUTS: dict[str, Output[Validated]] = {
-    "json": Output(None),
-    "map": Output(_map_content, "a map", (".csv", ".html")),
-    "report": Output(_report_content, "the report of a validation", (".html",), (".htm",)),
+OUTPUTS = {
+    "json": Output(),
+    "map": Output("a map", (".csv", ".html")),
+    "report": Output("the report of a validation", (".html",), (".htm",)),
 }
 
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...diagnostics import find_extrapolation  # lazy import, as the following: they load Pinocchio
-    from ...io import existing_sidecar, robot_name
-    from ...iso9283 import pose_characteristics
-    from ...report.provenance import file_digests
-    from ...report.validation import Validation
-    from ..output_table import chosen_files, file_contents, paths_by_name, require_endings
-    from ..outputs import require_workbook, require_writable_outputs, write_outputs
+    from ..output_table import file_contents, paths_by_name  # lazy import, as the following
+    from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
     from ..screens import console
     from ..screens.result_screens import validation_screen
 
-    sidecar = args.sidecar or existing_sidecar(args.robot)
-    inputs, outputs = _input_paths(args, sidecar), chosen_files(vars(args), OUTPUTS)
-    require_writable_outputs([file.path for file in outputs], inputs)
+    sidecar = args.sidecar or io.existing_sidecar(args.robot)
+    nominal = [args.nominal] if args.nominal else []
+    others = filter(None, (sidecar, args.columns, args.rig, args.servos))
+    inputs = [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
+    outputs = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    require_endings(outputs)
     given = _read_input(args, sidecar)
     judged = _judge(args, given)
     data, accuracies = given.data, judged.accuracies
     characteristics = None
     if args.iso9283:
         points = [file.iso_points for file in given.files]
-        characteristics = pose_characteristics(judged.chain, data, points, judged.known)
+        characteristics = iso9283.pose_characteristics(judged.chain, data, points, judged.known)
     warnings = _input_warnings(args, given, judged, sidecar)
     notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
-    extrapolation = given.region and find_extrapolation(given.region, judged.chain, data, judged.known)
-    report = Validation(
-        robot_name(args.robot),
+    extrapolation = given.region and diagnostics.find_extrapolation(
+        given.region, judged.chain, data, judged.known
+    )
+    done = report.Validation(
+        io.robot_name(args.robot),
         judged.chain,
         data,
         judged.known,
@@ -183,68 +155,61 @@ def run(args: Namespace) -> int:
         ],
         [f"{path}: {text}" for path, texts in warnings.items() for text in texts],
         notes,
-        file_digests(inputs),
+        report.file_digests(inputs),
         characteristics,
     )
     files = paths_by_name(outputs)
-    document = _document(report, judged) | {
+    document = _document(done, judged) | {
         "estimated_entries": given.estimated,
-        "warnings": [*notes, *report.warnings],
+        "warnings": [*notes, *done.warnings],
         "measured_region": extrapolation and extrapolation.to_dict(),
         "iso9283": characteristics and characteristics.to_dict(),
         "files": files,
     }
-    write_outputs(file_contents(outputs, Validated(report, given.predictor)), args.json, document)
+
+    def map_content(path: str) -> str:
+        assert given.predictor is not None
+        return report.map_content(path, given.predictor, data, judged.known)
+
+    makers: Makers = {"map": map_content, "report": lambda path: report.validation_page(done)}
+    write_outputs(file_contents(outputs, makers), args.json, document)
     title = f"{args.robot}: accuracy on {document['samples']} samples"
     shown = {name: path for name, path in files.items() if name != "json"}
     tables = characteristics.tables() if characteristics else []
-    screen = validation_screen(title, accuracies, report.remarks, notes, warnings, shown, tables)
+    screen = validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
     console.show(screen, args.verbosity)
     return 0
 
 
-def _input_paths(args: Namespace, sidecar: str | None) -> list[str]:
-    """List the files that a validation reads."""
-    from ..outputs import existing_sidecars  # lazy import: loads Pinocchio
-
-    nominal = [args.nominal] if args.nominal else []
-    others = filter(None, (sidecar, args.columns, args.rig, args.servos))
-    return [args.robot, *nominal, *args.data, *others, *existing_sidecars(nominal)]
-
-
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
-    from ...io import read_instrument, read_measured_region, read_robot, read_servos
-    from ...measurements.position import require_common_reference_target
+    from ...measurements.position import require_common_reference_target  # lazy import: loads Pinocchio
 
-    chain = read_robot(args.robot, args.tip, sidecar, args.package_dir, args.root)
-    servos = read_servos(args.servos) if args.servos else None
+    chain = read_one_robot(args.robot, args, sidecar)
+    servos = io.read_servos(args.servos) if args.servos else None
     rig, estimated = _mounted_rig(args, sidecar, chain, servos)
     predictor = _predictor(chain, sidecar, args) if args.map else None
     files = read_data(args, chain, servos, rig)
-    instrument = read_instrument(sidecar) if sidecar else {}
+    instrument = io.read_instrument(sidecar) if sidecar else {}
     require_common_reference_target({file.source: file.data for file in files}, instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
     known = {name: value for name, value in instrument.items() if name in used}
-    region = read_measured_region(sidecar, chain) if sidecar else None
+    region = io.read_measured_region(sidecar, chain) if sidecar else None
     return Given(chain, files, known, rig, estimated, region, predictor)
 
 
 def _judge(args: Namespace, given: Given) -> Judged:
     """Compute the accuracies that are compared, with base and tool as given or fitted."""
-    from ...calibration import accuracy  # lazy import, as the following: they load Pinocchio
-    from ...diagnostics import fit_frames
-
     chain, data, known = given.chain, given.data, given.known
-    before = accuracy(chain, data, known)
+    before = calibration.accuracy(chain, data, known)
     name = "fitted to these images" if _unstated_entries(given.rig) else "base and tool as given"
     accuracies, alone = {name: before}, before
     if chain.error_families:
-        alone = _accuracy_on_all(fit_frames(chain.urdf_alone, data, known), data, known)
+        alone = _accuracy_on_all(diagnostics.fit_frames(chain.urdf_alone, data, known), data, known)
         accuracies = {"URDF alone, base and tool fitted": alone, name: before}
     judged = Judged(chain, known, None, before, accuracies, alone)
     if args.fit_frames:
-        fit = fit_frames(chain, data, known)
+        fit = diagnostics.fit_frames(chain, data, known)
         after = _accuracy_on_all(fit, data, known)
         accuracies = accuracies | {"base and tool fitted": after}
         alone = alone if chain.error_families else after
@@ -256,30 +221,27 @@ def _judge(args: Namespace, given: Given) -> Judged:
     return judged._replace(before=nominal, accuracies=accuracies, reference=reference, remarks=remarks)
 
 
-def _accuracy_on_all(fit: Result, data: Sequence[Measurement], known: Mapping[str, float]) -> Accuracy:
+def _accuracy_on_all(
+    fit: calibration.Result, data: Sequence[Measurement], known: Mapping[str, float]
+) -> calibration.Accuracy:
     """Return the accuracy on all samples, outliers too, with the fitted base and tool."""
-    from ...calibration import accuracy  # lazy import: loads Pinocchio
-
-    return accuracy(fit.chain, data, {**known, **fit.instruments})
+    return calibration.accuracy(fit.chain, data, {**known, **fit.instruments})
 
 
-def _document(report: Validation, judged: Judged) -> dict[str, Any]:
+def _document(done: report.Validation, judged: Judged) -> dict[str, Any]:
     """Create the part of the JSON document that a calibration has, too."""
-    from ...report.json_document import main_statistics, result_to_dict, validation_to_dict
-
     if judged.fit:
-        document = result_to_dict(judged.fit, {}, report.inputs, is_calibration=False)
+        document = report.result_to_dict(judged.fit, {}, done.inputs, is_calibration=False)
     else:
-        document = validation_to_dict(report.chain, report.data, report.inputs, report.known)
-    before, alone = main_statistics(judged.before), main_statistics(judged.alone)
-    after = main_statistics(list(judged.accuracies.values())[-1])
+        document = report.validation_to_dict(done.chain, done.data, done.inputs, done.known)
+    before, alone = report.main_statistics(judged.before), report.main_statistics(judged.alone)
+    after = report.main_statistics(list(judged.accuracies.values())[-1])
     return document | {"before": before, "after": after, "urdf_alone": {"before": before, "after": alone}}
 
 
 def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
     """Name the samples that are far from the others, and state the accuracy without them."""
-    from ...calibration import Accuracy  # lazy import, as the following: they load Pinocchio
-    from ...calibration.evaluation import compute_errors, find_inliers, take_errors
+    from ...calibration.evaluation import compute_errors, find_inliers, take_errors  # lazy import
     from ...calibration.summary import statistic
     from ...measurements.groups import ERROR_GROUPS
     from ..screens.screen import list_first
@@ -290,7 +252,7 @@ def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
     texts = [f"{source}: {list_first(lines)}" for source, lines in rows if lines]
     if not texts:
         return []
-    group, rest = next(iter(Accuracy.from_errors(take_errors(errors, masks)).groups.items()))
+    group, rest = next(iter(calibration.Accuracy.from_errors(take_errors(errors, masks)).groups.items()))
     return [
         f"Samples far from the others: {sum(len(lines) for _, lines in rows)} (lines in {'; '.join(texts)}). "
         f"RMS {ERROR_GROUPS[group].label} without them: {statistic(rest)}."
@@ -315,19 +277,18 @@ def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str
 
 
 def _mounted_rig(
-    args: Namespace, sidecar: str | None, chain: Chain, servos: ServoFile | None
+    args: Namespace, sidecar: str | None, chain: robot.Chain, servos: io.ServoFile | None
 ) -> tuple[MountedRig | None, list[str]]:
     """Return the cameras and boards of the images, with the estimates of a calibration.
 
     Without a rig file, they are those of the sidecar. Other measurements than images need none.
     """
     from ...io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
-    from ...io.rig_file import read_calibrated_rig, read_rig, with_estimates_of
     from ...measurements.mounting import mount_rig
 
-    calibrated = read_calibrated_rig(sidecar) if sidecar else None
+    calibrated = io.read_calibrated_rig(sidecar) if sidecar else None
     if args.rig:
-        rig = read_rig(args.rig)
+        rig = io.read_rig(args.rig)
     else:
         is_usable = calibrated is not None and calibrated.is_complete
         has_images = is_usable and any(
@@ -341,7 +302,7 @@ def _mounted_rig(
         *(f"board.{name}" for name in rig.boards if name in calibrated.boards),
     ]
     ends = {"world": chain.root, "tip": chain.tip}
-    return mount_rig(with_estimates_of(rig, calibrated, ends), chain), names
+    return mount_rig(io.with_estimates_of(rig, calibrated, ends), chain), names
 
 
 def _unstated_entries(rig: MountedRig | None) -> list[str]:
@@ -355,16 +316,12 @@ def _unstated_entries(rig: MountedRig | None) -> list[str]:
 
 
 def _nominal_accuracy(
-    chain: Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
-) -> tuple[Accuracy, tuple[Chain, Mapping[str, float]], list[str]]:
+    chain: robot.Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
+) -> tuple[calibration.Accuracy, tuple[robot.Chain, Mapping[str, float]], list[str]]:
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
     import numpy as np  # lazy import, as the following
 
-    from ...calibration import accuracy
-    from ...diagnostics import fit_frames
-    from ...io import read_robot
-
-    nominal = read_robot(args.nominal, args.tip, None, args.package_dir, args.root)
+    nominal = read_one_robot(args.nominal, args)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "
@@ -373,8 +330,8 @@ def _nominal_accuracy(
     pairs = {"base": (nominal.base, chain.base), "tool": (nominal.tool, chain.tool)}
     others = [name for name, (a, b) in pairs.items() if not np.allclose(a, b, rtol=0, atol=FRAMES_TOL)]
     if not others:
-        return accuracy(nominal, data, known), (nominal, known), []
-    fit = fit_frames(nominal, data, known, ",".join(others))
+        return calibration.accuracy(nominal, data, known), (nominal, known), []
+    fit = diagnostics.fit_frames(nominal, data, known, ",".join(others))
     note = f"nominal: {' and '.join(others)} fitted to these measurements"
     return _accuracy_on_all(fit, data, known), (fit.chain, {**known, **fit.instruments}), [note]
 
@@ -383,28 +340,22 @@ def _input_warnings(
     args: Namespace, given: Given, judged: Judged, sidecar: str | None
 ) -> dict[str, list[str]]:
     """List the warnings about each file, rows that the robot cannot reach included; no row is excluded."""
-    from ...diagnostics import FRAMES_WARNING, frames_differ  # lazy import, as the following
-    from ...diagnostics.input_checks import find_input_warnings
-    from ...diagnostics.reachability import find_unreachable_rows
-    from ...io.sidecar import Fitted, read_fitted
-    from ...report.provenance import file_digests
-
-    fitted = read_fitted(sidecar) if sidecar else Fitted()
-    digests = file_digests(args.data)
+    fitted = io.read_fitted(sidecar) if sidecar else io.Fitted()
+    digests = report.file_digests(args.data)
     warnings = {}
     for file in given.files:
-        unreachable = [] if args.fit_frames else find_unreachable_rows(judged.chain, file)
+        unreachable = [] if args.fit_frames else diagnostics.find_unreachable_rows(judged.chain, file)
         warnings[file.source] = [
-            *find_input_warnings(judged.chain, file),
+            *diagnostics.find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
             *_fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
-    if not args.fit_frames and frames_differ(judged.chain, given.data, judged.known):
-        warnings[args.robot] = [FRAMES_WARNING]
+    if not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
+        warnings[args.robot] = [diagnostics.FRAMES_WARNING]
     return warnings
 
 
-def _fitted_warning(item: Measurement, digest: str, fitted: Fitted) -> list[str]:
+def _fitted_warning(item: Measurement, digest: str, fitted: io.Fitted) -> list[str]:
     """Return a warning about a file with rows that the calibration fitted."""
     from ...io.measurement_files.fitted_rows import count_fitted_rows  # lazy import: loads Pinocchio
 
@@ -415,15 +366,13 @@ def _fitted_warning(item: Measurement, digest: str, fitted: Fitted) -> list[str]
     return [f"was fitted, all of it or a part, {FITTED_WARNING}"] if digest in fitted.files else []
 
 
-def _predictor(chain: Chain, sidecar: str | None, args: Namespace) -> Predictor:
+def _predictor(chain: robot.Chain, sidecar: str | None, args: Namespace) -> estimation.Predictor:
     """Read the uncertainty that the calibration has written beside the robot."""
-    from ...io.sidecar import read_uncertainty  # lazy import: loads Pinocchio
-
     if args.fit_frames:
         raise InvalidArgumentError(
             "--map: not available with --fit-frames; the uncertainty holds for base and tool as calibrated"
         )
-    uncertainty = read_uncertainty(sidecar, chain) if sidecar else None
+    uncertainty = io.read_uncertainty(sidecar, chain) if sidecar else None
     if uncertainty is None:
         raise InvalidArgumentError(
             f"{sidecar or args.robot}: --map needs the table [uncertainty] of a calibration; `dhcal "

@@ -6,32 +6,31 @@ import os
 import tempfile
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
 from ..options import (
-    COLUMNS,
     DATA,
     FIT_FRAMES,
     JSON,
     POSITIVE_INTEGER,
     RIG,
     ROBOT,
-    SERVOS,
-    SHEET,
     SKIP_BAD_ROWS,
     add_open_option,
+    add_table_options,
     add_urdf_options,
     read_data,
+    read_mounted_rig,
     read_robot_or_table,
 )
 from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
-    from ...measurements import Measurement, MountedRig
-    from ...robot import Chain
+    from ...measurements import Measurement
 
-OUTPUTS: dict[str, Output[Any]] = {"html": Output(None, "a scene", (".html",), (".htm",))}
+OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
@@ -43,10 +42,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--data", **{**DATA, "help": f"{DATA['help']}; their poses are drawn and played"}, default=[]
     )
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
-    parser.add_argument("--skip-bad-rows", action="store_true", **SKIP_BAD_ROWS)
+    add_table_options(parser)
+    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
     parser.add_argument(
         "--rig",
         metavar=RIG["metavar"],
@@ -77,22 +74,17 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
     )
-    parser.add_argument("--fit-frames", action="store_true", **FIT_FRAMES)
+    parser.add_argument("--fit-frames", **FIT_FRAMES)
     add_urdf_options(parser)
     parser.add_argument("--json", **JSON)
 
 
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
-    from ...diagnostics import FRAMES_WARNING, fit_frames, frames_differ  # lazy import, as the following
-    from ...io import read_servos
-    from ...io.robot import robot_name
-    from ...io.sidecar import existing_sidecar, read_instrument, read_uncertainty
-    from ...visualization import scene
+    from ...visualization import scene  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
     from ..screens import console
-    from ..screens.result_screens import files_block, notes_block, warnings_block
-    from ..screens.screen import Screen
+    from ..screens.result_screens import files_screen
 
     if args.live and (args.html or args.open or args.json):
         raise InvalidArgumentError("--live writes no page; omit --html, --open and --json")
@@ -102,27 +94,27 @@ def run(args: Namespace) -> int:
         )
     robots = [args.nominal, *([args.calibrated] if args.calibrated else [])]
     sidecars = existing_sidecars(robots)
-    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{robot_name(args.nominal)}.html")
+    page = args.html or os.path.join(tempfile.mkdtemp(prefix="dhcal-"), f"{io.robot_name(args.nominal)}.html")
     settings = filter(None, (args.rig, args.columns, args.servos))
     inputs = [*robots, *sidecars, *args.data, *settings]
     require_writable_outputs([page, args.json], inputs)
     require_workbook(args.sheet, inputs)
     require_endings(chosen_files(vars(args), OUTPUTS))
     chains = [read_robot_or_table(path, args) for path in robots]
-    sidecar = existing_sidecar(robots[-1])
-    rig = _rig(args.rig, sidecar, chains[-1])
-    servos = read_servos(args.servos) if args.servos else None
+    sidecar = io.existing_sidecar(robots[-1])
+    rig = read_mounted_rig(args.rig, sidecar, chains[-1])
+    servos = io.read_servos(args.servos) if args.servos else None
     files = read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
-    known = read_instrument(sidecar) if sidecar else {}
-    predictor = read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
+    known = io.read_instrument(sidecar) if sidecar else {}
+    predictor = io.read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
     warnings = {}
     if args.fit_frames:
         predictor = None  # The uncertainty holds for base and tool as calibrated.
-        fits = [fit_frames(chain, data, known) for chain in chains]
+        fits = [diagnostics.fit_frames(chain, data, known) for chain in chains]
         chains, known = [fit.chain for fit in fits], known | fits[-1].instruments
-    elif data and frames_differ(chains[-1], data, known):
-        warnings[robots[-1]] = [FRAMES_WARNING]
+    elif data and diagnostics.frames_differ(chains[-1], data, known):
+        warnings[robots[-1]] = [diagnostics.FRAMES_WARNING]
     if args.live:
         return _serve_live(chains, data, args)
     text = scene.scene_html(
@@ -131,32 +123,20 @@ def run(args: Namespace) -> int:
         measurements=data,
         known=known,
         predictor=predictor,
-        title=" and ".join(robot_name(path) for path in robots),
+        title=" and ".join(io.robot_name(path) for path in robots),
         magnification=args.magnification,
         triangles=args.simplify,
     )
     findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
-    notes = notes_block([f"{file.source}: {text}" for file in files for text in file.notes])
-    console.show(Screen([notes, warnings_block(warnings), files_block([page])]), args.verbosity)
+    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
+    console.show(files_screen([page], notes, warnings), args.verbosity)
     if args.open if args.open is not None else not args.html:
         console.open_page(page)
     return 0
 
 
-def _rig(path: str | None, sidecar: str | None, chain: Chain) -> MountedRig | None:
-    """Return the rig of a file, with poses of the sidecar where it has none, or that of the sidecar."""
-    from ...io.rig_file import read_calibrated_rig, read_rig, with_poses_of  # lazy import, as the following
-    from ...measurements import mount_rig
-
-    calibrated = read_calibrated_rig(sidecar) if sidecar else None
-    rig = read_rig(path) if path else calibrated
-    if rig is not None and calibrated is not None:
-        rig = with_poses_of(rig, calibrated)
-    return mount_rig(rig, chain) if rig else None
-
-
-def _serve_live(chains: Sequence[Chain], data: Sequence[Measurement], args: Namespace) -> int:
+def _serve_live(chains: Sequence[robot.Chain], data: Sequence[Measurement], args: Namespace) -> int:
     """Play the measured poses repeatedly in a live scene."""
     import numpy as np  # lazy import, as the following: they are slow to load
 

@@ -30,28 +30,28 @@ _VERDICT_STYLES = {"ok": "green", "caution": "yellow", "refused": "red"}
 
 def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     """Describe the result of a calibration."""
-    fit = outcome.fit
-    names = short_names([outcome.robot, *outcome.n_rows])
+    fit, data, source = outcome.fit, outcome.data, outcome.source
+    names = short_names([outcome.robot, *data.n_rows])
     is_refused = fit.verdict.is_refused
     # The parameters of a refused robot have no meaning.
     unidentified = [] if is_refused else summary.parameter_notes(fit.unobservable, fit.weakly_observable)
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
-    all_warnings = [f"{names[p]}: warning: {text}" for p, texts in outcome.warnings.items() for text in texts]
+    all_warnings = [f"{names[p]}: warning: {text}" for p, texts in data.warnings.items() for text in texts]
     signs = fit.signs
     turned = [f"{names[outcome.robot]}: warning: {signs.note}"] if signs and signs.turned else []
     warnings = [text for text in all_warnings if text not in turned]
     moved = [f"warning: {text}" for text in outcome.moved_zeros]
     notes = [
         f"note: {names[p]}: {text}"
-        for p, texts in outcome.notes.items()
+        for p, texts in data.notes.items()
         for text in texts
         if text not in outcome.moved_zeros
     ]
-    hints = [f"hint: {outcome.hint}"] if outcome.hint else []
+    hints = [f"hint: {source.hint}"] if source.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
-    by_file = summary.file_table([names[path] for path in outcome.fitted], fit.file_comparisons)
+    by_file = summary.file_table([names[path] for path in data.fitted], fit.file_comparisons)
     blocks = [
-        Block(_robot_lines(fit, names[outcome.robot], outcome.settings["parameters"])),
+        Block(_robot_lines(fit, names[outcome.robot], source.settings["parameters"])),
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
         Block(by_file if by_file else [], noun="file", rank=6, n_kept=4, has_space=True),
@@ -112,9 +112,9 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
 def _data_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> list[str]:
     """Describe each measurement file: rows, kind and standard deviations, and how the rows were used."""
     lines = []
-    for path, n_rows in outcome.n_rows.items():
-        fitted = [outcome.fitted[path]] if path in outcome.fitted else []
-        held_out = [item for name, item in outcome.held_out if name == path]
+    for path, n_rows in outcome.data.n_rows.items():
+        fitted = [outcome.data.fitted[path]] if path in outcome.data.fitted else []
+        held_out = [item for name, item in outcome.data.held_out if name == path]
         facts = [f"{n_rows} rows", *_describe_data([*fitted, *held_out])]
         uses = f"; {_describe_use(fitted, held_out)}" if held_out else ""
         lines.append(f"{names[path]}: {', '.join(facts)}{uses}")
@@ -147,12 +147,12 @@ def _count_images(items: Sequence[Measurement]) -> int:
 
 def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterator[str]:
     """Describe the rows that are not used, and the outliers."""
-    for path, unreachable in outcome.unreachable.items():
+    for path, unreachable in outcome.data.unreachable.items():
         for item in unreachable:
             yield f"{names[path]}: line {item.row} is excluded: {item.reason}"
     for path, rows in outcome.outliers.items():
         rejected = outcome.rejected[path]
-        item = outcome.fitted[path]
+        item = outcome.data.fitted[path]
         if excluded := [row for row in rows if row in rejected]:
             yield f"{names[path]}: {_count_outliers(excluded, item)} excluded from the fit"
         if included := [row for row in rows if row not in rejected]:
@@ -161,10 +161,10 @@ def _row_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> Iterato
             yield (
                 f"{names[path]}: {count} kept in the fit, not far from the other samples: a few do no harm; "
                 "--loss tukey down-weights them"
-                if method == "lm" and outcome.settings["loss"] == "auto"
+                if method == "lm" and outcome.source.settings["loss"] == "auto"
                 else f"{names[path]}: {count} kept in the fit; {option} excludes those far from the others"
             )
-    for path, item in outcome.held_out:
+    for path, item in outcome.data.held_out:
         if rows := [row for row in outcome.held_out_outliers[path] if row in item.rows]:
             yield f"{names[path]}: {_count_outliers(rows, item)} among the hold-out samples"
 

@@ -58,6 +58,13 @@ def files_block(paths: Iterable[object]) -> Block:
     return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
 
 
+def files_screen(
+    paths: Iterable[object], notes: Sequence[str] = (), warnings: Mapping[str, Sequence[str]] | None = None
+) -> Screen:
+    """Describe the files that were written, below notes and warnings."""
+    return Screen([notes_block(notes), warnings_block(warnings or {}), files_block(paths)])
+
+
 def validation_screen(
     title: str,
     accuracies: Mapping[str, Accuracy],

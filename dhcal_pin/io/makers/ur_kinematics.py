@@ -25,7 +25,7 @@ from ...robot.dh import DHTable
 from ...robot.urdf import MAX_ORIGIN
 from ..origins_file import ORIGIN_KEYS
 from ..robot_format import ConvertedRobot, RobotSource
-from ..tabular import parse_number, read_text
+from ..tabular import parse_number, read_text, yaml_number
 
 # Joints of a UR arm, and the names of their origins in the file.
 UR_JOINTS = {
@@ -76,15 +76,9 @@ def ur_kinematics_text(chain: Chain) -> str:
     """Return the text of a UR kinematics file."""
     lines = ["kinematics:"]
     for name, origin in ur_kinematics(chain).items():
-        lines += [f"  {name}:", *(f"    {key}: {_yaml_number(value)}" for key, value in origin.items())]
+        lines += [f"  {name}:", *(f"    {key}: {yaml_number(value)}" for key, value in origin.items())]
     digest = int(hashlib.sha256("\n".join(lines).encode()).hexdigest()[:_HASH_DIGITS], 16)
     return "\n".join([*lines, f"  hash: calib_{digest}", ""])
-
-
-def _yaml_number(value: float) -> str:
-    """Write a number that YAML 1.1 reads as a number: with a decimal point even before an exponent."""
-    mantissa, *exponent = repr(value).split("e")
-    return "e".join([mantissa if "." in mantissa else f"{mantissa}.0", *exponent])
 
 
 def read_ur_kinematics(path: PathLike) -> DHTable:

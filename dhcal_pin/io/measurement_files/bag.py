@@ -56,23 +56,6 @@ class _PoseSample(NamedTuple):
     quaternion: Any
 
 
-class RecordedJoints(NamedTuple):
-    """Joint positions with two times of each message [s], columns of (k, 2): its header, its recording."""
-
-    names: tuple[str, ...]
-    times: Array
-    q: Array
-
-
-class _RecordedPoses(NamedTuple):
-    """Poses with two times of each message [s], columns of (p, 2): its header, its recording."""
-
-    times: Array
-    positions: Array
-    rotations: Array | None
-    frame: str
-
-
 # Function that takes position and rotation from a message of each type.
 POSE_TYPES: Mapping[str, Callable[[Any], _PoseSample]] = {
     "geometry_msgs/msg/PoseStamped": lambda m: _PoseSample(m.header, m.pose.position, m.pose.orientation),
@@ -89,13 +72,6 @@ POSE_TYPES: Mapping[str, Callable[[Any], _PoseSample]] = {
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
-class ConvertedBag(NamedTuple):
-    """Measurement file made from a recording."""
-
-    text: str  # Text of the CSV file
-    notes: list[str]  # Sentences on the recording
-
-
 def is_bag(path: PathLike) -> bool:
     """Return whether a path is that of a recording: by its ending, or a folder of ROS 2."""
     return os.fspath(path).lower().endswith(ENDINGS) or os.path.exists(os.path.join(path, "metadata.yaml"))
@@ -103,8 +79,8 @@ def is_bag(path: PathLike) -> bool:
 
 def convert_bag(
     path: PathLike, pose_topic: str | None, joint_topic: str | None, chain: Chain | None
-) -> ConvertedBag:
-    """Make a measurement file from the stops of a recording."""
+) -> tuple[str, list[str]]:
+    """Make the text of a measurement file from the stops of a recording; return it, and notes."""
     source = os.fspath(path)
     with _open_bag(source) as reader:
         joint_topic = _choose_joint_topic(reader, source, joint_topic)
@@ -134,10 +110,10 @@ def convert_bag(
     ]
     if stops.n_without_poses:
         notes.append(f"left out {format_count(stops.n_without_poses, 'stop')} without a pose")
-    return ConvertedBag(_stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes)
+    return _stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes
 
 
-def read_bag_joints(path: PathLike, joint_topic: str | None) -> RecordedJoints:
+def read_bag_joints(path: PathLike, joint_topic: str | None) -> JointSeries:
     """Read all joint positions of a recording."""
     source = os.fspath(path)
     with _open_bag(source) as reader:
@@ -251,7 +227,7 @@ def _stamp(header: Any) -> float:
     return header.stamp.sec + header.stamp.nanosec * _NANO
 
 
-def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None) -> RecordedJoints:
+def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None) -> JointSeries:
     """Read the joint positions, of the robot's joints only if it is known."""
     times, rows = [], []
     current: dict[str, float] = {}
@@ -276,12 +252,10 @@ def _read_joints(reader: AnyReader, source: str, topic: str, chain: Chain | None
     complete = [i for i, row in enumerate(rows) if len(row) == len(names) and np.isfinite(row).all()]
     if not complete:
         raise FileFormatError(f"{source}: {topic} has no finite joint positions")
-    return RecordedJoints(
-        names, np.array([times[i] for i in complete]), np.array([rows[i] for i in complete])
-    )
+    return JointSeries(names, np.array([times[i] for i in complete]), np.array([rows[i] for i in complete]))
 
 
-def _read_poses(reader: AnyReader, source: str, spec: str) -> _RecordedPoses:
+def _read_poses(reader: AnyReader, source: str, spec: str) -> PoseSeries:
     """Read positions or poses."""
     topic, _, child = spec.partition(_FRAME_SEPARATOR)
     # The property makes a new dictionary of all topics each time.
@@ -301,7 +275,7 @@ def _read_poses(reader: AnyReader, source: str, spec: str) -> _RecordedPoses:
     if not positions:
         raise FileFormatError(f"{source}: {spec} has no finite positions")
     rotations = _rotations(np.array(quaternions), f"{source}: {spec}") if quaternions else None
-    return _RecordedPoses(np.array(times), np.array(positions, float), rotations, frame)
+    return PoseSeries(np.array(times), np.array(positions, float), rotations, frame)
 
 
 def _samples_of(message_type: str, message: Any, child: str) -> Iterator[_PoseSample]:
@@ -328,7 +302,7 @@ def _have_common_times(first: Array, second: Array) -> bool:
     return is_set and bool(first.min() <= second.max() and second.min() <= first.max())
 
 
-def _in_order(joints: RecordedJoints, poses: _RecordedPoses, clock: int) -> tuple[JointSeries, PoseSeries]:
+def _in_order(joints: JointSeries, poses: PoseSeries, clock: int) -> tuple[JointSeries, PoseSeries]:
     """Return the series in the order of one clock, without repeated times."""
     joint_times, i = np.unique(joints.times[:, clock], return_index=True)
     pose_times, j = np.unique(poses.times[:, clock], return_index=True)

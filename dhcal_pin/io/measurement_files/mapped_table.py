@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,49 +26,19 @@ _MAX_ORTHOGONALITY_ERROR = 1e-3
 _MAX_LISTED_NAMES = 30
 
 
-@dataclass(frozen=True)
-class _VendorTable:
-    """File of another maker with the map of its columns."""
-
-    table: DataTable  # Table of the file
-    column_map: ColumnMap
-
-    def column_index(self, name: str | int) -> int | None:
-        """Return the index of a column, counted from 0; None if it is absent."""
-        headers = self.table.headers
+def _find_columns(table: DataTable, column_map: ColumnMap) -> dict[str | int, int | None]:
+    """Return the index of each column that a map names, counted from 0; None if the file lacks it."""
+    found: dict[str | int, int | None] = {}
+    for name in column_map.source_columns:
         if isinstance(name, int):
-            return name - 1 if name <= len(headers) else None
-        if headers.count(name) > 1:
+            found[name] = name - 1 if name <= len(table.headers) else None
+        elif table.headers.count(name) > 1:
             raise FileFormatError(
-                f"{self.table.header_location}: column {name!r} appears twice; give its number in the map"
+                f"{table.header_location}: column {name!r} appears twice; give its number in the map"
             )
-        return headers.index(name) if name in headers else None
-
-    def index(self, name: str | int) -> int:
-        """Return the index of a column that the file has."""
-        index = self.column_index(name)
-        assert index is not None
-        return index
-
-    def missing_columns(self) -> list[str | int]:
-        """Return the columns of the map that the file does not have."""
-        return [name for name in self.column_map.source_columns if self.column_index(name) is None]
-
-    def without_bad_rows(self) -> _VendorTable:
-        """Return the table without the rows that lack a number."""
-        rotation = self.column_map.rotation.columns if self.column_map.rotation else ()
-        rules = [rule.source_column for rule in self.column_map.rules if rule.content != "text"]
-        indices = [self.index(name) for name in (*rules, *rotation)]
-        return replace(self, table=self.table.without_bad_rows(indices))
-
-    def text(self, name: str | int) -> list[str]:
-        """Return the cells of a column."""
-        index = self.index(name)
-        return [row[index].strip() for row in self.table.cells]
-
-    def values(self, name: str | int) -> Array:
-        """Return the numbers of a column, shape (m,)."""
-        return self.table.values(self.index(name))
+        else:
+            found[name] = table.headers.index(name) if name in table.headers else None
+    return found
 
 
 def read_mapped_table(
@@ -83,25 +53,29 @@ def read_mapped_table(
     native = TextLayout(sheet=sheet, names=known)
     if _is_native(source, native, known) and not _matches(source, column_map):
         return read_table(source, native)
-    vendor = _VendorTable(read_table(source, column_map.layout), column_map)
-    table = vendor.table
-    euler_angles = None
+    table = read_table(source, column_map.layout)
+    rotation, euler_angles = column_map.rotation, None
     with table.notes_in_errors():
-        if missing := vendor.missing_columns():
+        indices = _find_columns(table, column_map)
+        if missing := [name for name, index in indices.items() if index is None]:
             raise FileFormatError(
                 f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the "
                 f"file ({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
             )
-        vendor = vendor.without_bad_rows()
+        index = {name: found for name, found in indices.items() if found is not None}
+        numbers = [rule.source_column for rule in column_map.rules if rule.content != "text"]
+        turns = [index[name] for name in rotation.columns] if rotation else []
+        table = table.without_bad_rows([*(index[name] for name in numbers), *turns])
         columns = {
-            column_header(rule.name, rule.unit): _apply_rule(vendor, rule) for rule in column_map.rules
+            column_header(rule.name, rule.unit): _apply_rule(table, index[rule.source_column], rule)
+            for rule in column_map.rules
         }
-        if column_map.rotation:
-            euler_angles = _read_euler_angles(vendor, column_map.rotation)
-            columns |= _rotation_columns(vendor, column_map.rotation, euler_angles)
+        if rotation:
+            values = [table.values(i) for i in turns]
+            euler_angles = _read_euler_angles(table, values, rotation)
+            columns |= _rotation_columns(table, values, rotation, euler_angles)
     for name, text in column_map.constants.items():
-        columns[name] = [_fill_placeholders(text, source)] * len(vendor.table.lines)
-    table = vendor.table
+        columns[name] = [_fill_placeholders(text, source)] * len(table.lines)
     return DataTable.from_columns(
         table.source,
         columns,
@@ -137,35 +111,34 @@ def _matches(source: PathLike | Any, column_map: ColumnMap) -> bool:
     if not column_map.layout.has_header:
         return False
     try:
-        return not _VendorTable(read_table(source, column_map.layout), column_map).missing_columns()
+        return None not in _find_columns(read_table(source, column_map.layout), column_map).values()
     except DhcalError:
         return False
 
 
-def _apply_rule(vendor: _VendorTable, rule: ColumnRule) -> Array | list[str]:
-    """Return the values of a column of the project, (m,)."""
+def _apply_rule(table: DataTable, index: int, rule: ColumnRule) -> Array | list[str]:
+    """Return the values of a column of the project, (m,), from that of the vendor with an index."""
     if rule.content == "text":
-        return vendor.text(rule.source_column)
-    values = vendor.values(rule.source_column)
+        return [row[index].strip() for row in table.cells]
+    values = table.values(index)
     return values if (rule.scale, rule.offset) == (1.0, 0.0) else rule.scale * values + rule.offset
 
 
-def _read_euler_angles(vendor: _VendorTable, notation: Rotation) -> EulerAngles | None:
-    """Read the Euler angles of a file; NaN for matrices, None for rotation vectors and quaternions."""
+def _read_euler_angles(table: DataTable, columns: list[Array], notation: Rotation) -> EulerAngles | None:
+    """Return the Euler angles of columns (m,); NaN for matrices, None for vectors and quaternions."""
     if notation.convention in ("rotvec", "quaternion"):
         return None
-    lines = np.array(vendor.table.lines)
+    lines = np.array(table.lines)
     if notation.convention == "matrix":
         return EulerAngles("", lines, np.full((len(lines), 3), np.nan))
-    angles = np.stack([vendor.values(name) for name in notation.columns], -1) / ANGLES[notation.unit]
+    angles = np.stack(columns, -1) / ANGLES[notation.unit]
     return EulerAngles(euler_notation(notation.axes, notation.frame), lines, angles)
 
 
 def _rotation_columns(
-    vendor: _VendorTable, notation: Rotation, euler: EulerAngles | None
+    table: DataTable, columns: list[Array], notation: Rotation, euler: EulerAngles | None
 ) -> dict[str, Array | list[str]]:
     """Return the values (m,) of each column of the project that holds the rotation, by header cell."""
-    columns = [vendor.values(name) for name in notation.columns]
     if notation.convention in ("rotvec", "quaternion"):
         names = ROTVEC if notation.convention == "rotvec" else [f"q{letter}" for letter in notation.order]
         return {
@@ -174,7 +147,7 @@ def _rotation_columns(
     if euler is not None and euler.notation:
         rotations = angles_to_matrix(euler.angles, euler.notation)
     else:
-        rotations = _orthonormalized(np.stack(columns, -1).reshape(-1, 3, 3), vendor.table)
+        rotations = _orthonormalized(np.stack(columns, -1).reshape(-1, 3, 3), table)
     components = np.ascontiguousarray(se3.log3(rotations).T)
     return {column_header(name, "rad"): column for name, column in zip(ROTVEC, components, strict=True)}
 

@@ -435,15 +435,8 @@ def _parse_quaternion(table: DataTable) -> Array:
 
 def _parse_group(table: DataTable, names: Sequence[str], units: Mapping[str, float] | None) -> Array | None:
     """Parse k columns that belong together, shape (m, k), in SI units; return None if all are absent."""
-    missing = [name for name in names if name not in table.columns]
-    if len(missing) == len(names):
+    if not _has_all(table, names):
         return None
-    if missing:
-        present = [name for name in names if name in table.columns]
-        raise FileFormatError(
-            f"{table.header_location}: {', '.join(present)} without {missing[0]!r}; "
-            f"give {','.join(names)} or none"
-        )
     columns = [table.columns[name] for name in names]
     if units is not None:
         return np.stack([table.to_si(column, units) for column in columns], -1)
@@ -464,13 +457,19 @@ def _require_all_sigmas(table: DataTable, kind: type[Measurement], values: Mappi
     """Raise an error if some standard deviations are given without the others."""
     wanted = [f"sigma_{name}" for name in kind.columns if name in values and f"sigma_{name}" in kind.columns]
     wanted = wanted or [name for name in kind.columns if name.startswith("sigma_")]
-    given = [name for name in wanted if name in values]
-    if given and len(given) < len(wanted):
-        missing = next(name for name in wanted if name not in values)
+    _has_all(table, wanted)
+
+
+def _has_all(table: DataTable, names: Sequence[str]) -> bool:
+    """Return whether a table has columns that belong together; raise an error if some of them are missing."""
+    present = [name for name in names if name in table.columns]
+    if present and len(present) < len(names):
+        missing = next(name for name in names if name not in present)
         raise FileFormatError(
-            f"{table.header_location}: {', '.join(given)} without {missing!r}; "
-            f"give {','.join(wanted)} or none"
+            f"{table.header_location}: {', '.join(present)} without {missing!r}; "
+            f"give {','.join(names)} or none"
         )
+    return bool(present)
 
 
 def _parse_holdout_mask(table: DataTable) -> Array:

@@ -46,7 +46,7 @@ class JointSeries:
     """Recorded joint positions."""
 
     names: tuple[str, ...]
-    times: Array  # Times, ascending, shape (k,) [s]
+    times: Array  # Times, ascending, shape (k,) [s]; (k, 2) before a clock is chosen: header, recording
     q: Array  # Joint positions, shape (k, n) [rad or m]
 
 
@@ -54,7 +54,7 @@ class JointSeries:
 class PoseSeries:
     """Recorded positions or poses of the tool."""
 
-    times: Array  # Times, ascending, shape (p,) [s]
+    times: Array  # Times, ascending, shape (p,) [s]; (p, 2) before a clock is chosen, as of the joints
     positions: Array  # Positions, shape (p, 3) [m]
     rotations: Array | None  # Rotations, shape (p, 3, 3); None for a series of positions
     frame: str  # Name of the frame that they are measured in

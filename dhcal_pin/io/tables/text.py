@@ -143,8 +143,6 @@ class _TextRows(Sequence[list[str]]):
         return len(self._rows)
 
     def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return _TextRows(self._rows[index], self._split)
         return self._split(self._rows[int(index)])
 
 
