@@ -33,6 +33,7 @@ from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
 from . import cameras
+from .contradictions import MIN_RATIO, own_fit_ratio
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .model_selection import FULL_SET
@@ -84,6 +85,8 @@ MAX_FITTED_SHARE = 0.1
 MAX_ZERO = np.deg2rad(40.0)
 # Largest share of outliers of a measurement that needs no caution.
 MAX_OUTLIER_SHARE = 0.1
+# Smallest error of a measurement that may contradict others, as a fraction of that of the nominal robot.
+MIN_CONTRADICTION = 1e-3
 # Largest share of outliers of one of several measurements that needs no caution.
 MAX_FILE_OUTLIER_SHARE = 0.5
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
@@ -433,7 +436,7 @@ def _hand_eye_images(fit: Evidence) -> list[Finding]:
 
 
 def _contradictions(fit: Evidence) -> list[Finding]:
-    """Advise caution if measurements contradict others: a file of outliers, or images that are displaced."""
+    """Advise caution if measurements contradict others: a file of outliers or with another arm, or images."""
     if len(fit.data) < 2 or (fit.hand_eye and not fit.hand_eye.is_noise):
         return []
     texts = [
@@ -443,10 +446,33 @@ def _contradictions(fit: Evidence) -> list[Finding]:
         for item, mask in zip(fit.data, fit.is_counted, strict=True)
         if np.mean(~mask) > MAX_FILE_OUTLIER_SHARE
     ]
+    texts = texts or _contradicting_files(fit)
     if not texts and fit.camera_stages:
         solved = Fit(fit.data, fit.problem, fit.solution, tuple(fit.weights))
         texts = [cameras.describe_contradiction(solved, fit.comparisons[-1].after)]
     return [Finding("caution", text) for text in texts if text]
+
+
+def _contradicting_files(fit: Evidence) -> list[str]:
+    """Name the measurements beside images that an arm of their own fits far better than the arm of all."""
+    texts = []
+    for item, comparison in zip(fit.inlier_problem.data, fit.file_comparisons, strict=True):
+        if item.rig is not None or not comparison.after.groups:
+            continue
+        name, after = next(iter(comparison.after.groups.items()))
+        if after.rms <= MIN_CONTRADICTION * comparison.before.groups[name].rms:
+            continue
+        ratio = own_fit_ratio(fit.inlier_problem, fit.solution.x, item)
+        if ratio < MIN_RATIO:
+            continue
+        both = (after.rms, after.rms / ratio)
+        common, own = (format_quantity(rms, after.unit, rms / 10, small=True) for rms in both)
+        texts.append(
+            f"{item.source or item.kind} contradicts the other measurements: its error is {common} after the "
+            f"fit of all, and about {own} after a fit of it alone. Check the zeros and signs of the joints, "
+            "the units and the scale of all, and calibrate each by itself."
+        )
+    return texts
 
 
 def _weak_positions(fit: Evidence) -> list[Finding]:
