@@ -380,8 +380,13 @@ def _root(
     a: Chain, b: Chain, pair: tuple[Uncertainty | None, Uncertainty | None], q: Array, lever: float, n: int
 ) -> Array:
     """Return the root of the covariance of the displacements without base and tool, (m·n, r)."""
-    parts = [_effects(c, u, q, lever) for c, u in zip((a, b), pair, strict=True) if u is not None]
-    return _without_frames(a, q, lever, n, np.concatenate(parts, 2))
+    # Base and tool of each calibration by themselves: measurements may leave them undetermined.
+    parts = [
+        _without_frames(c, q, lever, n, _effects(c, u, q, lever))
+        for c, u in zip((a, b), pair, strict=True)
+        if u is not None
+    ]
+    return np.hstack(parts)
 
 
 def _expected(a, b, pair, q: Array, lever: float, n: int) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
-from ..formatting import format_fixed, format_quantity
+from ..formatting import format_fixed, format_quantity, significant_decimals
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .causes import Block, Cause, Drift, FreeDrift, Step
@@ -195,11 +195,14 @@ class Scale:
     @property
     def finding(self) -> str:
         """What was found."""
-        percent = f"{abs(100 * (self.factor - 1)):.2g} %"
+        change, std = abs(100 * (self.factor - 1)), 100 * self.std
         if self.axis:
+            percent = f"{change:.2g} %"
             word = "long" if self.factor > 1 else "short"
             return f"Measured {self.axis} is {percent} too {word} compared with the other axes."
         word = "longer" if self.factor > 1 else "shorter"
+        decimals = significant_decimals(std)
+        percent = f"{format_fixed(change, decimals)} ± {format_fixed(std, decimals)} %"
         return f"The correction makes the whole robot {percent} {word}."
 
     @property

@@ -15,6 +15,7 @@ from sessions import ANGLE_NOISE, NOISE, Simulation
 from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.diagnostics import Calibrated, Difference, compare
+from dhcal_pin.diagnostics.difference import STATISTICS
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io.robot import write_urdf
 from dhcal_pin.measurements import Measurement, Pose, Position
@@ -67,6 +68,17 @@ def reduced(found: Difference) -> float:
     """Return the reduced chi-square of residuals and parameters."""
     assert found.overall is not None
     return found.overall.reduced
+
+
+@pytest.mark.parametrize("arm", ["ur10", "panda", "xarm7"])
+def test_a_calibrated_robot_differs_from_the_nominal_one(arm):
+    """Positions do not determine the orientation of the tool, which no distance depends on."""
+    sim = Simulation(arm, 60, 3)
+    fit = calibration(sim, sim.measure(Position))
+    found = compare(Calibrated(sim.chain), fit)
+    assert found.verdict == "different"
+    assert found.everywhere.expected is not None
+    assert found.everywhere.expected < 5 * NOISE < STATISTICS["rms"](found.everywhere.position)
 
 
 # Reduced chi-square of robots that the model describes.

@@ -682,9 +682,9 @@ def test_only_an_irregular_drift_has_a_largest_size(shape, by):
 
 
 def test_a_scale_is_stated_in_percent():
-    assert Scale(1.003, 1e-4, "").finding == "The correction makes the whole robot 0.3 % longer."
+    assert Scale(1.003, 1e-4, "").finding == "The correction makes the whole robot 0.300 ± 0.010 % longer."
     assert Scale(1.003, 1e-4, "z").finding == "Measured z is 0.3 % too long compared with the other axes."
-    assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.5 % shorter."
+    assert Scale(0.985, 1e-4, "").finding == "The correction makes the whole robot 1.500 ± 0.010 % shorter."
     assert Scale(0.985, 1e-4, "", ("a.csv", "b.csv")).consequence.endswith(
         "add --mend scale:0.985@a.csv --mend scale:0.985@b.csv."
     )
