@@ -553,7 +553,7 @@ def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypo
                 factors = [value if i in group else 1.0 for i in range(n)]
                 text = f"the values of {label} are {_misread(true, read, value)}"
                 yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
-    for true, read in permutations(("m", "mm", "in"), 2):
+    for true, read in (*permutations(("m", "mm", "in"), 2), *permutations(("mm", "cm"), 2)):
         factor = LENGTHS[read] / LENGTHS[true]
         text = f"measured lengths are {_misread(true, read, factor)}"
         yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(factor))

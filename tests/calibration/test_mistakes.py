@@ -154,6 +154,7 @@ MISTAKES = {
     "metres as millimetres": Mistake(Position, positions(lambda p: p / 1e3), "lengths:m-not-mm"),
     "millimetres as metres": Mistake(Pose, positions(lambda p: 1e3 * p), "lengths:mm-not-m"),
     "millimetres as inches": Mistake(Pose, positions(lambda p: 25.4 * p), "lengths:mm-not-in"),
+    "millimetres as centimetres": Mistake(Position, positions(lambda p: 10 * p), "lengths:mm-not-cm"),
     "rows shifted down": Mistake(Position, shifted_rows(1), "rows:below"),
     "rows shifted up": Mistake(Pose, shifted_rows(-1), "rows:above"),
     "order of quaternions": Mistake(Pose, rotations(quaternions_in_another_order), "quaternions:xyzw"),
