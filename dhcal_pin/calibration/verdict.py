@@ -29,11 +29,11 @@ from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
+from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
 from . import cameras
-from .contradictions import MIN_RATIO, own_fit_ratio
 from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .model_selection import FULL_SET

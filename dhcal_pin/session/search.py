@@ -30,19 +30,23 @@ from itertools import pairwise
 
 import numpy as np
 
+from .. import se3
 from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, residual_of
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
+from .file_bases import place_files
 from .linear_model import Layout, inverse, solve_information, whitened_rows
-from .robot_changes import JointPaths, RobotChanges, apply_changes, update
+from .robot_changes import JointPaths, Motion, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
 # Largest numbers of samples that are examined, and of cells between which steps are tested; the same for the
 # screening that decides whether to search.
 MAX_SAMPLES, MAX_CELLS = 4000, 400
 MAX_SCREENED_SAMPLES, MAX_SCREENED_CELLS = 200, 40
+# Largest rise of the logarithm of the noise from the linear fit at the start to the end of a search.
+MAX_NOISE_RISE = 0.1
 # Largest number of samples among which a lag is looked for.
 MAX_PATH_SAMPLES = 20_000
 # Logarithm of the ratio of the evidences from which the screening calls for a search.
@@ -162,6 +166,18 @@ class _Search:
                 label[:, : item.residual_dim][:, group.rows] = units.index(key)
             labels.append(label)
         return np.concatenate(labels)[self.order]
+
+    def move_base(self, base: Motion) -> None:
+        """Begin with a step of the base at the beginning of each file but the first."""
+        block = next(block for block in self.layout.blocks if block.kind == "base")
+        own = self._base()
+        twists = [se3.log6(se3.inverse(own) @ pose @ own) for pose in base.poses]
+        self.causes = [
+            Cause(block, Step(number), after - before, np.zeros((6, 6)))
+            for number, (before, after) in zip(base.steps, pairwise(twists), strict=True)
+        ]
+        self.changes = RobotChanges(base)
+        self.first_fit = self._fit()
 
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:
@@ -728,11 +744,14 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         _Search(problem, start, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
         for start in (np.zeros_like(x), x)
     ]
+    if moved := place_files(problem, timeline):
+        starts.append(_Search(moved[0], np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS))
+        starts[-1].move_base(moved[1])
     noises = [search.log_noise(search.first_fit) for search in starts]
     search = starts[int(np.argmin(noises))]
     search.run()
     # A search that ends in a wrong minimum says nothing.
-    if search.log_noise(search.solve(search.linearize(), search.causes)) > min(noises):
+    if search.log_noise(search.solve(search.linearize(), search.causes)) > min(noises) + MAX_NOISE_RISE:
         return nothing
     alone = search.with_lag_alone() if len(search.causes) > 1 else None
     if alone and not _is_suspicious(problem, alone.x, alone.corrected_timeline(), is_ordered):
@@ -742,7 +761,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     causes = tuple(search.causes)
     return Session(
         timeline,
-        chain,
+        search.chain,
         is_ordered,
         search.changes,
         causes,

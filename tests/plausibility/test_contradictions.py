@@ -7,8 +7,8 @@ import pytest
 from robots import robot_file
 
 from dhcal_pin import calibrate, read_robot, select_parameters
-from dhcal_pin.calibration.contradictions import MIN_RATIO, own_fit_ratio
 from dhcal_pin.measurements import KINDS, Noise
+from dhcal_pin.plausibility.contradictions import MIN_RATIO, own_fit_ratio
 
 ELBOW = 2
 OTHERS = ("distance", "inclination", "point", "pose")

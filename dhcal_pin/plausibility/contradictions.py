@@ -48,7 +48,8 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)
     u, s, _ = np.linalg.svd(system.r / np.maximum(weights[is_geometric], smallest))
     components = u.T @ (system.z + system.r @ values[is_geometric])
-    variance = common = system.cost / n_rows
+    variance, freedom = system.cost / n_rows, n_rows
+    common = variance
     for _ in range(MAX_ROUNDS):
         kept = variance / (s**2 + variance)
         freedom = n_rows - np.sum(1 - kept)

@@ -1,0 +1,60 @@
+"""Files of one arm whose measuring frames differ by large rotations, against the true arm and motions."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from sessions import Simulation
+
+from dhcal_pin import calibrate
+from dhcal_pin.measurements import Pose, Position
+
+
+def files(sim: Simulation, kind: type, frames: list[pin.SE3]):
+    """Return the measurements of an arm in parts, each in another measuring frame."""
+    data, out = sim.measure(kind), []
+    for i, part in enumerate(np.array_split(np.arange(len(sim.q)), len(frames))):
+        moved = [frames[i] * pin.SE3(pose) for pose in sim_poses(data, part)]
+        if kind is Position:
+            item = Position(data.q[part], np.array([pose.translation for pose in moved]))
+        else:
+            item = Pose(data.q[part], np.array([pose.homogeneous for pose in moved]))
+        out.append(item.replace(source=f"{i}.csv"))
+    return out
+
+
+def sim_poses(data, part: np.ndarray) -> list[np.ndarray]:
+    """Return measured poses; those of positions have no rotation."""
+    poses = np.tile(np.eye(4), (len(part), 1, 1))
+    poses[:, :3, 3] = data.positions()[part]
+    if isinstance(data, Pose):
+        poses[:, :3, :3] = data.rotations()[part]
+    return list(poses)
+
+
+@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize(
+    ("arm", "angles"),
+    [("ur10", (20, 0)), ("panda", (180, 0)), ("xarm7", (60, -100, 0)), ("ur10", (5, 12, 0))],
+)
+def test_each_file_has_its_own_pose_of_the_base(arm, angles, kind):
+    rng = np.random.default_rng(len(angles) + abs(angles[0]))
+    sim = Simulation(arm, 40 * len(angles), 5)
+    axes = rng.standard_normal((len(angles), 3))
+    turns = [pin.exp3(np.deg2rad(a) * v / np.linalg.norm(v)) for a, v in zip(angles, axes, strict=True)]
+    frames = [pin.SE3(turn, rng.normal(0, 1, 3)) for turn in turns]
+    fit = calibrate(sim.chain, files(sim, kind, frames), extend="none")
+    assert fit.session is not None
+    events = fit.session.events
+    assert [(event.kind, event.before.file, event.after.file) for event in events] == [
+        ("base", f"{i}.csv", f"{i + 1}.csv") for i in range(len(angles) - 1)
+    ]
+    motion = fit.session.changes.base.poses
+    found = [np.linalg.norm(pin.log3((b @ np.linalg.inv(a))[:3, :3])) for a, b in pairwise(motion)]
+    true = [np.linalg.norm(pin.log3((b * a.inverse()).rotation)) for a, b in pairwise(frames)]
+    np.testing.assert_allclose(found, true, atol=1e-3)
+    assert fit.verdict.status == "caution"
+    assert sim.true_error(fit.chain) < 1e-4
