@@ -56,8 +56,8 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
         new = (system.min_cost + np.sum((kept * components) ** 2)) / freedom if freedom > 0 else np.inf
         if not abs(new - variance) > MIN_CHANGE * variance:
             break
-        variance = new
-    if not np.isfinite(variance) or variance <= 0:
+        variance = max(new, np.finfo(float).tiny)
+    if not np.isfinite(variance):
         return 1.0
     from scipy.special import fdtrc  # lazy import: slow
 
