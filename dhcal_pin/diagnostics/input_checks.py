@@ -148,7 +148,10 @@ def poorly_fitted_files(
             if other != path and names & {parameter.name for parameter in data[other].instrument_parameters}
         ]
         for group, errors in all_errors.items():
-            median = float(np.median(np.linalg.norm(errors, axis=1)))
+            norms = np.linalg.norm(errors, axis=1)
+            # A corner behind its camera has no error.
+            norms = norms[np.isfinite(norms)]
+            median = float(np.median(norms)) if len(norms) else 0.0
             si_unit = ERROR_GROUPS[error_group(group)].unit
             if median <= limits[si_unit]:
                 continue

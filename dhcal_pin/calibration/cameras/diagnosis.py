@@ -188,7 +188,10 @@ class HandEyeDiagnosis:
     @property
     def error_sentence(self) -> str:
         """Error of left-out images and noise, in millimetres and in pixels."""
-        text = f"Error of left-out images: {_mm(self.error.distance)} at the board ({_px(self.error.pixels)})"
+        at_board = f"{_mm(self.error.distance)} at the board ({_px(self.error.pixels)})"
+        # A corner behind its camera has no error at the board.
+        size = at_board if np.isfinite(self.error.distance) else _px(self.error.pixels)
+        text = f"Error of left-out images: {size}"
         if self.error.pixels > MAX_LINEAR_ERROR:
             return f"{text}."
         noise = f"{_mm(self.noise.distance)} ({_px(self.noise.pixels)})"
