@@ -36,18 +36,24 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
 
     It is 1 if chance may make it as large.
     """
-    own = replace(problem, data=(item,))
-    names, n_errors = [u.name for u in problem.instrument_parameters], len(problem.errors.parameters)
-    used = [*range(n_errors), *(n_errors + names.index(u.name) for u in own.instrument_parameters)]
-    values, weights = x[used], problem.weights[used]
-    system = linearize_and_factor(own, values, small_angle=False)
-    is_geometric = np.ones(len(used), bool)
-    is_geometric[:n_errors] = [p.coefficient_index is None for p in problem.errors.parameters]
-    system, n_rows = system.select(is_geometric), item.residual_dim * len(item.rows)
-    effects = system.column_norms
+    errors, n_errors = problem.errors, len(problem.errors.parameters)
+    geometric = tuple(p for p in errors.parameters if p.coefficient_index is None)
+    # Increments of the geometric errors, which come first, and of the unknowns of the instrument.
+    own = replace(
+        problem,
+        errors=replace(errors, chain=problem.chain(x), parameters=geometric),
+        data=(item,),
+        bounds=None,
+    )
+    names = [u.name for u in problem.instrument_parameters]
+    used = [n_errors + names.index(u.name) for u in own.instrument_parameters]
+    values, weights = (each[[*range(len(geometric)), *used]] for each in (x, problem.weights))
+    start = np.concatenate([np.zeros(len(geometric)), x[used]])
+    system = linearize_and_factor(replace(own, weights=weights), start, small_angle=False)
+    n_rows, effects = item.residual_dim * len(item.rows), system.column_norms
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)
-    u, s, _ = np.linalg.svd(system.r / np.maximum(weights[is_geometric], smallest))
-    components = u.T @ (system.z + system.r @ values[is_geometric])
+    u, s, _ = np.linalg.svd(system.r / np.maximum(weights, smallest))
+    components = u.T @ (system.z + system.r @ values)
     variance, freedom = system.cost / n_rows, n_rows
     common = variance
     for _ in range(MAX_ROUNDS):
