@@ -27,6 +27,8 @@ MIN_RATIO = 4.0
 MAX_CHANCE = 1e-4
 # Largest number of rounds of the noise, and change that ends them.
 MAX_ROUNDS, MIN_CHANGE = 50, 1e-3
+# Smallest number of degrees of freedom of a fit that shows the noise.
+MIN_FREEDOM = 1.0
 # Smallest weight of a prior, as a fraction of the effect of its unknown on the rows.
 MIN_WEIGHT = 1e-9
 
@@ -54,17 +56,18 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)
     u, s, _ = np.linalg.svd(system.r / np.maximum(weights, smallest))
     components = u.T @ (system.z + system.r @ values)
-    variance, freedom = system.cost / n_rows, n_rows
+    variance, freedom = system.cost / n_rows, float(n_rows)
     common = variance
     for _ in range(MAX_ROUNDS):
         kept = variance / (s**2 + variance)
-        freedom = n_rows - np.sum(1 - kept)
-        new = (system.min_cost + np.sum((kept * components) ** 2)) / freedom if freedom > 0 else np.inf
-        if not abs(new - variance) > MIN_CHANGE * variance:
-            break
+        freedom = n_rows - float(np.sum(1 - kept))
+        if freedom < MIN_FREEDOM:
+            return 1.0
+        new = (system.min_cost + float(np.sum((kept * components) ** 2))) / freedom
+        has_settled = abs(new - variance) <= MIN_CHANGE * variance
         variance = max(new, np.finfo(float).tiny)
-    if not np.isfinite(variance):
-        return 1.0
+        if has_settled:
+            break
     from scipy.special import fdtrc  # lazy import: slow
 
     is_chance = fdtrc(n_rows, freedom, common / variance) > MAX_CHANCE

@@ -19,6 +19,8 @@ from .timeline import Timeline
 
 # Smallest rotation between two files for which the base is placed in each of them [rad].
 MIN_ROTATION = np.deg2rad(10.0)
+# Smallest number of samples of a file in which the base is placed.
+MIN_SAMPLES = 6
 # Largest number of iterations of the fit of the frames.
 MAX_ITERATIONS = 20
 
@@ -37,13 +39,11 @@ def place_files(problem: Problem, timeline: Timeline) -> tuple[Problem, Motion] 
     is_base_free = any(p.error_frame == BASE_FRAME for p in problem.errors.parameters)
     if not is_base_free or len(parts) < 2 or len(parts) != len(timeline.file_starts) + 1:
         return None
+    files = [tuple(problem.data[i] for i in parts[file]) for file in sorted(parts)]
+    if min(sum(len(item.rows) for item in file) for file in files) < MIN_SAMPLES:
+        return None
     errors = problem.errors
-    chains = [
-        initialize_frames(
-            errors, tuple(problem.data[i] for i in parts[file]), problem.known, MAX_ITERATIONS
-        ).chain
-        for file in sorted(parts)
-    ]
+    chains = [initialize_frames(errors, file, problem.known, MAX_ITERATIONS).chain for file in files]
     last = chains[-1]
     poses = np.array([chain.base @ se3.inverse(last.base) for chain in chains])
     if max(np.linalg.norm(se3.log3(pose[:3, :3])) for pose in poses) < MIN_ROTATION:

@@ -58,3 +58,18 @@ def test_each_file_has_its_own_pose_of_the_base(arm, angles, kind):
     np.testing.assert_allclose(found, true, atol=1e-3)
     assert fit.verdict.status == "caution"
     assert sim.true_error(fit.chain) < 1e-4
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_a_file_with_few_rows_moves_nothing(kind, count):
+    sim = Simulation("ur10", 60, 5)
+    data = sim.measure(kind)
+    parts = [
+        data.take(part).replace(source=f"{i}.csv")
+        for i, part in enumerate(np.split(np.arange(60), [60 - count]))
+    ]
+    fit = calibrate(sim.chain, parts, extend="none")
+    assert fit.verdict.status == "ok"
+    assert fit.session is not None
+    assert not fit.session.found
