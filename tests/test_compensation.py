@@ -19,8 +19,7 @@ from dhcal_pin.cli import main
 from dhcal_pin.compensation import compensate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_targets
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import read_targets, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain, DHTable
 

@@ -24,8 +24,7 @@ from robots import random_table, robot_file, with_masses
 from dhcal_pin import se3
 from dhcal_pin.cli import main
 from dhcal_pin.exceptions import InvalidArgumentError
-from dhcal_pin.io import read_robot
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import read_robot, write_urdf
 from dhcal_pin.model_code import model_code
 from dhcal_pin.robot import FAMILIES, Chain
 

@@ -22,8 +22,7 @@ import numpy as np
 
 from .. import _kernels
 from ..calibration.procedure import calibrate
-from ..io import read_dh, read_robot, shipped_file
-from ..io.robot import write_urdf
+from ..io import read_dh, read_robot, shipped_file, write_urdf
 from ..measurements import Noise, Pose
 from ..robot import Chain
 from ..ros_packages import example_robots

@@ -51,7 +51,7 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
     used = [n_errors + names.index(u.name) for u in own.instrument_parameters]
     values, weights = (each[[*range(len(geometric)), *used]] for each in (x, problem.weights))
     start = np.concatenate([np.zeros(len(geometric)), x[used]])
-    system = linearize_and_factor(replace(own, weights=weights), start, small_angle=False)
+    system = linearize_and_factor(own, start, small_angle=False)
     n_rows, effects = item.residual_dim * len(item.rows), system.column_norms
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)
     u, s, _ = np.linalg.svd(system.r / np.maximum(weights, smallest))

@@ -17,7 +17,7 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.diagnostics import Calibrated, Difference, compare
 from dhcal_pin.diagnostics.difference import STATISTICS
 from dhcal_pin.exceptions import InvalidArgumentError
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import write_urdf
 from dhcal_pin.measurements import Measurement, Pose, Position
 from dhcal_pin.robot import Chain
 

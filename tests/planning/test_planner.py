@@ -15,8 +15,7 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_configurations, read_robot, read_uncertainty
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import read_configurations, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import (
     KINDS,
     Inclination,

@@ -15,8 +15,7 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import ZERO_WEIGHT, reject_groups, standardized_residuals
 from dhcal_pin.exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
-from dhcal_pin.io import measurement_text, read_measurements, read_robot
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import measurement_text, read_measurements, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Position
 from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.robot import Chain, Conditions

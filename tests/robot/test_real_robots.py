@@ -15,8 +15,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import PARAMETER_SETS, Problem, linearize_and_factor, qr, select_parameters
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import read_robot
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.paper import crosscheck
 from dhcal_pin.paper.jacobian_check import kernel_jacobian, regressor_jacobian

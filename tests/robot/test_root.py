@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from dhcal_pin import Chain, select_parameters
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import write_urdf
 from dhcal_pin.robot.urdf import read_urdf
 from dhcal_pin.ros_packages import resolve_robot_path
 

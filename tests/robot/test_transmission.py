@@ -16,8 +16,7 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import PARAMETER_SETS, select_parameters
 from dhcal_pin.estimation.batch import ChainBatch
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import measurement_text, read_robot
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload, parse_urdf
 from dhcal_pin.robot.transmission import (

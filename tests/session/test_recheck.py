@@ -16,8 +16,7 @@ from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 from dhcal_pin import Result, calibrate
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
-from dhcal_pin.io import measurement_text, read_robot, read_uncertainty
-from dhcal_pin.io.robot import write_urdf
+from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
 from dhcal_pin.planning import change_options, plan
 from dhcal_pin.session import Recheck, recheck
