@@ -150,7 +150,7 @@ class Simulation:
         around = np.array([[1.5, 0, -1], [-1.2, 1.3, -1], [-1, -1.4, -1], [0.2, 0.3, 2.2]])
         anchors = self.base.translation + around
         lengths = np.linalg.norm(pose.positions()[:, None] - anchors, axis=2)
-        return Wires(self.q, lengths, anchors=anchors)
+        return Wires(self.q, lengths, anchors=anchors, offsets=0.0)
 
     def measure_targets(self, changes: Changes | None = None) -> MultiTargetPosition:
         """Return the positions of three targets on the tool, one after the other at each configuration."""

@@ -1,6 +1,6 @@
 """Lengths: wires from anchors to the tool point, and distances between two positions of the tool point.
 
-    wire          h = |p - anchor| + offset      anchor and offset may be unknown
+    wire          h = |p - anchor| + offset      anchor and offset are unknown unless given
     distance      h = |p_b - p_a|                two configurations a and b
 
 The derivative by p is the unit vector along the wire or from p_a to p_b.
@@ -70,7 +70,7 @@ class Wires(PointMeasurement):
         lengths: ArrayLike,
         sigma: ArrayLike | None = None,
         anchors: ArrayLike | None = None,
-        offsets: ArrayLike | None = 0.0,
+        offsets: ArrayLike | None = None,
     ) -> None:
         """Check and store measured lengths.
 
@@ -79,7 +79,7 @@ class Wires(PointMeasurement):
             lengths: Measured lengths, (m, w), or (m,) for one wire [m].
             sigma: Standard deviations, one number or (m, w) [m]; estimated with the fit if None.
             anchors: Anchors, (w, 3) [m]; estimated with the fit if None.
-            offsets: Constants that the lengths contain, one number or (w,) [m]; estimated if None.
+            offsets: Constants that the lengths contain, one number or (w,) [m]; estimated with the fit if None.
 
         Raises:
             InvalidArgumentError: The offsets are neither one number nor one per wire.

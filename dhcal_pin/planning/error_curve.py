@@ -40,7 +40,9 @@ def error_curve(goal: DesignGoal, found: Selection, rng: np.random.Generator) ->
     larger_sizes = np.arange(count, len(larger) + 1)
     errors += goal.expected.after_first(larger, larger_sizes)
     all_sizes = np.arange(smallest, len(larger) + 1)
-    log_errors = np.interp(np.log(all_sizes), np.log([*sizes, *larger_sizes]), np.log(errors))
+    # Any pose that is added to a plan lowers its error.
+    lowest = np.minimum.accumulate(errors)
+    log_errors = np.interp(np.log(all_sizes), np.log([*sizes, *larger_sizes]), np.log(lowest))
     return all_sizes, np.exp(log_errors)
 
 

@@ -199,6 +199,7 @@ def test_instruments_must_be_known(sim_6dof):
     points = truth.poses(data.q)[:, :3, 3]
     anchors = points.mean(0) + [-1.5, 0, 0] + 0.3 * np.array([[0, 0, 1], [0, 0.866, -0.5], [0, -0.866, -0.5]])
     known = {f"wire{i + 1}.{axis}": anchors[i, j] for i in range(3) for j, axis in enumerate("xyz")}
+    known |= {f"wire{i + 1}.zero": 0.0 for i in range(3)}
     found = solve_batch(BatchProblem.from_models([errors] * 2, [[data]] * 2, 1 / errors.priors, known))
     alone = minimize(Problem(errors, (data,), 1 / errors.priors, known))
     np.testing.assert_allclose(found.x, [alone.x, alone.x], atol=1e-9)

@@ -8,26 +8,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import URDF
+from robots import URDF, robot_file
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.estimation.initialization import align
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements import Noise, Wires
+from dhcal_pin.robot import Chain
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
+UR10 = "ur_description/urdf/ur10_robot.urdf"
+
 
 def wires(chain, m, seed=0):
-    """Return lengths of a three-wire device, and its true anchors by name."""
+    """Return lengths of a three-wire device, and its true anchors and zero offsets by name."""
     rng = np.random.default_rng(seed)
     anchors = np.array([[-1.4, 0, 0.5], [-1.4, 0.26, 0.05], [-1.4, -0.26, 0.05]])
     q = rng.uniform(-2.5, 2.5, (m, 6))
     length = np.linalg.norm(chain.poses(q)[:, None, :3, 3] - anchors, axis=2)
     true = {f"wire{i + 1}.{axis}": float(anchors[i, j]) for i in range(3) for j, axis in enumerate("xyz")}
-    return Wires(q, length), true
+    return Wires(q, length), true | {f"wire{i + 1}.zero": 0.0 for i in range(3)}
 
 
 def test_the_derivative_of_lengths_by_instrument_parameters(sim_6dof):
@@ -65,6 +70,30 @@ def test_known_anchors_make_the_base_observable(sim_6dof, sim_6dof_actual):
     q = np.random.default_rng(1).uniform(-2.5, 2.5, (50, 6))
     gap = fit.chain.poses(q)[:, :3, 3] - sim_6dof_actual.poses(q)[:, :3, 3]
     assert np.abs(gap).max() < 1e-9
+
+
+def test_unknown_zero_offsets_cost_hardly_any_accuracy():
+    """Offsets of 4, -10 and 30 mm: the same lengths with known offsets have the same errors."""
+    chain, errors, offsets = Chain.from_urdf(robot_file(UR10), "tool0"), [], np.array([4e-3, -1e-2, 3e-2])
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        model = select_parameters(chain, "minimal,base,tool")
+        sizes = [1e-3 if p.unit == "m" else 2e-3 for p in model.parameters]
+        actual = model.at(rng.normal(size=len(sizes)) * sizes)
+        lengths = Wires.simulate(actual, rng.uniform(-2, 2, (60, 6)), Noise(1e-4), rng)
+        other = rng.uniform(-2, 2, (200, 6))
+        for data in (
+            Wires(lengths.q, lengths.values, 1e-4, offsets=0.0),
+            Wires(lengths.q, lengths.values + offsets, 1e-4),
+        ):
+            fit = calibrate(chain, data, "minimal,base,tool", extend="none")
+            assert fit.verdict.status == "ok"
+            found, true = (c.poses(other)[:, :3, 3] for c in (fit.chain, actual))
+            errors.append(align(found, true)[1])
+        zeros = [fit.instruments[f"wire{i}.zero"] for i in (1, 2, 3)]
+        np.testing.assert_allclose(zeros, offsets, atol=1e-3)
+    known, unknown = np.square(errors).reshape(-1, 2).mean(0)
+    assert unknown < 1.2**2 * known
 
 
 def test_some_anchors_known_and_some_estimated(sim_6dof, sim_6dof_actual):

@@ -100,12 +100,13 @@ def test_locate_point_is_exact():
 
 
 def test_unknown_anchors_are_estimated_with_the_robot(sim_6dof, sim_6dof_actual):
-    """Raw lengths, nine unknown anchor coordinates, and all the arm's errors, noise-free."""
+    """Raw lengths, unknown anchors and zero offsets, and all the arm's errors, noise-free."""
     rng = np.random.default_rng(0)
     q = rng.uniform(-np.pi, np.pi, (60, 6))
     data = Wires.simulate(sim_6dof_actual, q, Noise(), rng)
     fit = calibrate(sim_6dof, data, "dh", priors="none", fix=["theta1", "d1"])
-    anchors = np.array([fit.instruments[u.name] for u in data.instrument_parameters]).reshape(3, 3)
+    anchors = np.array([[fit.instruments[f"wire{i}.{axis}"] for axis in "xyz"] for i in (1, 2, 3)])
+    np.testing.assert_allclose([fit.instruments[f"wire{i}.zero"] for i in (1, 2, 3)], 0, atol=1e-7)
     # Anchors and base can move together: compare the distances between the anchors.
     truth = np.array([[np.linalg.norm(a - b) for a in RIG] for b in RIG])
     found = np.array([[np.linalg.norm(a - b) for a in anchors] for b in anchors])
