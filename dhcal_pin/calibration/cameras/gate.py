@@ -123,6 +123,9 @@ class GatedFit:
     nominal: Fit  # Fit of independent corners with the nominal arm
     with_arm: Fit  # Fit with the arm estimated
     gate: Gate  # Whether the arm is estimated in the final fit
+    displaced: Fit | None = (
+        None  # Fit with the arm estimated and a displacement of each image, if it was tried
+    )
 
 
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
@@ -171,21 +174,30 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     others_ratio = _others_ratio(best.closed, max_iterations)
     gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
     if not gate.is_open:
-        return GatedFit(_kept_fit(nominal, is_right, folds, max_iterations), nominal, best.closed, gate)
+        kept = _kept_fit(nominal, is_right, folds, max_iterations)
+        return GatedFit(kept, nominal, best.closed, gate, None if is_complete else shared)
     opened_at = 1.0
     if not is_complete:
         factor = 1.0 if best.model is shared else share
         opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
     opened = _solve(best.model, best.model.problem, opened_at, max_iterations)
-    return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at))
+    return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at), opened)
 
 
-def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
-    """Estimate the displacement of images anew, fit with it, and return the temperature of the fit."""
+def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, Gate]:
+    """Estimate the displacement of images anew, fit with it, and judge the arm again if the gate is closed."""
     fit, jitter = fit_with_jitter(fit, max_iterations)
     n_configurations = gate.n_configurations if jitter.is_significant else 0
     opened_at = temperature(n_configurations, OPEN_SAMPLES)
-    return _solve(fit, fit.problem, opened_at, max_iterations), opened_at
+    opened = _solve(fit, fit.problem, opened_at, max_iterations)
+    if not gate.is_open:
+        errors = [
+            held_out_error(each, cluster_folds(fit.problem.data))
+            for each in (opened, without_arm(fit, max_iterations))
+        ]
+        after, nominal = (error.pixels if error else float("nan") for error in errors)
+        gate = replace(gate, ratio=after / nominal, is_complete=not jitter.is_significant)
+    return opened, replace(gate, temperature=opened_at)
 
 
 def _kept_fit(nominal: Fit, is_right: bool, folds: Sequence[Fold], max_iterations: int) -> Fit:

@@ -8,8 +8,10 @@ column of U have the variance 1 + σ² before they are whitened by the displacem
 s², and that of the components to 1 + s²·σ². The share of the noise s in the variance is t = σ²/(1 + σ²), see
 `estimation.folds`. An image thus counts as six rows however many corners it has.
 
-Families are tried only if the gate lets images change the arm. What remains of the displacements is then
-estimated again. Families that raise the error of left-out clusters of joint space are not added.
+What remains of the displacements is then estimated again. Families that raise the error of left-out clusters
+of joint space are not added. If the gate keeps the nominal arm, it is judged again with the families: an arm
+with elastic joints is demonstrably wrong where geometry and elasticity together explain the images up to the
+noise of the corners.
 """
 
 from __future__ import annotations
@@ -48,11 +50,12 @@ def add_joint_errors(
     gated: GatedFit, families: Sequence[str], max_iterations: int
 ) -> tuple[GatedFit, Extension]:
     """Add the families of joint errors that the displacements of images support."""
-    gate, fit = gated.gate, gated.fit
+    gate, fit = gated.gate, gated.displaced
     extension = Extension(temperature=gate.temperature, n_configurations=gate.n_configurations)
     chosen = [name for name in families if name in FAMILIES]
-    has_displacements = all(item.n_images and item.has_jitter for item in fit.problem.data)
-    if not (gate.is_open and chosen and has_displacements) or gate.n_configurations < MIN_CONFIGURATIONS:
+    if not (fit and chosen) or gate.is_right or gate.n_configurations < MIN_CONFIGURATIONS:
+        return gated, extension
+    if not all(item.n_images and item.has_jitter for item in fit.problem.data):
         return gated, extension
     judged = fit.without_rejected()
     judged = replace(judged, problem=judged.problem.at_temperature(1.0))
@@ -63,21 +66,22 @@ def add_joint_errors(
     problem, x, family = with_selected(start, selected, model)
     problem = problem.with_prior_weights(prior_weights(problem, family, model.widths))
     solution = minimize(problem, "lm", x, max_iterations, loose=True)
-    opened, temperature = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
+    opened, gate = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
     folds = cluster_folds(fit.data)
     errors = [held_out_error(each, folds) for each in (fit, opened)]
     before, after = (error.pixels if error else float("nan") for error in errors)
-    if after > before:
+    if not gate.is_open or after > before:
         trials = tuple(replace(trial, is_selected=False) for trial in trials)
         return gated, replace(extension, trials=trials)
     extension = Extension(
         trials,
-        temperature,
+        gate.temperature,
         gate.n_configurations,
         random_ratio=random_ratio,
         region_ratio=after / before if before else float("nan"),
     )
-    return replace(gated, fit=opened, gate=replace(gate, temperature=temperature)), extension
+    with_arm = gated.with_arm if gated.gate.is_open else opened
+    return replace(gated, fit=opened, with_arm=with_arm, gate=gate), extension
 
 
 def factor_displacements(

@@ -139,8 +139,8 @@ def calibrate_images(
         fit = fitting.reweight(points.fit)
     ungated = with_lens_priors(fit)
     gated = apply_gate(ungated, fitting.groups, fitting.max_iterations, fitting.arm_type)
-    stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gated, extension = add_joint_errors(gated, families, fitting.max_iterations)
+    stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gate = gated.gate
     warnings = [exchange.sentence for exchange in exchanges]
     if has_arm:
