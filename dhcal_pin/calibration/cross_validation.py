@@ -108,16 +108,12 @@ def cross_validate_folds(
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors of held-out samples.
+    """Errors of held-out samples."""
 
-    Attributes:
-        folds: Accuracy of the held-out samples of each fold, without outliers of the calibration.
-        errors: RMS of the held-out rows of each fold in standard deviations, (k,).
-        accuracy: The same of all folds together. A sample counts once for each fold that holds it out.
-    """
-
+    #: Accuracy of the held-out samples of each fold, without outliers of the calibration.
     folds: tuple[Accuracy, ...]
-    errors: Array
+    errors: Array  #: RMS of the held-out rows of each fold in standard deviations, (k,)
+    #: The same of all folds together. A sample counts once for each fold that holds it out.
     accuracy: Accuracy
 
 
@@ -300,26 +296,21 @@ class Generalization:
     """Accuracy on configurations that are not fitted: within the measured region and beyond it.
 
     The shares are those of random configurations within the joint limits, see `measurements.measured_region`.
-
-    Attributes:
-        cross_validated: Accuracy within the measured region, from random folds of whole configurations; None
-            if it cannot be stated.
-        cross_validated_reason: Why it cannot be stated; empty if it can.
-        region_holdout: Accuracy beyond the measured region, from folds that leave out regions of joint space,
-            or from `leave_regions_out` if it was called; None if it cannot be stated.
-        region_holdout_reason: Why it cannot be stated; empty if it can.
-        covered_share: Share of the joint space in the measured region, 0 to 1.
-        reached_share: Share of the joint space that is no farther from the measured configurations than the
-            left-out regions are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share`
-            if that cannot be stated. Nothing is known about the rest. Both shares are None where joint values
-            have no meaning, as the poses of the tip were measured in their place.
     """
 
+    #: Accuracy within the measured region, from random folds of whole configurations; None if it cannot be
+    #: stated.
     cross_validated: Comparison | None
-    cross_validated_reason: str
+    cross_validated_reason: str  #: Why it cannot be stated; empty if it can
+    #: Accuracy beyond the measured region, from folds that leave out regions of joint space, or from
+    #: `leave_regions_out` if it was called; None if it cannot be stated.
     region_holdout: Comparison | None
-    region_holdout_reason: str
-    covered_share: float | None
+    region_holdout_reason: str  #: Why it cannot be stated; empty if it can
+    covered_share: float | None  #: Share of the joint space in the measured region, 0 to 1
+    #: Share of the joint space that is no farther from the measured configurations than the left-out regions
+    #: are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share` if that cannot be
+    #: stated. Nothing is known about the rest. Both shares are None where joint values have no meaning, as
+    #: the poses of the tip were measured in their place.
     reached_share: float | None
 
 

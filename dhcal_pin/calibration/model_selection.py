@@ -142,23 +142,15 @@ FULL_SET = "minimal,base,tool"
 
 @dataclass(frozen=True)
 class FamilyTrial:
-    """Effect of a family on top of those selected before it.
+    """Effect of a family on top of those selected before it."""
 
-    Attributes:
-        family: Name of the family, one of `estimation.EXTENSIONS`.
-        cv_before: Error of random held-out folds without the family, in standard deviations.
-        cv_after: The same with it; as before if its evidence is too small to try.
-        log_bayes_factor: Rise of the log evidence by the family.
-        prior_width: Standard deviation of its priors of greatest evidence, as a fraction of the default one.
-        is_selected: Whether it was added.
-    """
-
-    family: str
-    cv_before: float
-    cv_after: float
-    log_bayes_factor: float
+    family: str  #: Name of the family, one of `estimation.EXTENSIONS`
+    cv_before: float  #: Error of random held-out folds without the family, in standard deviations
+    cv_after: float  #: The same with it; as before if its evidence is too small to try
+    log_bayes_factor: float  #: Rise of the log evidence by the family
+    #: Standard deviation of its priors of greatest evidence, as a fraction of the default one.
     prior_width: float
-    is_selected: bool = False
+    is_selected: bool = False  #: Whether it was added
 
     @property
     def improvement(self) -> float:
@@ -200,23 +192,17 @@ def trial_table(trials: Sequence[FamilyTrial]) -> Table:
 
 @dataclass(frozen=True)
 class Extension:
-    """What a calibration added to the geometry, and how much its samples count.
+    """What a calibration added to the geometry, and how much its samples count."""
 
-    Attributes:
-        trials: Trials of the selected families in the order of selection, then of the others.
-        temperature: Temperature T of the residuals.
-        n_configurations: Number N of different fitted configurations.
-        prediction_scale: Factor to predicted standard deviations of the tool.
-        random_ratio: Error of random left-out samples as a fraction of that of the geometry alone; NaN if no
-            family was added.
-        region_ratio: The same of left-out regions of joint space; NaN if none can be left out.
-    """
-
+    #: Trials of the selected families in the order of selection, then of the others.
     trials: tuple[FamilyTrial, ...] = ()
-    temperature: float = 1.0
-    n_configurations: int = 0
-    prediction_scale: float = 1.0
+    temperature: float = 1.0  #: Temperature T of the residuals
+    n_configurations: int = 0  #: Number N of different fitted configurations
+    prediction_scale: float = 1.0  #: Factor to predicted standard deviations of the tool
+    #: Error of random left-out samples as a fraction of that of the geometry alone; NaN if no family was
+    #: added.
     random_ratio: float = float("nan")
+    #: The same of left-out regions of joint space; NaN if none can be left out.
     region_ratio: float = float("nan")
 
     @property
@@ -278,39 +264,26 @@ def _percent(ratio: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Selected families, with the hyperparameters of greatest evidence.
+    """Selected families, with the hyperparameters of greatest evidence."""
 
-    Attributes:
-        widths: Standard deviation of the priors of each family, as a fraction of the expected one.
-        noise: Standard deviation of the whitened residuals.
-        log_evidence: Log evidence, up to a constant.
-        values: Values of its parameters by name.
-    """
-
+    # Standard deviation of the priors of each family, as a fraction of the expected one.
     widths: Mapping[str, float]
-    noise: float
-    log_evidence: float
-    values: Mapping[str, float]
+    noise: float  # Standard deviation of the whitened residuals
+    log_evidence: float  # Log evidence, up to a constant
+    values: Mapping[str, float]  # Values of its parameters by name
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """Linear model around a fit with the columns of further families.
+    """Linear model around a fit with the columns of further families."""
 
-    Attributes:
-        problem: Problem with the parameters and the expected priors of all families.
-        x: Point of the linearization, (p,).
-        family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
-        rows: Rows of all data.
-        folds: Rows of random folds of whole configurations; empty if nothing is selected.
-        cv_errors: Error of the random folds with the families of each model that was asked for.
-    """
-
-    problem: Problem
-    x: Array
-    family: Array
-    rows: NoisyRows
+    problem: Problem  # Problem with the parameters and the expected priors of all families
+    x: Array  # Point of the linearization, (p,)
+    family: Array  # Name of the family of each unknown, "" for the unknowns of the fit, (p,)
+    rows: NoisyRows  # Rows of all data
+    # Rows of random folds of whole configurations; empty if nothing is selected.
     folds: tuple[NoisyFold, ...] = ()
+    # Error of the random folds with the families of each model that was asked for.
     cv_errors: dict[Model, float] = field(default_factory=dict)
 
     @classmethod
@@ -546,19 +519,12 @@ def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _RegionErrors:
-    """Errors of left-out regions of joint space, with their prediction.
+    """Errors of left-out regions of joint space, with their prediction."""
 
-    Attributes:
-        n_rows: Number of held-out rows of each region, (k,).
-        squares: Mean square of the held-out rows, in units of the residual variance, (k,).
-        variances: Mean variance of these rows by the uncertainty of the fit, in the same units, (k,).
-        noise: Standard deviation of the whitened residuals.
-    """
-
-    n_rows: Array
-    squares: Array
-    variances: Array
-    noise: float
+    n_rows: Array  # Number of held-out rows of each region, (k,)
+    squares: Array  # Mean square of the held-out rows, in units of the residual variance, (k,)
+    variances: Array  # Mean variance of these rows by the uncertainty of the fit, in the same units, (k,)
+    noise: float  # Standard deviation of the whitened residuals
 
     @property
     def prediction_scale(self) -> float:

@@ -53,38 +53,25 @@ MAX_WIDTH = 8.0
 
 @dataclass(frozen=True)
 class SessionFit:
-    """First fit of measurements, with what happened during the session.
+    """First fit of measurements, with what happened during the session."""
 
-    Attributes:
-        fit: First fit, with the changes that are believed.
-        holdout: Measurements that are not fitted, with these changes.
-        session: What happened; None if it was not looked for.
-        diagnosis: Diagnosis of mistakes in the measurements; None if none was made.
-    """
-
-    fit: Fit
-    holdout: tuple[Measurement, ...]
-    session: Session | None = None
-    diagnosis: Diagnosis | None = None
+    fit: Fit  # First fit, with the changes that are believed
+    holdout: tuple[Measurement, ...]  # Measurements that are not fitted, with these changes
+    session: Session | None = None  # What happened; None if it was not looked for
+    diagnosis: Diagnosis | None = None  # Diagnosis of mistakes in the measurements; None if none was made
 
 
 @dataclass(frozen=True)
 class SessionModels:
-    """Fits that are compared to decide whether changes are believed.
+    """Fits that are compared to decide whether changes are believed."""
 
-    Attributes:
-        errors: Errors of the robot that are unknown.
-        start: Fit measurements for the first time, with given errors that are unknown.
-        reweighted: Fit with robust weights, from a first fit.
-        extended: Fit with robust weights and all families of joint errors, from a first fit.
-        sets: Name of the widths of ordinary errors in `plausibility.evidence`.
-    """
-
-    errors: ErrorModel
+    errors: ErrorModel  # Errors of the robot that are unknown
+    # Fit measurements for the first time, with given errors that are unknown.
     start: Callable[[tuple[Measurement, ...], ErrorModel], Fit]
-    reweighted: Callable[[Fit], Fit]
+    reweighted: Callable[[Fit], Fit]  # Fit with robust weights, from a first fit
+    # Fit with robust weights and all families of joint errors, from a first fit.
     extended: Callable[[Fit], Fit]
-    sets: str
+    sets: str  # Name of the widths of ordinary errors in `plausibility.evidence`
 
 
 def fit_session(

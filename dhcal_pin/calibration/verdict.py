@@ -106,32 +106,21 @@ MIN_STATED_ROWS_PER_DIRECTION = 1.5
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about a calibration that its user must know.
+    """Something about a calibration that its user must know."""
 
-    Attributes:
-        status: Verdict that this finding alone leads to.
-        reason: What was found and what to do, in one or two sentences.
-        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
-    """
-
-    status: Status
-    reason: str
-    keeps_nominal: bool = False
+    status: Status  # Verdict that this finding alone leads to
+    reason: str  # What was found and what to do, in one or two sentences
+    keeps_nominal: bool = False  # Whether the nominal robot should be used in place of the calibrated one
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a calibrated robot may be used.
+    """Whether a calibrated robot may be used."""
 
-    Attributes:
-        status: "ok", "caution" or "refused".
-        reasons: Sentences, those of the most severe findings first; empty if the status is "ok".
-        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
-    """
-
-    status: Status
+    status: Status  #: "ok", "caution" or "refused"
+    #: Sentences, those of the most severe findings first; empty if the status is "ok".
     reasons: tuple[str, ...] = ()
-    keeps_nominal: bool = False
+    keeps_nominal: bool = False  #: Whether the nominal robot should be used in place of the calibrated one
 
     @property
     def is_refused(self) -> bool:

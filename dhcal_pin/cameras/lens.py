@@ -49,17 +49,11 @@ _BLOCK = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Lens model.
+    """Lens model."""
 
-    Attributes:
-        name: Name in rig files: "pinhole" or "fisheye".
-        coefficients: Names of the coefficients of the distortion.
-        distort: Function of the distortion.
-    """
-
-    name: str
-    coefficients: tuple[str, ...]
-    distort: Distortion
+    name: str  # Name in rig files: "pinhole" or "fisheye"
+    coefficients: tuple[str, ...]  # Names of the coefficients of the distortion
+    distort: Distortion  # Function of the distortion
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -40,21 +40,13 @@ UNIT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class BareGeometry:
-    """Geometric errors that fit best without joint errors.
+    """Geometric errors that fit best without joint errors."""
 
-    Attributes:
-        errors: Nominal chain without joint errors, and its unknown geometric errors.
-        x: Identified geometric errors, shape (g,) [m or rad].
-        configurations: Measured configurations, then those of the joint space, shape (m, n).
-        weights: Weight of each of them, shape (m,).
-        lever: Lever ℓ by which differences of the orientation count as distances [m].
-    """
-
-    errors: ErrorModel
-    x: Array
-    configurations: Array
-    weights: Array
-    lever: float
+    errors: ErrorModel  # Nominal chain without joint errors, and its unknown geometric errors
+    x: Array  # Identified geometric errors, shape (g,) [m or rad]
+    configurations: Array  # Measured configurations, then those of the joint space, shape (m, n)
+    weights: Array  # Weight of each of them, shape (m,)
+    lever: float  # Lever ℓ by which differences of the orientation count as distances [m]
 
     @cached_property
     def chain(self) -> Chain:

@@ -286,15 +286,10 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Parameter set that users select by name; calling it returns its parameters.
+    """Parameter set that users select by name; calling it returns its parameters."""
 
-    Attributes:
-        build: Function from a chain to the parameters of the set.
-        help: One line for help texts.
-    """
-
-    build: Callable[[Chain], list[ErrorParameter]]
-    help: str
+    build: Callable[[Chain], list[ErrorParameter]]  #: Function from a chain to the parameters of the set
+    help: str  #: One line for help texts
 
     def __call__(self, chain: Chain) -> list[ErrorParameter]:
         """Build the parameters of the set."""

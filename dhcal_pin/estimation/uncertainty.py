@@ -112,9 +112,9 @@ class Predictor(Protocol):
 class FamilyGain:
     """What a family of joint errors that a model lacks would explain of the residuals."""
 
-    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`.
-    added: int  #: Number of its parameters.
-    remaining: int  #: Number of rows less the number of all parameters.
+    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`
+    added: int  #: Number of its parameters
+    remaining: int  #: Number of rows less the number of all parameters
 
     @property
     def ratio(self) -> float:
@@ -124,17 +124,13 @@ class FamilyGain:
 
 @dataclass(frozen=True)
 class ModelFit:
-    """How well a model explains the measurements that it was fitted to.
+    """How well a model explains the measurements that it was fitted to."""
 
-    Attributes:
-        chi_square: Sum of the squared residuals in stated standard deviations of the instrument; None if they
-            are not stated.
-        freedom: Degrees of freedom of the residuals.
-        gains: Families of joint errors that the model lacks, by name, and what they would explain.
-    """
-
+    # Sum of the squared residuals in stated standard deviations of the instrument; None if they are not
+    # stated.
     chi_square: float | None
-    freedom: float
+    freedom: float  # Degrees of freedom of the residuals
+    # Families of joint errors that the model lacks, by name, and what they would explain.
     gains: Mapping[str, FamilyGain]
 
 
@@ -147,11 +143,11 @@ class Uncertainty:
     their own link frames.
     """
 
-    chain: Chain  #: Calibrated chain.
-    entries: Array  #: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
-    sqrt_covariance: Array  #: Square root of the covariance, shape (6(k+1)+e, r).
-    unbounded_directions: Array  #: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
-    temperature: float = 1.0  #: Factor on the variance of correlated residuals that the covariance contains.
+    chain: Chain  #: Calibrated chain
+    entries: Array  #: Indices of the uncertain coefficients in the flattened transmission, shape (e,)
+    sqrt_covariance: Array  #: Square root of the covariance, shape (6(k+1)+e, r)
+    unbounded_directions: Array  #: Directions that neither data nor priors determine, shape (6(k+1)+e, h)
+    temperature: float = 1.0  #: Factor on the variance of correlated residuals that the covariance contains
     #: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of the
     #: orientation [rad] of the tool.
     model_std: tuple[float, float] = (0.0, 0.0)

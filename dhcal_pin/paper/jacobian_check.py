@@ -37,19 +37,12 @@ _KINDS = ("theta", "d", "a", "alpha")
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of one route with the paper's R.
+    """Agreement of one route with the paper's R."""
 
-    Attributes:
-        route: Name of the route.
-        columns: Number of columns of R that were compared; 0 for a comparison of poses.
-        difference: Largest absolute difference [m or rad].
-        tolerance: Largest allowed difference [m or rad].
-    """
-
-    route: str
-    columns: int
-    difference: float
-    tolerance: float
+    route: str  #: Name of the route
+    columns: int  #: Number of columns of R that were compared; 0 for a comparison of poses
+    difference: float  #: Largest absolute difference [m or rad]
+    tolerance: float  #: Largest allowed difference [m or rad]
 
     @property
     def agrees(self) -> bool:

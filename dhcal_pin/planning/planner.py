@@ -314,25 +314,16 @@ def _report_phases(progress: Progress | None) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Configurations from which the poses are selected.
+    """Configurations from which the poses are selected."""
 
-    Attributes:
-        chain: Nominal robot.
-        q: Joint positions, shape (m, n) [rad or m].
-        task_q: Joint positions of the task, shape (t, n) [rad or m].
-        images: Cameras and boards; a board must be in view. None for other measurements of the tool.
-        sampler: Sampler that has drawn them; None if they are given.
-        collision: Collision checks of the robot.
-        notes: What is not checked and why.
-    """
-
-    chain: Chain
-    q: Array
-    task_q: Array
+    chain: Chain  # Nominal robot
+    q: Array  # Joint positions, shape (m, n) [rad or m]
+    task_q: Array  # Joint positions of the task, shape (t, n) [rad or m]
+    # Cameras and boards; a board must be in view. None for other measurements of the tool.
     images: PlannedImages | None
-    sampler: ConfigurationSampler | None
-    collision: CollisionChecker
-    notes: tuple[str, ...]
+    sampler: ConfigurationSampler | None  # Sampler that has drawn them; None if they are given
+    collision: CollisionChecker  # Collision checks of the robot
+    notes: tuple[str, ...]  # What is not checked and why
 
 
 def _collect_pool(

@@ -236,21 +236,15 @@ def _towards(directions: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraViews:
-    """Planned images of a camera.
+    """Planned images of a camera."""
 
-    Attributes:
-        camera: Name of the camera.
-        n_images: Number of configurations in which it sees a board.
-        covered_share: Share of the 10 x 10 cells of its image in which there is at least one corner.
-        distances: Smallest and largest distance of the middle of a board [m]; NaN without images.
-        max_angle: Largest angle between the normal of a board and the line of sight [rad]; NaN for points
-            that are not on a board.
-    """
-
-    camera: str
-    n_images: int
-    covered_share: float
+    camera: str  #: Name of the camera
+    n_images: int  #: Number of configurations in which it sees a board
+    covered_share: float  #: Share of the 10 x 10 cells of its image in which there is at least one corner
+    #: Smallest and largest distance of the middle of a board [m]; NaN without images.
     distances: tuple[float, float]
+    #: Largest angle between the normal of a board and the line of sight [rad]; NaN for points that are not on
+    #: a board.
     max_angle: float
 
 

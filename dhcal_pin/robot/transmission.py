@@ -139,17 +139,12 @@ class GravityLoads:
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Transmission errors of a chain's independent joints.
+    """Transmission errors of a chain's independent joints."""
 
-    Attributes:
-        coefficients: All coefficients of the formula in the module docstring, shape (c,).
-        loads: Gravity torques on the joints.
-        min_order: Order up to which the harmonics are evaluated even if their coefficients are zero, so that
-            the derivatives by them are available.
-    """
-
-    coefficients: Array
-    loads: GravityLoads
+    coefficients: Array  #: All coefficients of the formula in the module docstring, shape (c,)
+    loads: GravityLoads  #: Gravity torques on the joints
+    #: Order up to which the harmonics are evaluated even if their coefficients are zero, so that the
+    #: derivatives by them are available.
     min_order: int = 0
 
     @classmethod

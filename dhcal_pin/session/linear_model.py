@@ -46,29 +46,17 @@ def measures_positions(data: Sequence[Measurement]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Columns of the linear model.
+    """Columns of the linear model."""
 
-    Attributes:
-        problem: Problem whose errors contain all parameters of base and tool.
-        model: Columns of the unknowns of the calibration, (p,).
-        weights: Their prior weights, (p,).
-        blocks: Possible causes.
-        joints: Columns of the joint zeros, (n,).
-        links: Columns of the growth of each link, (k+1,).
-        scale: Column of a scale of all axes.
-        lag: Column of the lag.
-        n_columns: Number of columns, the residual included.
-    """
-
-    problem: Problem
-    model: Array
-    weights: Array
-    blocks: tuple[Block, ...]
-    joints: Array
-    links: Array
-    scale: int
-    lag: int
-    n_columns: int
+    problem: Problem  # Problem whose errors contain all parameters of base and tool
+    model: Array  # Columns of the unknowns of the calibration, (p,)
+    weights: Array  # Their prior weights, (p,)
+    blocks: tuple[Block, ...]  # Possible causes
+    joints: Array  # Columns of the joint zeros, (n,)
+    links: Array  # Columns of the growth of each link, (k+1,)
+    scale: int  # Column of a scale of all axes
+    lag: int  # Column of the lag
+    n_columns: int  # Number of columns, the residual included
 
     @classmethod
     def of(cls, problem: Problem) -> Layout:

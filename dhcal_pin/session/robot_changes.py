@@ -29,16 +29,11 @@ from .timeline import Timeline
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of base or tool over time; the identity at the end.
+    """Motion of base or tool over time; the identity at the end."""
 
-    Attributes:
-        steps: Numbers of the first samples of all segments but the first, ascending.
-        poses: Motion of each segment, (S, 4, 4) [m].
-        drifts: Drifts with the twists of their functions of time, (F, 6).
-    """
-
-    steps: tuple[int, ...] = ()
-    poses: Array = field(default_factory=lambda: np.eye(4)[None])
+    steps: tuple[int, ...] = ()  # Numbers of the first samples of all segments but the first, ascending
+    poses: Array = field(default_factory=lambda: np.eye(4)[None])  # Motion of each segment, (S, 4, 4) [m]
+    # Drifts with the twists of their functions of time, (F, 6).
     drifts: tuple[tuple[Drift | FreeDrift, Array], ...] = ()
 
     @property
@@ -64,21 +59,15 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class RobotChanges:
-    """Changes of a robot during a session.
+    """Changes of a robot during a session."""
 
-    Attributes:
-        base: Motion of the base.
-        tool: Motion of the tool.
-        zeros: Changes of joint zeros: number of the joint, functions of time, and amplitudes (F,) [rad or m].
-        growth: Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
-        lag: Time by which the joint values are too early, in the unit of the timeline.
-    """
-
-    base: Motion = field(default_factory=Motion)
-    tool: Motion = field(default_factory=Motion)
+    base: Motion = field(default_factory=Motion)  # Motion of the base
+    tool: Motion = field(default_factory=Motion)  # Motion of the tool
+    # Changes of joint zeros: number of the joint, functions of time, and amplitudes (F,) [rad or m].
     zeros: tuple[tuple[int, Change, Array], ...] = ()
+    # Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
     growth: tuple[tuple[Change, Array], ...] = ()
-    lag: float = 0.0
+    lag: float = 0.0  # Time by which the joint values are too early, in the unit of the timeline
 
     @property
     def without_lag(self) -> RobotChanges:

@@ -101,27 +101,16 @@ MIN_SIDE = 3
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Fit of the linear model with weights of bounded influence.
+    """Fit of the linear model with weights of bounded influence."""
 
-    Attributes:
-        rows: Rows divided by the noise, with the residual after the fit as last column, (N, k, c).
-        columns: The same columns of the unknowns and causes of the fit, (N, k, p).
-        step: Step of the unknowns and causes, (p,).
-        covariance: Covariance of them with the weights of the samples, (p, p).
-        test_covariance: Covariance of them with equal weights, (p, p).
-        score: Remaining derivative of the cost with equal weights and bounded residuals, (p,).
-        weights: Weights of the samples, (N,).
-        noise: Noise of each row in whitened units, (N, k).
-    """
-
-    rows: Array
-    columns: Array
-    step: Array
-    covariance: Array
-    test_covariance: Array
-    score: Array
-    weights: Array
-    noise: Array
+    rows: Array  # Rows divided by the noise, with the residual after the fit as last column, (N, k, c)
+    columns: Array  # The same columns of the unknowns and causes of the fit, (N, k, p)
+    step: Array  # Step of the unknowns and causes, (p,)
+    covariance: Array  # Covariance of them with the weights of the samples, (p, p)
+    test_covariance: Array  # Covariance of them with equal weights, (p, p)
+    score: Array  # Remaining derivative of the cost with equal weights and bounded residuals, (p,)
+    weights: Array  # Weights of the samples, (N,)
+    noise: Array  # Noise of each row in whitened units, (N, k)
 
 
 class _Search:

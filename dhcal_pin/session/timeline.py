@@ -26,23 +26,16 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Order of the samples of a session of N samples.
+    """Order of the samples of a session of N samples."""
 
-    Attributes:
-        data: Fitted measurements, then held-out ones.
-        n_fitted: Number of fitted measurements.
-        numbers: Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
-        times: Time of each sample, one array per measurement: in seconds if known, else its number.
-        unit: "s", "row" or "image", the unit of the times.
-        file_starts: Numbers of the first samples of all files but the first.
-    """
-
-    data: tuple[Measurement, ...]
-    n_fitted: int
+    data: tuple[Measurement, ...]  # Fitted measurements, then held-out ones
+    n_fitted: int  # Number of fitted measurements
+    # Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
     numbers: tuple[Array, ...]
+    # Time of each sample, one array per measurement: in seconds if known, else its number.
     times: tuple[Array, ...]
-    unit: str
-    file_starts: tuple[int, ...]
+    unit: str  # "s", "row" or "image", the unit of the times
+    file_starts: tuple[int, ...]  # Numbers of the first samples of all files but the first
 
     @property
     def fitted_numbers(self) -> Array:

@@ -209,19 +209,12 @@ def _padded(item: Measurement, count: int) -> Measurement:
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """Result of `solve_batch`.
+    """Result of `solve_batch`."""
 
-    Attributes:
-        batch: Problems that were solved.
-        x: Solutions of shape (b, p) [m and rad].
-        iterations: Number of iterations of each problem, shape (b,).
-        converged: Whether the last step was negligible, shape (b,).
-    """
-
-    batch: BatchProblem
-    x: Array
-    iterations: Array
-    converged: Array
+    batch: BatchProblem  #: Problems that were solved
+    x: Array  #: Solutions of shape (b, p) [m and rad]
+    iterations: Array  #: Number of iterations of each problem, shape (b,)
+    converged: Array  #: Whether the last step was negligible, shape (b,)
 
     @cached_property
     def systems(self) -> TriangularSystemBatch:
