@@ -118,12 +118,9 @@ class CrossValidation:
 
 
 def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
-    """Fit a part of the samples of `fit.problem` by the same method, from an approximate solution (p,).
-
-    If there are parameters without a prior, the fit starts from the nominal robot, as the values of
-    undetermined parameters in x contain information of all samples. If the calibration did not converge, the
-    fit stops after as many iterations, at most `MAX_REFIT_ITERATIONS`.
-    """
+    """Fit some of the samples by the method of a calibration, from an approximate solution (p,)."""
+    # The values of undetermined parameters in x contain information of all samples: without priors, the fit
+    # starts from the nominal robot. If the calibration did not converge, it stops after as many iterations.
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
         loose = minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True)
@@ -197,11 +194,8 @@ class FoldComparison:
 
 
 def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> FoldComparison:
-    """Compare the accuracy of held-out samples before and after a calibration.
-
-    The nominal robot is judged in the same way: base, tool and instrument parameters are fitted to the other
-    samples of each fold.
-    """
+    """Compare the accuracy of held-out samples before and after a calibration."""
+    # The nominal robot is judged in the same way: its frames are fitted to the other samples of each fold.
     data = fit.inliers
     nominal = replace(fit.errors, chain=fit.nominal_refitted)
     before: list[dict[str, Array]] = []
@@ -247,11 +241,7 @@ def leave_regions_out(
     recalibrate: Callable[[list[Measurement]], FittedModel],
     progress: Progress | None,
 ) -> Comparison | None:
-    """Judge a calibration by further ones, each without the samples of a region of joint space.
-
-    Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
-    and additional parameters. None if no region can be left out.
-    """
+    """Judge a calibration by further complete ones, each without a region; None without regions."""
     try:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     except NotObservableError:

@@ -236,10 +236,7 @@ def accuracy(
 
 
 def find_inliers(errors: Sequence[Mapping[str, Array]]) -> tuple[Array, ...]:
-    """Find the samples whose errors are no outliers among those of their measurement, (m,) each.
-
-    Only the first group of errors of a measurement is tested: of a pose, the position.
-    """
+    """Find the samples (m,) whose first group of errors (of a pose, the position) has no outlier."""
     tested = [next(iter(item.values())) for item in errors]
     return tuple(
         robust.standardize_mean_squares(np.mean(each**2, 1), each.shape[1]) <= robust.OUTLIER_THRESHOLD
@@ -285,10 +282,7 @@ class PairedErrors:
         return cls(*mean_squares, n_components=n_components)
 
     def without_outliers(self) -> PairedErrors:
-        """Leave out wrong measurements: outliers after the calibration whose error was large before, too.
-
-        An error that the calibration causes is far smaller before it.
-        """
+        """Leave out outliers after the calibration whose error was large before, too: wrong measurements."""
         t = robust.standardize_mean_squares(self.after, self.n_components)
         is_outlier = (t > robust.OUTLIER_THRESHOLD) & (self.before > MIN_RATIO_BEFORE**2 * self.after)
         return replace(self, before=self.before[~is_outlier], after=self.after[~is_outlier])
@@ -300,10 +294,7 @@ class PairedErrors:
 
     @property
     def t(self) -> float:
-        """Mean change of the squared error in standard errors: negative if the error fell; NaN if unknown.
-
-        Student's t statistic of paired differences, with u - 1 degrees of freedom.
-        """
+        """Student's t of the paired change of the squared error: negative if it fell; NaN if unknown."""
         change = self.after - self.before
         if len(change) < 2:
             return np.nan

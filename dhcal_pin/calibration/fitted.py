@@ -317,11 +317,9 @@ class FittedModel:
 
     @cached_property
     def _sigma_scale(self) -> float:
-        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined.
-
-        A noise scale that is estimated from few rows is uncertain itself, and the errors then have Student's
-        t distribution. The factor widens the standard deviations so that ±1.96 of them contain 95 % of it.
-        """
+        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined."""
+        # A noise scale from few rows is uncertain itself: ±1.96 of the standard deviations contain 95 % of a
+        # t distribution.
         if all(item.has_stated_sigma for item in self.data):
             if not self.contradicts_sigma:
                 return 1.0
@@ -411,10 +409,7 @@ class FittedModel:
 
     @property
     def _complete_uncertainty(self) -> Uncertainty:
-        """Uncertainty with the errors, too, that the minimal set leaves out because others imitate them.
-
-        Where nothing is measured, their variances add to those of the others.
-        """
+        """Uncertainty with the errors, too, that the minimal set leaves out as others imitate them."""
         errors = replace(self.errors, chain=self.chain)
         left_out = redundant(errors)
         if not left_out or len(self.x) > MAX_COLUMNS or errors.undetermined:
@@ -454,10 +449,7 @@ class FittedModel:
 
     @property
     def _model_fit(self) -> ModelFit:
-        """How well the model explains the measurements.
-
-        Correlated residuals are errors of the model, which the uncertainty contains.
-        """
+        """How well the model explains the measurements; the uncertainty contains correlated residuals."""
         is_stated = self.problem.temperature == 1 and all(item.has_stated_sigma for item in self.data)
         chi_square = self.unit_weight_std**2 * self.degrees_of_freedom
         has_chi_square = is_stated and np.isfinite(chi_square)
@@ -500,10 +492,8 @@ class FittedModel:
 
     @property
     def _model_std(self) -> tuple[float, float]:
-        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad].
-
-        It is that of the residuals of the inliers, without the noise of the instrument where it is stated.
-        """
+        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad]."""
+        # It is that of the residuals of the inliers, without the stated noise of the instrument.
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
         n_rows = sum(count for _, _, count in self._row_counts)
         per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0

@@ -384,10 +384,7 @@ def _best_width(x: Array, determined: Array, expected: Array, members: Array) ->
 
 
 def _missing_parameters(problem: Problem, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
-    """Return the parameters of each family that are neither estimated nor fixed, if there are any.
-
-    Families whose condition is not known of any sample have none.
-    """
+    """Return the parameters of each family of a known condition that are not in the model."""
     errors, conditions = problem.errors, known_conditions(problem.data)
     known = {p.name for p in (*errors.parameters, *errors.fixed)}
     by_family = {
@@ -437,10 +434,7 @@ def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tupl
 
 
 def _may_have_curves(problem: Problem, x: Array, curves: Sequence[ErrorParameter], orders: range) -> bool:
-    """Check whether curves stand out of white residuals; this costs far less than a trial of them.
-
-    The prior weights of the problem are those that x was fitted with.
-    """
+    """Check whether curves stand out of the residuals at x; this costs far less than a trial of them."""
     if any(item.configurations_per_row != 1 for item in problem.data):
         return True
     if count_rows(problem) < MANY_ROWS_PER_LINE * len(curves):
@@ -449,12 +443,10 @@ def _may_have_curves(problem: Problem, x: Array, curves: Sequence[ErrorParameter
 
 
 def _line_excess(problem: Problem, x: Array, curves: Sequence[ErrorParameter]) -> float:
-    """Compute by how many standard deviations residuals along the columns of curves exceed white ones.
-
-    With M = I - J·(Jᵀ·J + W²)⁻¹·Jᵀ, white noise ε of variance σ² leaves the residuals r = M·ε. Their
-    components along the unit columns A of the curves have the sum of squares ‖Aᵀ·r‖². For B = M·A, its mean
-    is σ²·‖B‖² and its variance 2·σ⁴·‖Bᵀ·B‖². The estimate of σ² is ‖r‖²/‖M‖².
-    """
+    """Compute by how many standard deviations residuals along the columns of curves exceed white ones."""
+    # With M = I - J·(Jᵀ·J + W²)⁻¹·Jᵀ, white noise ε of variance σ² leaves the residuals r = M·ε. Along the
+    # unit columns A of the curves, their sum of squares is ‖Aᵀ·r‖². For B = M·A, its mean is σ²·‖B‖² and its
+    # variance 2·σ⁴·‖Bᵀ·B‖². The estimate of σ² is ‖r‖²/‖M‖².
     extended, start, family = _with_families(problem, x, {HARMONICS: list(curves)})
     linearization = extended.linearize(start)
     rows = np.concatenate(
@@ -472,15 +464,9 @@ def _line_excess(problem: Problem, x: Array, curves: Sequence[ErrorParameter]) -
 
 
 def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
-    """Check whether lines stand out of the spectrum of the residuals over the joint values.
-
-    With the whitened column a of a joint, the residuals r with standard deviation 1, and white residuals, the
-    sums
-
-        z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
-
-    are distributed as χ²_1, or smaller where the fit has taken up a part.
-    """
+    """Check whether lines stand out of the spectrum of the residuals over the joint values."""
+    # With the whitened column a of a joint and white residuals r of variance 1, (Σ a·r·sin kq)² / Σ |a|²·sin²
+    # kq, and the same with the cosine, are distributed as χ²_1, or smaller where the fit has taken up a part.
     robot = len(problem.errors.parameters)
     chain = problem.errors.at(x[:robot])
     first = [p for p in PARAMETER_SETS[HARMONICS](chain) if p.name.endswith(("sin1", "cos1"))]
@@ -528,10 +514,7 @@ class _RegionErrors:
 
     @property
     def prediction_scale(self) -> float:
-        """Factor to standard deviations by the uncertainty of the fit that the held-out errors agree with.
-
-        Each held-out row also has the variance 1 of the residuals.
-        """
+        """Factor to standard deviations of the fit that agrees with the held-out errors."""
         excess = np.sum(self.n_rows * (self.squares - 1)) / np.sum(self.n_rows * self.variances)
         return float(np.sqrt(max(excess, 0.0)))
 
@@ -645,10 +628,7 @@ def _fit_selected(
 
 
 def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
-    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,).
-
-    Samples of low previous weight do not count for the scale of the residuals.
-    """
+    """Return weights (m,): 1, or hardly any for outliers at x (p,) by the scale of earlier inliers."""
     weights = []
     for residual, w in zip(problem.residuals(x, problem.data), previous, strict=True):
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
@@ -657,11 +637,8 @@ def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tu
 
 
 def _rejection_stage(fit: Fit) -> str:
-    """Return the robust stage for outliers that were set apart from the other samples before an extension.
-
-    Residuals that only the geometry leaves may look like outliers. They then have all sizes with the
-    families, too.
-    """
+    """Return the robust stage for outliers that were set apart from the other samples before an extension."""
+    # Outliers that only the geometry leaves have all sizes with the families.
     data = [item.with_weights(1 / w) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     t = [np.empty(0)]
     for residual, w in zip(fit.problem.residuals(fit.solution.x, data), fit.weights, strict=True):
@@ -686,11 +663,7 @@ def families_by_stage(names: Iterable[str]) -> list[tuple[str, ...]]:
 def select_families(
     fit: Fit, names: Sequence[str], factor: FactorFolds = _factor_folds
 ) -> tuple[tuple[FamilyTrial, ...], Model, float, dict[str, list[ErrorParameter]]]:
-    """Select families of joint errors among those of some names.
-
-    The function that factors the rows says what is known of their noise. The error of random folds with the
-    selected families relative to that of the geometry follows, and the parameters of these families.
-    """
+    """Select families by rows that `factor` factors; return trials, model, random ratio and parameters."""
     missing = _missing_parameters(fit.problem, names)
     trials: list[FamilyTrial] = []
     model, random_ratio = Model({}, _noise(fit), float("nan"), {}), float("nan")
@@ -744,11 +717,7 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
 
 
 def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:
-    """Compute what each family that is not in the model would explain of the residuals.
-
-    The gains are computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
-    measurement.
-    """
+    """Compute what each family that is not in the model would explain of the residuals."""
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
     missing = _missing_parameters(solved, [name for name in EXTENSIONS if not FAMILIES[name].is_curve])
@@ -768,11 +737,9 @@ def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[st
 
 
 def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
-    """Suggest an extension if one family explains a significant part of the residuals.
-
-    It requires a change of the cost that chance causes less than once in a million fits, by the bound
-    P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
-    """
+    """Suggest an extension if one family explains a significant part of the residuals."""
+    # Chance causes such a change of the cost less than once in a million fits: P(χ²_q > q + 2·sqrt(q·t) +
+    # 2·t) <= exp(-t) (Laurent and Massart 2000).
     best = MAX_HINT_RATIO, ""
     for name, each in family_gains(solved, x, weights).items():
         threshold = each.added + 2 * np.sqrt(HINT_LOG_P * each.added) + 2 * HINT_LOG_P

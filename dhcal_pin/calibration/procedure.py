@@ -350,10 +350,7 @@ def _full_set(setup: _Setup) -> dict[str, Any]:
 
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
-    """Raise an error if measurements beside images fit only if base or tool are estimated, too.
-
-    Images fit nevertheless, and their errors do not show the cause.
-    """
+    """Raise an error if measurements beside images need a base or a tool: errors of images do not show it."""
     errors = fit.problem.errors
     frames = {"base": BASE_FRAME, "tool": errors.chain.tool_frame_index}
     estimated = {parameter.error_frame for parameter in errors.parameters}

@@ -82,10 +82,7 @@ def fit_session(
     is_ordered: bool,
     progress: Progress | None,
 ) -> SessionFit:
-    """Find what happened during a session, and fit the measurements again with the changes that are believed.
-
-    `fit` is the first fit of `data`.
-    """
+    """Find what happened, and fit the measurements of a first fit again with believed changes."""
     unweighted = replace(fit.problem, data=fit.data)
     found = find_session(unweighted, fit.solution.x, holdout, is_ordered)
     if found.changes.is_empty:
@@ -103,10 +100,7 @@ def fit_session(
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
-    """Hold what no row shows of base and tool, such as the rotation of a tool of which a point is measured.
-
-    Changes of the tool act in its axes. These axes would turn until the changes fit better by chance.
-    """
+    """Hold what no row shows of base and tool: changes act in these axes, which would turn by chance."""
     system, n = solution.system, len(errors.parameters)
     is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
     held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
@@ -147,12 +141,9 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
 
 
 def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
-    """Return whether changes explain measurements beside all families of joint errors.
-
-    `without` and `fit` are the first fits without and with the changes; `extended` adds all families of joint
-    errors that the measurements support without the changes. They are fitted to both. Joint errors do not
-    imitate changes that are far larger than what they leave.
-    """
+    """Return whether changes explain measurements beside all families of joint errors, in first fits."""
+    # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
+    # families that the measurements support without the changes.
     changes = [cause for cause in session.causes if not cause.block.is_constant]
     numbers = session.timeline.fitted_numbers
     shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]

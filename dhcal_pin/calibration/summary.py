@@ -202,10 +202,7 @@ def judged_regions(
 def generalization_lines(
     generalization: Generalization, comparisons: Sequence[Comparison]
 ) -> tuple[str, str]:
-    """State the accuracy within the measured region and beyond it, one line each.
-
-    Where joint values have no meaning, the lines speak of the measured poses, and state no shares.
-    """
+    """State the accuracy in the measured region and beyond it, one line each; shares need joint values."""
     inside, beyond = judged_regions(generalization, comparisons)
     covered, reached = generalization.covered_share, generalization.reached_share
     region, pronoun, rest = "Among the measured poses", "them", ""

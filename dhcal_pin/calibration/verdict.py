@@ -191,10 +191,8 @@ def judge(fit: Evidence) -> Verdict:
 
 
 def _other_loss(fit: Evidence, verdict: Verdict) -> list[Finding]:
-    """Return the findings of the loss "auto" if its verdict is more severe, or if outliers spoil the fit.
-
-    A loss must not hide mistakes. The method of the paper only asks if there are outliers.
-    """
+    """Return the findings of the loss "auto" if its verdict is more severe, or if outliers spoil the fit."""
+    # A loss must not hide mistakes. The method of the paper only asks if there are outliers.
     if fit.with_auto is None or verdict.is_refused or (fit.method != "lm" and not fit.n_outliers):
         return []
     auto = fit.with_auto()
@@ -631,10 +629,7 @@ def _regional_errors(fit: Evidence) -> list[Finding]:
 
 
 def _overfitting(fit: Evidence) -> float:
-    """Return the increase of the squared error that the uncertainty of the parameters causes, relative to it.
-
-    A robot that needs no correction becomes worse by this much, which is no reason to doubt the measurements.
-    """
+    """Return the relative increase of the squared error that uncertain parameters cause in any robot."""
     return fit.random_folds.prediction_std**2 if fit.random_folds else np.inf
 
 
@@ -646,10 +641,7 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
-    """Advise caution if the measurements could not have revealed outliers.
-
-    Stated standard deviations that the residuals do not contradict need fewer rows for it.
-    """
+    """Advise caution if the measurements could not have revealed outliers; stated errors need fewer rows."""
     is_image = bool(fit.camera_stages or fit.hand_eye)
     if is_image or not fit.shrinkage_factor:
         return []
@@ -678,10 +670,8 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 
 def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
-    """Return the number of different configurations that gives this number of independent rows per direction.
-
-    The present rows may be too few to determine all directions that many rows would determine.
-    """
+    """Return the number of configurations with this number of independent rows per direction."""
+    # The present rows may be too few to determine all directions that many rows would determine.
     factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)
     n_configurations = len(np.unique(configuration_groups(fit.data)))
@@ -690,10 +680,8 @@ def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
 
 
 def _few_judged(fit: Evidence) -> list[Finding]:
-    """Advise caution if all samples together are too few to judge the accuracy.
-
-    Few hold-out samples say nothing against the fit of the others.
-    """
+    """Advise caution if all samples together are too few to judge the accuracy."""
+    # Few hold-out samples say nothing against the fit of the others.
     judged = headline(fit.comparisons).comparison
     if judged.title in ("fitted", "hold-out") or not small_sample_note(judged):
         return []

@@ -155,23 +155,9 @@ def recheck(
     noise: Noise | None = None,
     size: float = DEFAULT_SIZE,
 ) -> Recheck:
-    """Check whether a robot is still calibrated.
-
-    Args:
-        chain: Calibrated robot, with its base and tool.
-        data: Positions or poses of the tool, five to ten samples.
-        uncertainty: Uncertainty of the calibration; None for an exact one.
-        known: Values of instrument parameters [m or rad].
-        noise: Standard deviations of instrument and robot together [m, rad]; None for those of the
-            measurements, which are estimated if they state none.
-        size: Displacement of the tool that the check must be able to reveal [m].
-
-    Returns:
-        Verdict, what changed and by how much.
-
-    Raises:
-        InvalidArgumentError: The measurements are not positions or poses, or too many.
-    """
+    """Check whether a robot is still calibrated, by five to ten positions or poses of its tool."""
+    # The noise is that of instrument and robot together [m, rad]; without it, unstated noise of the
+    # measurements is estimated. The check must be able to reveal a displacement of the tool by `size` [m].
     if not can_have_session(data) or not measures_positions(data):
         kinds = ", ".join(dict.fromkeys(item.kind for item in data))
         raise InvalidArgumentError(
@@ -315,10 +301,7 @@ class _CheckModel:
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
     def log_likelihoods(self, columns: Array, sets: Sequence[Array], nothing: Array) -> Array:
-        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d).
-
-        `nothing` has those without a change, (σ, d).
-        """
+        """Return the log likelihood (σ, w, d) of d scaled residuals; (σ, d) without a change are given."""
         square = WIDTHS[:, None] ** 2
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):

@@ -113,11 +113,9 @@ class Layout:
         )
 
     def restricted_to(self, rows: Array) -> Layout:
-        """Return the layout with the causes that the rows (m, k, c) can show.
-
-        Columns without an effect on the rows are held at their values. A change over time is looked for only
-        if the calibration also estimates a constant error of the same kind.
-        """
+        """Return the layout with the causes that the rows (m, k, c) can show."""
+        # Columns without an effect on the rows are held at their values. A change over time is looked for
+        # only if the calibration also estimates a constant error of the same kind.
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
         changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))

@@ -110,10 +110,7 @@ class RobotChanges:
     def conditions(
         self, conditions: Conditions, chain: Chain, numbers: Array, times: Array, later: Array | None
     ) -> Conditions:
-        """Return the conditions of m samples with the changes, by their numbers and times (m,).
-
-        The base drifts in that of the chain. `later` are the joint positions by the lag later, (m, n).
-        """
+        """Return the conditions of samples with changes; `later` are their q after the lag, (m, n)."""
         values: dict[str, Any] = {}
         if not self.base.is_identity:
             drift = se3.exp6(self.base.twists(numbers, times))
@@ -164,10 +161,7 @@ class JointPaths:
 def apply_changes(
     changes: RobotChanges, chain: Chain, timeline: Timeline, paths: JointPaths | None
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
-    """Return fitted and held-out measurements with the changes as conditions of their samples.
-
-    A lag needs the paths of the joints.
-    """
+    """Return fitted and held-out measurements with the changes as conditions; a lag needs the paths."""
     out = []
     for item, numbers, times in zip(timeline.data, timeline.numbers, timeline.times, strict=True):
         later = paths.evaluate(numbers, times, changes.lag)[0] if paths and changes.lag else None
@@ -179,11 +173,7 @@ def apply_changes(
 def update(
     changes: RobotChanges, causes: Sequence[Cause], steps: Sequence[Array], base: Array, links: Array
 ) -> RobotChanges:
-    """Return the changes after increments (F·c,) of the coefficients of each cause.
-
-    `base` is the pose of the base (4, 4) at the end [m], `links` are the columns of the growth of each link
-    in the linear model, (k+1,).
-    """
+    """Return the changes after increments (F·c,) of the coefficients of each cause, at a base (4, 4) [m]."""
     motions = {"base": changes.base, "tool": changes.tool}
     zeros: list[tuple[int, Change, Array]] = []
     growth: list[tuple[Change, Array]] = []

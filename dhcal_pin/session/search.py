@@ -563,10 +563,7 @@ class _Search:
         return float(np.mean(is_outlier[side]))
 
     def _log_evidence(self, cause: Cause, i: int, full: LinearFit, without: LinearFit) -> float:
-        """Return the logarithm of the ratio of the evidences with and without a cause.
-
-        A sample counts no more than an outlier does.
-        """
+        """Return the logarithm of the ratio of the evidences with and without a cause."""
         limit = np.sum(self.groups >= 0, 1) + MAX_SAMPLE_COST
         costs = [
             float(np.sum(np.minimum(np.sum((fit.rows[..., -1] * fit.noise / full.noise) ** 2, 1), limit)))
@@ -584,10 +581,8 @@ class _Search:
 
     # ------------------------------------------------------------------------------------------- after it
     def with_lag_alone(self) -> _Search | None:
-        """Return a search with a lag as the only cause; None if there is no lag.
-
-        The last samples of a path are near each other, so that a step imitates small errors of the lag there.
-        """
+        """Return a search with a lag as the only cause; None if there is no lag."""
+        # The last samples of a path are near each other: a step imitates small errors of the lag there.
         lag = [cause for cause in self.causes if cause.block.kind == "lag"]
         if not lag:
             return None
@@ -717,10 +712,7 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
-    """Find what happened during a session, from an approximate solution x (p,) with base and tool.
-
-    Held-out measurements only count for the timeline. Without an order only files may differ.
-    """
+    """Find what happened, from an approximate x (p,) with base and tool; unordered files may only differ."""
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(timeline, chain, is_ordered)
     n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)

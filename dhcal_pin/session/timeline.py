@@ -48,10 +48,8 @@ class Timeline:
         return np.concatenate(self.times[: self.n_fitted])
 
     def thinned(self, count: int) -> Timeline:
-        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones.
-
-        Of consecutive samples at one configuration, the first counts: they share the error of the model.
-        """
+        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""
+        # Of consecutive samples at one configuration, the first counts: they share the error of the model.
         numbers = self.fitted_numbers
         order = np.argsort(numbers, kind="stable")
         q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
