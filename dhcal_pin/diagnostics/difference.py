@@ -240,18 +240,7 @@ def _interval(found: ChiSquare) -> str:
 
 
 def compare(first: Calibrated, second: Calibrated) -> Difference:
-    """Compare two calibrations of one robot.
-
-    Args:
-        first: One calibration, or the nominal robot.
-        second: The other one.
-
-    Returns:
-        Distances of the tools with the best common base and tool, and whether the uncertainties explain them.
-
-    Raises:
-        InvalidArgumentError: They are different robots.
-    """
+    """Compare the tools of two calibrations of one robot with the best common base and tool."""
     a, b = first.chain, second.chain
     for what in ("joint_names", "tip"):
         if getattr(a, what) != getattr(b, what):

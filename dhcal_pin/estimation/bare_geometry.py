@@ -72,10 +72,8 @@ class BareGeometry:
 def fit_bare_geometry(
     errors: ErrorModel, x: Array, complete: Chain, data: Sequence[Measurement]
 ) -> BareGeometry | None:
-    """Fit the geometry without joint errors to a complete model with the errors x; None if it has none.
-
-    Distances and angles have the weights that they have in the measurements.
-    """
+    """Fit the geometry without joint errors to a complete model with errors x; None without joint errors."""
+    # Distances and angles have the weights that they have in the measurements.
     if not complete.error_families:
         return None
     geometric = tuple(p for p in errors.parameters if p.coefficient_index is None)

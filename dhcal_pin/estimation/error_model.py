@@ -136,10 +136,7 @@ class ErrorModel:
         return displacements[0], twists[0]
 
     def at(self, x: Array) -> Chain:
-        """Build the chain with given errors.
-
-        The gravity torques remain those of the nominal chain; see `with_current_loads`.
-        """
+        """Build the chain with given errors; its gravity torques are nominal, see `with_current_loads`."""
         x = np.ascontiguousarray(x, float)
         return self._with_transmission(self.chain.perturbed(self._perturb_frames(x)[0]), x)
 
@@ -163,12 +160,9 @@ class ErrorModel:
         return replace(self, chain=self.chain.with_transmission(transmission))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
-        """Compute the chain at x and its derivative by each error.
-
-        The derivative consists of the body that each error moves, shape (p,), and the twist of that body in
-        its own frame, shape (p, 6), as `Chain.tool_jacobian` takes them. Transmission coefficients have
-        numbers above those of the bodies.
-        """
+        """Compute the chain at x, and its derivative by each error."""
+        # The derivative is the body (p,) that each error moves, and its twist (p, 6) in its own frame, as
+        # `Chain.tool_jacobian` takes them. Transmission coefficients have numbers above those of the bodies.
         x = np.ascontiguousarray(x, float)
         displacements, twists = self._perturb_frames(x)
         chain, bodies = self._with_transmission(self.chain.perturbed(displacements), x), self.bodies

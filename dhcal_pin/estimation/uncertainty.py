@@ -167,10 +167,7 @@ class Uncertainty:
 
     @property
     def relative(self) -> Uncertainty:
-        """Uncertainty relative to the base and tool poses that fit the measured configurations best.
-
-        It is the same if the measurements determine these poses.
-        """
+        """Uncertainty relative to the base and tool poses that fit the measured configurations best."""
         if not self.has_free_frames:
             return self
         parts = np.split(self.frame_part, [self.sqrt_covariance.shape[1]], axis=1)
@@ -210,12 +207,9 @@ class Uncertainty:
         )
 
     def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
-        """Compute the covariance of further parameters of the calibrated chain.
-
-        Parameters are matched by their effect on the tool (least squares). Effects shared by several
-        parameters are distributed in proportion to `scale`; effects outside the parameters' span are
-        projected onto it.
-        """
+        """Compute the covariance of further parameters of the calibrated chain, matched by their effects."""
+        # Effects shared by several parameters are distributed in proportion to `scale`; effects outside the
+        # parameters' span are projected onto it.
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_MATCHING_SAMPLES, self.chain.n_joints))
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
         effects = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
@@ -252,11 +246,9 @@ class Uncertainty:
 
     @cached_property
     def _shared_and_own(self) -> tuple[Array, Array]:
-        """Directions (6(k+1)+e, s) that move bodies, and the covariance (e, e) of the coefficients besides.
-
-        An orthogonal transformation of the columns of the square root separates the columns that all bodies
-        have in common, of which there are at most 6(k+1), from those of the coefficients alone.
-        """
+        """Directions (6(k+1)+e, s) that move bodies, and the covariance (e, e) of the coefficients alone."""
+        # An orthogonal transformation of the columns of the square root separates the columns that all bodies
+        # have in common, of which there are at most 6(k+1), from those of the coefficients alone.
         bodies, coefficients = np.split(self.sqrt_covariance, [len(self.sqrt_covariance) - len(self.entries)])
         basis, factor = np.linalg.qr(bodies.T)
         shared = coefficients @ basis

@@ -197,11 +197,8 @@ class Explainer:
     def _describe_observable(
         self, group: UnobservableGroup, names: list[str], listed: str = "", by: str = ""
     ) -> str:
-        """Describe which combinations of the members are identifiable.
-
-        The count refers to the null space of the group's cause, because other groups may share its members.
-        With `listed`, the text names the members, otherwise it refers to names that precede it.
-        """
+        """Describe which combinations of the members, `listed` or named before, are identifiable."""
+        # The count refers to the null space of the group's cause, because other groups may share its members.
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
         n_lost = int(np.sum(s > NEGLIGIBLE))
@@ -495,10 +492,8 @@ def label_unobservable(sentence: str) -> str:
 
 
 def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
-    """Merge groups of one cause if their union has one identifiable combination.
-
-    Groups of the causes "poses" and "unmoved" are always merged.
-    """
+    """Merge groups of one cause if their union has one identifiable combination."""
+    # Groups of the causes "poses" and "unmoved" are always merged.
     out: list[UnobservableGroup] = []
     for group in groups:
         for i, other in enumerate(out):

@@ -76,10 +76,7 @@ class ResidualCorrelation:
 def find_residual_correlation(
     problem: Problem, x: Array, system: TriangularSystem, noise: float, weights: Sequence[Array]
 ) -> ResidualCorrelation:
-    """Test whether the residuals of neighbouring configurations are correlated.
-
-    The system at x is that of the rows divided by the noise.
-    """
+    """Test whether residuals of neighbouring configurations are correlated, by rows divided by the noise."""
     linearization, chain = problem.linearize(x), problem.chain(x)
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), 1, 1))

@@ -106,11 +106,7 @@ def augmented_jacobian(table: DHTable, q: Array) -> Array:
 
 
 def regressor_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
-    """Compute the Jacobian from Pinocchio's kinematic regressor.
-
-    The regressor is the derivative of the tip frame with respect to a right perturbation of each joint
-    placement. It is multiplied by the matrix K from errors to perturbations.
-    """
+    """Compute the Jacobian from Pinocchio's kinematic regressor of each joint placement, and the matrix K."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
     n_moving = len(chain.moving_joints)

@@ -428,10 +428,7 @@ def _prepare(
 def _expected_error(
     information: Information, observable: Array, task_q: Array
 ) -> tuple[TaskError, bool, float]:
-    """Return the error to expect, relative to base and tool poses that measurements leave free.
-
-    Return, too, whether there are such poses, and the part of the error that only priors limit [m].
-    """
+    """Return the expected error [m], whether base or tool are free, and the part that priors limit."""
     undetermined = null_space(observable)
     combinations, has_free_frames = information.relative_combinations(task_q, undetermined)
     hidden = float(np.linalg.norm(undetermined.T @ combinations))
@@ -543,11 +540,7 @@ def _predict(
 
 
 def _error_with_points(planned: PlannedCalibration, pool: _Pool, refined: Array) -> float | None:
-    """Predict the error of a plan if the calibration finds that corners of boards must be estimated.
-
-    It is None if the rig states for each board whether its corners are estimated, or if the calibration does
-    not judge them.
-    """
+    """Predict the error of a plan if the calibration finds that corners of boards must be estimated."""
     if planned.images is None:
         return None
     judged = judged_boards(planned.images.rig.boards)

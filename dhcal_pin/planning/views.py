@@ -142,10 +142,7 @@ class PlannedImages:
 
 
 def _default_distances(camera: Camera, board: Board) -> tuple[float, float]:
-    """Return the smallest and the largest useful distance [m].
-
-    Nearer, the board does not fit into the image; farther, its details or the board itself are too small.
-    """
+    """Return the useful distances [m] between which a board fits into the image and is not too small."""
     focal, points = float(camera.values[:2].min()), board.points
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if board.type == "points":

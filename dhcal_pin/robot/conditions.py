@@ -194,10 +194,7 @@ def concatenate_conditions(parts: Sequence[Conditions | None]) -> Conditions | N
 
 
 def directions_in_order(q: Array) -> Array:
-    """Return the direction of the last motion of each joint for samples in the order of measurement, (m, n).
-
-    A joint that does not move keeps its direction. The direction before the first motion is not known: 0.
-    """
+    """Return the direction of the last motion of each joint (m, n), samples in order; 0 before the first."""
     steps = np.diff(q, axis=0, prepend=q[:1])
     directions = np.where(np.abs(steps) < MIN_MOTION, 0.0, np.sign(steps))
     rows = np.arange(len(q))[:, None]

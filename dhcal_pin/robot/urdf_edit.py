@@ -35,10 +35,7 @@ _INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
 
 
 def changed_origins(urdf: Urdf, origins: Mapping[str, Array]) -> Iterator[tuple[UrdfJoint, Array]]:
-    """List the joints whose new origins, which must be rigid, differ from those of the file.
-
-    An unknown joint raises an `UnknownNameError`.
-    """
+    """List the joints whose new origins, which must be rigid, differ from those of the file."""
     for name, value in origins.items():
         joint, origin = urdf.joint(name), np.asarray(value, float)
         where = f"{urdf.source}:{joint.line}: joint {name!r}: the new origin"
@@ -61,10 +58,7 @@ def changed_origins(urdf: Urdf, origins: Mapping[str, Array]) -> Iterator[tuple[
 
 
 def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
-    """Return the bytes of a URDF with new joint origins.
-
-    Translation and rotation are each rewritten only if they differ from those of the file.
-    """
+    """Return the bytes of a URDF with new joint origins; only what differs is written again."""
     changed = changed_origins(urdf, origins)
     return edited(
         urdf.data, [edit for joint, origin in changed for edit in _origin_edits(urdf, joint, origin)]
@@ -99,10 +93,7 @@ def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
 
 
 def with_world(data: bytes, base: Array) -> bytes:
-    """Return the bytes of a URDF whose root is the link `world`, the measuring frame.
-
-    If the root is already called `world`, the origins of its joints take up the base.
-    """
+    """Return the bytes of a URDF whose root is the link `world`, the measuring frame."""
     urdf = parse_urdf(data, "the calibrated URDF")
     if urdf.root == "world":
         at_root = [joint for joint in urdf.joints if joint.parent == "world"]

@@ -299,12 +299,10 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
 
 
 def _lockstep(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
-    """Run Levenberg-Marquardt on all problems in lockstep, without extrapolated steps.
-
-    In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
-    the others retry with more damping. State that outlives a pass has one element per problem of the batch;
-    quantities of one pass have one element per active problem.
-    """
+    """Run Levenberg-Marquardt on all problems in lockstep, without extrapolated steps."""
+    # In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
+    # the others retry with more damping. State that outlives a pass has one element per problem of the batch;
+    # quantities of one pass have one element per active problem.
     b, p, active_batch, active = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     systems, scale = batch.linearize_and_factor(x, batch.weights, small_angle=False), np.zeros((b, p))
