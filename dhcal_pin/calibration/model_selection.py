@@ -79,7 +79,7 @@ from ..estimation.folds import (
     solve_columns,
 )
 from ..estimation.parameters import EXTENSIONS, LOW_COST, PARAMETER_SETS
-from ..estimation.priors import PriorGroups, effective_parameters
+from ..estimation.priors import effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.solver import minimize
 from ..estimation.uncertainty import FamilyGain
@@ -586,9 +586,7 @@ def extend(
     stage = _rejection_stage(extended) if fit.stage == robust.REJECTED else fit.stage
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
-    groups = PriorGroups.none()
-    final = reweight(extended, (stage,), groups, max_iterations, progress, leverages)
-    return final, extension
+    return reweight(extended, (stage,), (), max_iterations, progress, leverages), extension
 
 
 def with_selected(

@@ -35,7 +35,13 @@ from ..estimation import robust
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
-from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
+from ..estimation.priors import (
+    PriorGroups,
+    Priors,
+    group_default_priors,
+    has_default_prior,
+    prior_weights,
+)
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
@@ -376,7 +382,7 @@ def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
 def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:
     """Return the groups of parameters whose prior widths are estimated."""
     errors = fit.problem.errors
-    return PriorGroups.from_expected(errors, fit.problem.weights, has_default_prior(errors, priors))
+    return group_default_priors(errors, fit.problem.weights, has_default_prior(errors, priors))
 
 
 def _first_fit(setup: _Setup, data: tuple[Measurement, ...], errors: ErrorModel) -> Fit:
@@ -438,7 +444,7 @@ def _calibrate_samples(
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     fit, holdout, families = begun.fit, begun.holdout, setup.families
     inliers = fit.without_rejected().problem
-    shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
+    shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups)
     result = make_result(fit, shrinkage_factor, holdout, "lm")
     result = replace(result, signs=setup.signs, earlier_diagnosis=begun.diagnosis)
     # Residuals of mixed-up measurements say nothing about other errors.

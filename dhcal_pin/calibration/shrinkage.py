@@ -39,12 +39,12 @@ References:
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .._typing import Array
+from ..estimation.priors import PriorGroups
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem
 from ..estimation.solver import SolverResult
@@ -63,9 +63,7 @@ NOISE_FLOOR = 1e-6
 N_FACTORS = 101
 
 
-def compute_shrinkage_factor(
-    problem: Problem, solution: SolverResult, groups: Sequence[tuple[Sequence[int], float]]
-) -> float:
+def compute_shrinkage_factor(problem: Problem, solution: SolverResult, groups: PriorGroups) -> float:
     """Compute the largest factor of a solution that is hardly worse than the nominal robot."""
     errors, x = problem.errors, solution.x
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
@@ -80,10 +78,10 @@ def compute_shrinkage_factor(
     change = displacement @ x[robot]
     # Stated priors and those of joint errors keep their widths; they form the last group, of width 1.
     std, members_of = 1 / problem.weights[robot], []
-    for members, default_weight in groups:
-        if errors.parameters[members[0]].coefficient_index is None:
-            members_of.append(np.isin(robot, members))
-            std[members_of[-1]] = 1 / default_weight
+    for group in groups:
+        if errors.parameters[group.members[0]].coefficient_index is None:
+            members_of.append(np.isin(robot, group.members))
+            std[members_of[-1]] = 1 / group.expected_weight
     widths = np.array([[*row, 1.0] for row in itertools.product(PRIOR_WIDTHS, repeat=len(members_of))])
     members_of.append(~np.any(members_of, 0))
     rows, effect = rows * std, displacement.T @ change * std
