@@ -269,7 +269,7 @@ class Evidence(FittedModel):
     @cached_property
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
-        return estimate_generalization(self, self.random_folds, self._measured_region, self.region_comparison)
+        return estimate_generalization(self, self.random_folds, self.measured_region, self.region_comparison)
 
     @cached_property
     def position_std(self) -> float:
@@ -280,13 +280,9 @@ class Evidence(FittedModel):
             q = np.clip(drawn, self.chain.lower, self.chain.upper)
         return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
 
-    @property
+    @cached_property
     def measured_region(self) -> MeasuredRegion | None:
         """Region of joint space around the fitted configurations; None without joint values."""
-        return self._measured_region
-
-    @cached_property
-    def _measured_region(self) -> MeasuredRegion | None:
         return measured_region(self)
 
     def _compare_holdout(self) -> Comparison:

@@ -365,13 +365,9 @@ class FittedModel:
         out[unknown, unknown] = np.inf
         return out
 
-    @property
+    @cached_property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of the robot without that of the instruments, for predictions and for the sidecar."""
-        return self._uncertainty
-
-    @cached_property
-    def _uncertainty(self) -> Uncertainty:
         root, unbounded = self._scaled_sqrt_covariance
         robot = len(self.errors.parameters)
         # Predictions agree with the errors of left-out regions, see `model_selection`.

@@ -93,30 +93,15 @@ def _uniform(t: Array) -> Array:
     return np.ones_like(t)
 
 
-def _huber(t: Array) -> Array:
-    """Return the weights of Huber's loss."""
-    return 1.345 / np.maximum(t, 1.345)
-
-
-def _cauchy(t: Array) -> Array:
-    """Return the weights of Cauchy's loss."""
-    return 1 / (1 + (np.maximum(t, 0) / 2.385) ** 2)
-
-
-def _tukey(t: Array) -> Array:
-    """Return the weights of Tukey's biweight loss."""
-    return np.maximum(1 - (np.clip(t, 0, 4.685) / 4.685) ** 2, 0) ** 2
-
-
 # Weight function of each stage, and the standardized residual above which its weight is zero. Without that
 # limit every outlier keeps a constant influence: with 10 % outliers the error is about 25 % larger.
 WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
     REJECTED: (_uniform, REJECTION_THRESHOLD),
     FAR_REJECTED: (_uniform, FAR_THRESHOLD),
     REGIONAL: (_uniform, FAR_THRESHOLD),
-    "huber": (_huber, OUTLIER_THRESHOLD),
-    "cauchy": (_cauchy, OUTLIER_THRESHOLD),
-    "tukey": (_tukey, OUTLIER_THRESHOLD),
+    "huber": (lambda t: 1.345 / np.maximum(t, 1.345), OUTLIER_THRESHOLD),
+    "cauchy": (lambda t: 1 / (1 + (np.maximum(t, 0) / 2.385) ** 2), OUTLIER_THRESHOLD),
+    "tukey": (lambda t: np.maximum(1 - (np.clip(t, 0, 4.685) / 4.685) ** 2, 0) ** 2, OUTLIER_THRESHOLD),
 }
 
 
