@@ -54,7 +54,7 @@ from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import has_enough_rows
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import Session, can_have_session, find_scale
@@ -70,13 +70,13 @@ from .cameras import (
     split_sets,
 )
 from .cross_validation import leave_regions_out
-from .evaluation import accuracy, fit_nominal
+from .evaluation import accuracy
 from .evidence import diagnose, positions_beside_images
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import SessionFit, SessionModels, fit_session
 from .shrinkage import compute_shrinkage_factor
-from .verdict import MAX_FRAME_ITERATIONS, MAX_FRAME_RATIO, MAX_USUAL_ERROR
+from .verdict import MAX_USUAL_ERROR, needed_frames
 
 # Decimals of the reference temperature of a model [°C].
 REFERENCE_DECIMALS = 1
@@ -357,21 +357,16 @@ def _full_set(setup: _Setup) -> dict[str, Any]:
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
     """Raise an error if measurements beside images need a base or a tool: errors of images do not show it."""
-    errors = fit.problem.errors
-    frames = {"base": BASE_FRAME, "tool": errors.chain.tool_frame_index}
-    estimated = {parameter.error_frame for parameter in errors.parameters}
-    missing = [name for name, frame in frames.items() if frame not in estimated]
+    problem, x = fit.problem, fit.solution.x
     others = tuple(item for item in fit.data if item.rig is None)
-    if not missing or not has_enough_rows(others):
+    if not has_enough_rows(others):
         return
-    chain, known, x = errors.chain, fit.problem.known, fit.solution.x
-    fitted = accuracy(fit.problem.chain(x), others, fit.problem.instruments(x))
-    group, found = next(iter(fitted.groups.items()))
-    if found.rms <= MAX_USUAL_ERROR[found.unit] * (workspace_radius(chain) if found.unit == "m" else 1.0):
+    fitted = accuracy(problem.chain(x), others, problem.instruments(x))
+    found = next(iter(fitted.groups.values()))
+    size = workspace_radius(problem.errors.chain) if found.unit == "m" else 1.0
+    if found.rms <= MAX_USUAL_ERROR[found.unit] * size:
         return
-    free = initialize_frames(select_parameters(chain, "base,tool"), others, known, MAX_FRAME_ITERATIONS)
-    nominal, instruments = fit_nominal(free, others, known)
-    if accuracy(nominal, others, instruments).groups[group].rms < MAX_FRAME_RATIO * found.rms:
+    if missing := needed_frames(problem, others, others, fitted):
         sources = list(dict.fromkeys(item.source or item.kind for item in others))
         raise InvalidArgumentError(
             f"{join_names(sources)}: the measurements fit this arm only with another {join_names(missing)}; "

@@ -11,7 +11,7 @@ The limits separate simulated mistakes from honest measurements of robots with e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,12 +21,14 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
+from ..estimation.problem import Problem
 from ..estimation.solver import minimize
 from ..exceptions import ConvergenceError
 from ..formatting import capitalized, format_below, format_count, format_quantity, join_names
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
+from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
@@ -34,7 +36,7 @@ from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
 from . import cameras
-from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
+from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .model_selection import FULL_SET
 from .partition import configuration_groups
@@ -482,17 +484,24 @@ def _describe(size: CorrectionSize) -> str:
 
 def _missing_frames(fit: Evidence) -> list[str]:
     """Return which of base and tool are not estimated, if the nominal robot fits much better with them."""
-    frames = {"base": BASE_FRAME, "tool": fit.errors.chain.tool_frame_index}
-    estimated = {parameter.error_frame for parameter in fit.errors.parameters}
+    return needed_frames(fit.problem, fit.data, fit.inliers, fit.comparisons[-1].before)
+
+
+def needed_frames(
+    problem: Problem, data: tuple[Measurement, ...], inliers: Sequence[Measurement], before: Accuracy
+) -> list[str]:
+    """Return which of base and tool a problem lacks, if the nominal robot fits much better with them."""
+    chain, known = problem.errors.chain, problem.known
+    frames = {"base": BASE_FRAME, "tool": chain.tool_frame_index}
+    estimated = {parameter.error_frame for parameter in problem.errors.parameters}
     missing = [name for name, frame in frames.items() if frame not in estimated]
     if not missing:
         return []
-    errors = select_parameters(fit.errors.chain, "base,tool")
-    errors = initialize_frames(errors, fit.data, fit.problem.known, MAX_FRAME_ITERATIONS)
-    chain, instruments = fit_nominal(errors, fit.inliers, fit.problem.known)
-    group, before = next(iter(fit.comparisons[-1].before.groups.items()))
-    with_frames = accuracy(chain, fit.inliers, instruments).groups[group]
-    return missing if with_frames.rms < MAX_FRAME_RATIO * before.rms else []
+    errors = initialize_frames(select_parameters(chain, "base,tool"), data, known, MAX_FRAME_ITERATIONS)
+    nominal, instruments = fit_nominal(errors, inliers, known)
+    group, found = next(iter(before.groups.items()))
+    is_needed = accuracy(nominal, inliers, instruments).groups[group].rms < MAX_FRAME_RATIO * found.rms
+    return missing if is_needed else []
 
 
 def _configuration_checks(fit: Evidence) -> str:

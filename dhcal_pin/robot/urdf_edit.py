@@ -21,7 +21,14 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..se3 import nearest_rotation, nearest_rpy, to_xyz_rpy
-from .formats.xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
+from .formats.xml_tags import (
+    Edit,
+    attribute_edit,
+    attribute_spans,
+    attribute_text,
+    edited,
+    number_text,
+)
 from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, scan_tags, xml_attribute
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
@@ -74,11 +81,7 @@ def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
         axis = number_text(-urdf.joint(name).axis)
         if "axis" in joint.children:
             spans, end, quotes = attribute_spans(urdf.data, joint.children["axis"].start)
-            edits.append(
-                Edit(*spans[b"xyz"].value, axis)
-                if b"xyz" in spans
-                else Edit(end, end, attribute_text(b"xyz", axis, quotes or b'"'))
-            )
+            edits.append(attribute_edit(spans, end, b"xyz", axis, quotes or b'"'))
         else:
             start = urdf.joint(name).first_child
             edits.append(Edit(start, start, b'<axis xyz="' + axis + b'"/>'))
@@ -140,12 +143,7 @@ def _origin_edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[Edit]:
         indent = _INDENT.search(urdf.data, joint.start, start)
         return [Edit(start, start, b"<origin" + attributes + b"/>" + (indent[0] if indent else b""))]
     spans, end, quote = attribute_spans(urdf.data, joint.origin_start)
-    return [
-        Edit(*spans[key].value, text)
-        if key in spans
-        else Edit(end, end, attribute_text(key, text, quote or joint_quote))
-        for key, text in texts.items()
-    ]
+    return [attribute_edit(spans, end, key, text, quote or joint_quote) for key, text in texts.items()]
 
 
 def _find_end_of_robot(data: bytes) -> int:

@@ -187,16 +187,22 @@ class _Search:
         parts = [cause.columns_of(rows, self.numbers, self.times) for cause in causes]
         return np.concatenate([rows[..., :0], *parts], -1)
 
+    def _prior(self, causes: Sequence[Cause]) -> Array:
+        """Return the weights of the priors of the unknowns and of causes, (p,)."""
+        # A prior of one metre decides what the measurements do not show, such as turns of a point.
+        return np.concatenate([self.layout.weights, *(1 / cause.sizes for cause in causes)])
+
+    def _columns_without(self, cause: Cause, rows: Array, causes: Sequence[Cause]) -> Array:
+        """Return the columns of the unknowns and of causes, and the residual as if one were left out."""
+        residual = self._undone(rows, cause)[..., -1:]
+        return np.concatenate([rows[..., self.layout.model], self._cause_columns(rows, causes), residual], -1)
+
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
         """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
         layout = self.layout
         columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
-        residual = rows[..., -1]
-        sizes = np.concatenate([np.ones(0), *(cause.sizes for cause in causes)])
-        held = np.concatenate([np.zeros(0), *(cause.values for cause in causes)])
-        # A prior of one metre decides what the measurements do not show, such as turns of a point.
-        prior = np.concatenate([layout.weights, 1 / sizes])
-        value = np.concatenate([self.x, held])
+        residual, prior = rows[..., -1], self._prior(causes)
+        value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
         labels = [self.groups == label for label in range(self.groups.max() + 1)]
         products = [part.T @ part for part in (columns[chosen] for chosen in labels)]
@@ -454,11 +460,8 @@ class _Search:
             ]
             if isinstance(old, FreeDrift):
                 tried.append(cause)
-            columns = [rows[..., self.layout.model], self._cause_columns(rows, [*others, *tried])]
-            stack = np.concatenate([*columns, self._undone(rows, cause)[..., -1:]], -1)
-            products = _information(stack, scaled)
-            sizes = np.concatenate([np.ones(0), *(1 / c.sizes for c in (*others, *tried))])
-            prior = np.concatenate([self.layout.weights, sizes])
+            products = _information(self._columns_without(cause, rows, [*others, *tried]), scaled)
+            prior = self._prior([*others, *tried])
             ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
             # Each coefficient costs the logarithm of the number of rows; a linear drift is the simplest one.
             costs = [
@@ -532,21 +535,14 @@ class _Search:
     def _judge(self, rows: Array, full: LinearFit, i: int) -> Cause:
         """Return a cause with the evidence for it, given all others."""
         cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
-        undone = self._undone(rows, cause)
-        without = self.solve(undone, others)
+        without = self.solve(self._undone(rows, cause), others)
         # The same noise and weights for both.
         scaled = np.sqrt(full.weights)[:, None] / full.noise
-        columns = [
-            rows[..., self.layout.model],
-            self._cause_columns(rows, [*others, cause]),
-            undone[..., -1:],
-        ]
-        stack = np.concatenate(columns, -1) * scaled[..., None]
-        sizes = [1 / c.sizes for c in (*others, cause)]
-        prior = np.concatenate([self.layout.weights, *sizes])
+        stack = self._columns_without(cause, rows, [*others, cause]) * scaled[..., None]
+        prior = self._prior([*others, cause])
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
-        inside, predicted = _predicted_gain(stack, len(prior) - len(sizes[-1]), prior, length)
+        inside, predicted = _predicted_gain(stack, len(prior) - len(cause.values), prior, length)
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 from xml.parsers import expat
@@ -170,6 +170,15 @@ def attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, AttributeSpan]
 def attribute_text(name: bytes, value: bytes, quotes: bytes) -> bytes:
     """Write an attribute with the space before it."""
     return b" " + name + b"=" + quotes + value + quotes
+
+
+def attribute_edit(
+    spans: Mapping[bytes, AttributeSpan], end: int, key: bytes, text: bytes, quotes: bytes
+) -> Edit:
+    """Return the edit that gives a tag an attribute: another value, or a new one behind the others."""
+    if key in spans:
+        return Edit(*spans[key].value, text)
+    return Edit(end, end, attribute_text(key, text, quotes))
 
 
 def number_text(values: Iterable[float]) -> bytes:
