@@ -230,7 +230,7 @@ class Extension:
             for name in self.families
         )
         changes = [
-            f"{kind} {_percent(ratio)}"
+            f"{kind} {100 * (ratio - 1):+.0f} %"
             for kind, ratio in (("at random", self.random_ratio), ("by region", self.region_ratio))
             if np.isfinite(ratio)
         ]
@@ -255,11 +255,6 @@ class Extension:
             "region_ratio": self.region_ratio,
             "trials": [asdict(trial) for trial in self.trials],
         }
-
-
-def _percent(ratio: float) -> str:
-    """Format a ratio as a change in percent."""
-    return f"{100 * (ratio - 1):+.0f} %"
 
 
 @dataclass(frozen=True, eq=False)

@@ -215,15 +215,10 @@ class Explainer:
         if len(members) > r + 1:
             return f"only {len(members) - r} combinations of {whole} {several}{by}"
         weights = vt[-1]
-        has_mixed_units = len({self._unit(i) for i in members}) > 1
+        has_mixed_units = len({self.probe.problem.parameters[i].unit for i in members}) > 1
         if has_mixed_units or np.abs(weights).min() < _ZERO_WEIGHT:
             return f"only one combination of {whole} {one}{by}"
         return f"only {_weighted_sum(names, weights)} {one}{by}"
-
-    def _unit(self, i: int) -> str:
-        """Return the unit of an unknown."""
-        problem = self.probe.problem
-        return problem.parameters[i].unit
 
     def _robot_part(self, group: UnobservableGroup) -> tuple[list[ErrorParameter], Propagation | None]:
         """Return the geometric errors of a group, and their propagation if the group has no other members."""

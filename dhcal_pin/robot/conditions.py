@@ -65,16 +65,6 @@ class Condition:
         return None
 
 
-def _draw_directions(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
-    """Draw directions of the joints."""
-    return rng.choice([-1.0, 1.0], shape)
-
-
-def _draw_temperatures(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
-    """Draw temperatures around the reference temperature."""
-    return reference + rng.uniform(-MAX_RISE, MAX_RISE, shape[0])
-
-
 CONDITIONS = {
     condition.name: condition
     for condition in (
@@ -86,7 +76,7 @@ CONDITIONS = {
             -1,
             1,
             is_per_joint=True,
-            draw=_draw_directions,
+            draw=lambda rng, shape, reference: rng.choice([-1.0, 1.0], shape),
             resolution=1,
         ),
         Condition(
@@ -94,7 +84,7 @@ CONDITIONS = {
             "temperature",
             "temperature of the robot",
             *TEMPERATURE_RANGE,
-            draw=_draw_temperatures,
+            draw=lambda rng, shape, reference: reference + rng.uniform(-MAX_RISE, MAX_RISE, shape[0]),
             resolution=1,
         ),
         Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD, resolution=0.01),

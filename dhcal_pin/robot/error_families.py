@@ -217,9 +217,9 @@ def _temperature_rise(conditions: Conditions, arm: ArmProperties) -> Array:
     return conditions.temperature - arm.reference_temperature
 
 
-def _has_length(arm: ArmProperties) -> Array:
-    """Return whether each link has a length that can grow."""
-    return np.linalg.norm(arm.link_vectors, axis=1) > MIN_LINK_LENGTH
+def growing_links(link_vectors: Array) -> Array:
+    """Return which links (k+1, 3) have a length that can grow, (k+1,)."""
+    return np.linalg.norm(link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
 GAIN, COMPLIANCE, COUPLING = "gain", "compliance", "coupling"
@@ -311,7 +311,11 @@ FAMILIES = {
             2e-5,
             "per_kelvin",
             link_term=Term(
-                "thermal", "1/K", "temperature - reference_temperature", _temperature_rise, _has_length
+                "thermal",
+                "1/K",
+                "temperature - reference_temperature",
+                _temperature_rise,
+                lambda arm: growing_links(arm.link_vectors),
             ),
             condition="temperature",
         ),

@@ -13,8 +13,8 @@ from .._typing import Array
 from ..formatting import format_fixed, format_quantity, significant_decimals
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
+from ..robot.error_families import growing_links
 from .causes import Block, Cause, Drift, FreeDrift, Step
-from .linear_model import growing_links
 from .robot_changes import JointPaths, RobotChanges, apply_changes
 from .timeline import Place, Timeline
 
@@ -365,7 +365,7 @@ def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timel
     if len(values) == 1:
         motions = motions.sum(0, keepdims=True)
     else:
-        motions = motions[growing_links(chain)]
+        motions = motions[growing_links(chain.link_vectors)]
     moved = np.einsum("jcm,j->cm", motions, values)
     size = float(np.sqrt(np.mean(np.sum(moved**2, 0))))
     gradient = np.einsum("jcm,cm->j", motions, moved) / (moved.shape[1] * max(size, 1e-300))

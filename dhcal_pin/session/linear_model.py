@@ -18,8 +18,7 @@ from .._typing import Array
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, instrument_values
-from ..robot.chain import Chain
-from ..robot.error_families import MIN_LINK_LENGTH
+from ..robot.error_families import growing_links
 from .causes import HELD_SIZE, Block
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
@@ -32,11 +31,6 @@ MAX_UNEXPLAINED = 1e-3
 MIN_INFORMATION = 1e-12
 # Axes of a scale; empty for all axes.
 SCALE_AXES = ("", "x", "y", "z")
-
-
-def growing_links(chain: Chain) -> Array:
-    """Return which links have a length that can grow, (k+1,)."""
-    return np.linalg.norm(chain.link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
 def measures_positions(data: Sequence[Measurement]) -> bool:
@@ -77,7 +71,7 @@ class Layout:
         all_links = int(links[-1]) + 1
         scales = all_links + 1 + np.arange(len(SCALE_AXES))
         lag = int(scales[-1]) + 1
-        grows = growing_links(chain)
+        grows = growing_links(chain.link_vectors)
         # A robot without lengths only turns.
         size = float(np.linalg.norm(chain.link_vectors, axis=1).sum()) or 1.0
         of_frame = np.array([1.0] * 3 + [1 / size] * 3)

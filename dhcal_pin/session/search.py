@@ -736,6 +736,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     other_robot = search.other_robot()
     search.place_steps()
     causes = tuple(search.causes)
+    constants = [
+        (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
+        for cause in causes
+        if cause.block.is_constant
+    ]
     return Session(
         timeline,
         search.chain,
@@ -743,21 +748,15 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search.changes,
         causes,
         (other_robot,) if other_robot else (),
-        lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
-        scales=tuple(scale for scale in _scales(causes) if abs(scale.factor - 1) <= MAX_SCALE_CHANGE),
+        lag=next(
+            (Lag(value, std, timeline.unit) for kind, value, std, _ in constants if kind == "lag"), None
+        ),
+        scales=tuple(
+            Scale(1 + value, std, axis)
+            for kind, value, std, axis in constants
+            if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
+        ),
     ).described()
-
-
-def _lag(cause: Cause, timeline: Timeline) -> Lag:
-    """Describe a lag."""
-    return Lag(float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), timeline.unit)
-
-
-def _scales(causes: Sequence[Cause]) -> Iterator[Scale]:
-    """Describe the scales of single axes."""
-    for cause in causes:
-        if cause.block.kind == "scale":
-            yield Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:
