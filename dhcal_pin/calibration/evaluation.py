@@ -236,7 +236,8 @@ def accuracy(
 
 
 def find_inliers(errors: Sequence[Mapping[str, Array]]) -> tuple[Array, ...]:
-    """Find the samples (m,) whose first group of errors (of a pose, the position) has no outlier."""
+    """Find the samples whose errors are no outliers among those of their measurement, (m,) each."""
+    # Only the first group of errors of a measurement is tested: of a pose, the position.
     tested = [next(iter(item.values())) for item in errors]
     return tuple(
         robust.standardize_mean_squares(np.mean(each**2, 1), each.shape[1]) <= robust.OUTLIER_THRESHOLD

@@ -445,7 +445,8 @@ class FittedModel:
 
     @property
     def _model_fit(self) -> ModelFit:
-        """How well the model explains the measurements; the uncertainty contains correlated residuals."""
+        """How well the model explains the measurements."""
+        # Correlated residuals are errors of the model, which the uncertainty contains.
         is_stated = self.problem.temperature == 1 and all(item.has_stated_sigma for item in self.data)
         chi_square = self.unit_weight_std**2 * self.degrees_of_freedom
         has_chi_square = is_stated and np.isfinite(chi_square)

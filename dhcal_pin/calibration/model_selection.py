@@ -621,7 +621,8 @@ def _fit_selected(
 
 
 def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
-    """Return weights (m,): 1, or hardly any for outliers at x (p,) by the scale of earlier inliers."""
+    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x."""
+    # Samples of low previous weight do not count for the scale of the residuals.
     weights = []
     for residual, w in zip(problem.residuals(x, problem.data), previous, strict=True):
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
@@ -656,7 +657,10 @@ def families_by_stage(names: Iterable[str]) -> list[tuple[str, ...]]:
 def select_families(
     fit: Fit, names: Sequence[str], factor: FactorFolds = _factor_folds
 ) -> tuple[tuple[FamilyTrial, ...], Model, float, dict[str, list[ErrorParameter]]]:
-    """Select families by rows that `factor` factors; return trials, model, random ratio and parameters."""
+    """Select families of joint errors among those of some names."""
+    # The function that factors the rows says what is known of their noise. Returned are the trials, the
+    # model, the error of random folds relative to that of the geometry, and the parameters of the selected
+    # families.
     missing = _missing_parameters(fit.problem, names)
     trials: list[FamilyTrial] = []
     model, random_ratio = Model({}, _noise(fit), float("nan"), {}), float("nan")

@@ -356,7 +356,8 @@ def _full_set(setup: _Setup) -> dict[str, Any]:
 
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
-    """Raise an error if measurements beside images need a base or a tool: errors of images do not show it."""
+    """Raise an error if measurements beside images fit only if base or tool are estimated, too."""
+    # Images fit nevertheless, and their errors do not show the cause.
     problem, x = fit.problem, fit.solution.x
     others = tuple(item for item in fit.data if item.rig is None)
     if not has_enough_rows(others):

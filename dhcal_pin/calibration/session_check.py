@@ -82,7 +82,7 @@ def fit_session(
     is_ordered: bool,
     progress: Progress | None,
 ) -> SessionFit:
-    """Find what happened, and fit the measurements of a first fit again with believed changes."""
+    """Find what happened during a session, and fit the measurements of a first fit again with it."""
     unweighted = replace(fit.problem, data=fit.data)
     found = find_session(unweighted, fit.solution.x, holdout, is_ordered)
     if found.changes.is_empty:

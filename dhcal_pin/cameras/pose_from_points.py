@@ -126,7 +126,8 @@ def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:
 
 
 def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
-    """Estimate the pose (4, 4) [m] of points in the camera from X/Z, Y/Z, and its RMS distance there."""
+    """Estimate the pose (4, 4) [m] of points in the camera from one image; None with too few points."""
+    # The image coordinates are undistorted, X/Z and Y/Z. The RMS distance in the image follows.
     found = estimate_poses([(points, image)])[0]
     return found[0] if found else None
 

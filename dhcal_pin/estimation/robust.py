@@ -262,7 +262,8 @@ class SolvedProblem:
 
     @cached_property
     def prediction_covariances(self) -> list[Array]:
-        """w_i·H_i, (m, k, k) of each measurement, H_i = J_i·C·J_iᵀ; its diagonal are leverages of rows."""
+        """w_i·H_i, (m, k, k) of each measurement, with the leverages of the rows on the diagonal."""
+        # H_i = J_i·C·J_iᵀ with the whitened Jacobian of a sample, without its weight, and the covariance C.
         problem, solution = self.problem, self.solution
         system, model = solution.system, problem.linearize(solution.x)
         if solution.converged and not isinstance(system, NormalEquations):

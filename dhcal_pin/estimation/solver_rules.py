@@ -180,7 +180,8 @@ def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
 
 
 def is_slow_and_short(remaining: float, last_remaining: float) -> bool:
-    """Decide whether undamped steps are short against the standard deviations, and hardly become shorter."""
+    """Decide whether undamped steps are short against the standard deviations, and hardly shrink."""
+    # The change of the whitened rows by an undamped step is its largest ratio to a standard deviation.
     return remaining <= MAX_DEVIATION and remaining > MIN_CREEPING_RATIO * last_remaining
 
 

@@ -120,7 +120,7 @@ class ObservabilityProbe:
         return rng.uniform(low, high, (m, chain.n_joints))
 
     def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
-        """Return a measurement, but a contact, with joints drawn anew, in images near the measured ones."""
+        """Return a measurement with joints drawn anew, in images near the measured ones."""
         if item.is_contact:
             return item
         if len(joints) == self.chain.n_joints and not item.instrument_parameters:

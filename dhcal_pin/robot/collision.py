@@ -137,9 +137,10 @@ class CollisionChecker:
         )
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
-        """Return whether robot and obstacles leave the line between two points, in the first link, free."""
-        # The links behind the last moving joint are ignored, because the measured point is on them, and so is
-        # the floor, because it may end before the instrument.
+        """Return whether robot and obstacles leave the line between two points free."""
+        # The points are in the frame of the first link. The links behind the last moving joint are ignored,
+        # because the measured point is on them, and so is the floor, because it may end before the
+        # instrument.
         return self.shapes_on_line(q, eye, point) <= self.shapes_on_end(True)
 
     def shapes_on_end(self, is_tip: bool) -> frozenset[int]:

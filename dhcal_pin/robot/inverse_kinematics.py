@@ -194,7 +194,7 @@ def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple
 def reach_within_limits(
     chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Find joint positions whose task errors are as near to zero as the arm can, from several starts."""
+    """Find joint positions with task errors as small as the arm allows, from several starts."""
     unlimited = without_rotary_limits(chain)
     out, least, within_limits = start.copy(), np.full(len(start), np.inf), np.zeros(len(start), bool)
     starts, remaining = start, np.arange(len(start))

@@ -84,7 +84,8 @@ class WorkspaceConstraints:
 
 
 def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
-    """Return the range of joint positions within limits, half a turn or metre, and margins [rad or m]."""
+    """Return the range of joint positions within the limits and half a turn or half a metre."""
+    # The margins to the limits are an angle [rad] for revolute and a length [m] for prismatic joints.
     low, high = limits_with_margin(chain, angle, length)
     span = np.where(_is_prismatic(chain), _MAX_STROKE, _MAX_ANGLE)
     return (

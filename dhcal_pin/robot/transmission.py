@@ -112,7 +112,8 @@ class GravityLoads:
         return out
 
     def torques(self, q: Array, payload: Array | None = None) -> Array:
-        """Compute the gravity torques; the z axis of the root link points up, payloads (m,) are in kg."""
+        """Compute the generalised gravity torques; the z axis of the root link points up."""
+        # A payload (m,) [kg] replaces the mass of the payload in the model.
         torques = self._torques(self.model, b"", q)
         if payload is None:
             return torques

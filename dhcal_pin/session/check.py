@@ -301,7 +301,8 @@ class _CheckModel:
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
     def log_likelihoods(self, columns: Array, sets: Sequence[Array], nothing: Array) -> Array:
-        """Return the log likelihood (σ, w, d) of d scaled residuals; (σ, d) without a change are given."""
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
+        # `nothing` has those without a change, (σ, d).
         square = WIDTHS[:, None] ** 2
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):

@@ -708,7 +708,8 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
-    """Find what happened, from an approximate x (p,) with base and tool; unordered files may only differ."""
+    """Find what happened during a session, from an approximate solution x (p,) with base and tool."""
+    # Held-out measurements only count for the timeline. Without an order only files may differ.
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(timeline, chain, is_ordered)
     n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
