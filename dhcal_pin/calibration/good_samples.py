@@ -77,28 +77,19 @@ MAX_EXTENSIONS = 20
 N_PERMUTATIONS = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class GoodSamples:
-    """Result of the search for good samples."""
-
-    # Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
-    weights: list[Array]
-    # Robust stage that judges the samples with the nonlinear model: "reject" if outliers were found that are
-    # set apart from the other samples, "reject_regional" if these lie together in joint space, otherwise
-    # "reject_far".
-    stage: str
-
-
 def find_good_samples(
     problem: Problem,
     solution: SolverResult,
     data: Sequence[Measurement],
     groups: Array,
     previous: Sequence[Array],
-) -> GoodSamples:
+) -> tuple[list[Array], str]:
     """Find the samples that agree with a majority; those of an earlier search may stay."""
+    # Weights (m,) of each measurement are 1 for good samples and ZERO_WEIGHT for others. The robust stage
+    # judges the samples with the nonlinear model: it is "reject" if outliers were found that are set apart
+    # from the other samples, "reject_regional" if these lie together in joint space, else "reject_far".
     counts = [len(item.rows) for item in data]
-    all_good = GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
+    all_good = [np.ones(count) for count in counts], robust.FAR_REJECTED
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
         return all_good
     drawn = _draw_samples(sum(counts))
@@ -126,9 +117,9 @@ def find_good_samples(
     threshold = robust.WEIGHT_FUNCTIONS[stage][1]
     if len(drawn) < len(groups):
         x = solution.x + root @ core.y
-        return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)
+        return _judge(problem.with_data(data), x, rows, core.scales, threshold), stage
     weights = np.where(core.t > threshold, robust.ZERO_WEIGHT, 1.0)
-    return GoodSamples([weights[a:b] for a, b in pairwise(starts)], stage)
+    return [weights[a:b] for a, b in pairwise(starts)], stage
 
 
 def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int, float] | None:

@@ -85,7 +85,7 @@ from ..estimation.solver import minimize
 from ..estimation.uncertainty import FamilyGain
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
-from ..identifiability.residual_correlation import design_effect, find_residual_correlation
+from ..identifiability.residual_correlation import MAX_WHITE_Z, design_effect, find_residual_correlation
 from ..measurements.base import known_conditions
 from ..robot.error_families import FAMILIES, HARMONICS
 from .partition import (
@@ -710,7 +710,9 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     if noise < MIN_CORRELATED_NOISE:
         return False
     system = fit.solution.system.scaled(1 / noise)
-    return find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights).is_significant
+    return (
+        abs(find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights)) > MAX_WHITE_Z
+    )
 
 
 def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:
