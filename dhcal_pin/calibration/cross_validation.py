@@ -95,7 +95,7 @@ def cross_validate_folds(
             if is_unobserved
         }
         known = {name: v for name, v in problem.instruments(solution).items() if name not in unobserved}
-        held_out = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
+        held_out = take_samples(data, fold)
         chain = problem.errors.at(solution[:robot])
         alone = bare.refitted(chain) if bare else None
         yield FoldErrors(
@@ -203,36 +203,30 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
         fitted, held_out = (take_samples(data, masks) for masks in ([~mask for mask in fold], fold))
         chain, instruments = fit_nominal(nominal, fitted, fit.problem.known, fit.nominal_instruments)
         before += compute_errors(chain, held_out, instruments)
-    after: list[dict[str, Array]] = []
-    alone: list[dict[str, Array]] = []
-    largest_std = 0.0
     # The fits of the folds contain the outliers that the calibration contains, but no figure does.
-    is_counted = [
-        counted[is_fitted]
-        for counted, is_fitted in (
-            (c, w > robust.ZERO_WEIGHT) for c, w in zip(fit.is_counted, fit.weights, strict=True)
-        )
-        if is_fitted.any()
-    ]
+    is_counted = _counted_in(tuple(w > robust.ZERO_WEIGHT for w in fit.weights), fit.is_counted)
     is_judged = [judged for fold in folds for judged in _counted_in(fold, is_counted)]
-    for fold_after in cross_validate_folds(
-        fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor, fit.bare
-    ):
-        after += fold_after.errors
-        alone += fold_after.errors_alone
-        largest_std = max(largest_std, fold_after.prediction_std)
-    if not fit.shrinkage_factor:
-        # Without a correction the calibrated robot is the nominal one.
-        after = before
+    found = list(
+        cross_validate_folds(
+            fit.inlier_problem,
+            fit.solution.x,
+            data,
+            folds,
+            partial(refit, fit),
+            fit.shrinkage_factor,
+            fit.bare,
+        )
+    )
+    # Without a correction the calibrated robot is the nominal one.
+    after = [item for fold in found for item in fold.errors] if fit.shrinkage_factor else before
+    alone = [item for fold in found for item in fold.errors_alone]
     labels = configuration_groups(data)
     held_out_labels = np.concatenate([labels[np.concatenate(fold)] for fold in folds])
     before, after = (take_errors(errors, is_judged) for errors in (before, after))
-    alone = take_errors(alone, is_judged) if alone else []
-    held_out_labels = held_out_labels[np.concatenate(is_judged)]
     return FoldComparison(
-        _comparison(fit, title, before, after, alone),
-        largest_std,
-        PairedErrors.from_errors(before, after, held_out_labels),
+        _comparison(fit, title, before, after, take_errors(alone, is_judged) if alone else []),
+        max(fold.prediction_std for fold in found),
+        PairedErrors.from_errors(before, after, held_out_labels[np.concatenate(is_judged)]),
     )
 
 
