@@ -65,41 +65,29 @@ MAX_TESTED = 200
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FittedModel:
-    """Model that was fitted to measurements, with the uncertainty of its parameters.
+    """Model that was fitted to measurements, with the uncertainty of its parameters."""
 
-    Attributes:
-        errors: Nominal chain and its p_robot unknown error parameters; unknown base and tool frames are
-            initialized from the data.
-        x: Identified errors of the robot, then of the instruments relative to their initial values, shape
-            (p,) [m or rad, or the unit of the parameter].
-        chain: Calibrated chain.
-        data: Fitted measurements.
-        holdout: Measurements that were held out.
-        problem: Least-squares problem with the final standard deviations, sample weights and priors.
-        solution: Solution of `problem`.
-        method: "lm" or "gn".
-        weights: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
-        shrinkage_factor: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see
-            `shrinkage`.
-        extension: Families of joint errors that were added, and how much the samples count; None if nothing
-            was tried.
-        bare: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
-        stage: Robust stage that the weights are from, see `robust.WEIGHT_FUNCTIONS`.
-    """
-
+    #: Nominal chain and its p_robot unknown error parameters; unknown base and tool frames are initialized
+    #: from the data.
     errors: ErrorModel
+    #: Identified errors of the robot, then of the instruments relative to their initial values, shape (p,) [m
+    #: or rad, or the unit of the parameter].
     x: Array
-    chain: Chain
-    data: tuple[Measurement, ...]
-    holdout: tuple[Measurement, ...]
-    problem: Problem
-    solution: SolverResult
-    method: str
+    chain: Chain  #: Calibrated chain
+    data: tuple[Measurement, ...]  #: Fitted measurements
+    holdout: tuple[Measurement, ...]  #: Measurements that were held out
+    problem: Problem  #: Least-squares problem with the final standard deviations, sample weights and priors
+    solution: SolverResult  #: Solution of `problem`
+    method: str  #: "lm" or "gn"
+    #: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
     weights: tuple[Array, ...]
+    #: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see `shrinkage`.
     shrinkage_factor: float = 1.0
+    #: Families of joint errors that were added, and how much the samples count; None if nothing was tried.
     extension: Extension | None = None
+    #: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
     bare: BareGeometry | None = None
-    stage: str = robust.KEPT
+    stage: str = robust.KEPT  #: Robust stage that the weights are from, see `robust.WEIGHT_FUNCTIONS`
 
     @property
     def urdf_alone(self) -> Chain:

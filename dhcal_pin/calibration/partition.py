@@ -105,12 +105,10 @@ def _merge_groups(labels: Array, others: Array) -> Array:
 
 
 def configuration_groups(data: Sequence[Measurement]) -> Array:
-    """Label the samples of measurements, those of the same configuration by the same label.
-
-    Labels are numbered in the order of the joint values. A sample with several configurations, such as a
-    relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
-    distance between points, has a label of its own; these are the last, in the order of their names.
-    """
+    """Label the samples of measurements, those of the same configuration by the same label."""
+    # Labels are numbered in the order of the joint values. A sample with several configurations, such as a
+    # relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
+    # distance between points, has a label of its own; these are the last, in the order of their names.
     counts = [len(item.rows) for item in data]
     starts = np.cumsum([0, *counts])
     labels = np.arange(starts[-1])

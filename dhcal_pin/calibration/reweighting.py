@@ -223,13 +223,10 @@ def estimate_variance_components(
     weights: Sequence[Array],
     lost_freedom: LostFreedom,
 ) -> Array:
-    """Estimate one noise scale per residual group from the residuals of a fit.
-
-    Groups with stated standard deviations keep scale 1, and so do all groups if there are not more rows than
-    determined parameters. A group with no more rows than that could be fitted exactly, so its residuals
-    do not show its noise. It takes the pooled scale of all groups of its unit that do not state their
-    standard deviations, or 1 if it is the only one.
-    """
+    """Estimate one noise scale per residual group from the residuals of a fit; 1 for stated groups."""
+    # A group with no more rows than determined parameters could be fitted exactly, so its residuals do not
+    # show its noise. It takes the pooled scale of all groups of its unit that do not state their standard
+    # deviations, or 1 if it is the only one. All scales are 1 if there are not more rows in all.
     if all(item.has_stated_sigma for item in data):
         return np.ones(sum(len(item.residual_groups) for item in data))
     problem, solution = solved.problem, solved.solution

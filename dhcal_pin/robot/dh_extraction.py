@@ -184,13 +184,11 @@ def extract_dh(
 
 
 def normalize_offsets(table: DHTable) -> DHTable:
-    """Remove large offsets that only cancel each other; most tables are returned unchanged.
-
-    Plain rows of axes that are parallel up to a milliradian have their common normals far outside the robot.
-    Each joint frame is moved along its own axis, back to where the axis passes the frame before; this changes
-    no pose. The result is used if it shortens the whole chain by a third or more; its rows then have β.
-    Exactly parallel axes stay as they are.
-    """
+    """Remove large offsets that only cancel each other; most tables are returned unchanged."""
+    # Plain rows of axes that are parallel up to a milliradian have their common normals far outside the
+    # robot. Each joint frame is moved along its own axis, back to where the axis passes the frame before;
+    # this changes no pose. The result is used if it shortens the whole chain by a third or more; its rows
+    # then have β.
     origins = table.origins()
     moved = origins.copy()
     shift = 0.0

@@ -91,12 +91,9 @@ def solve_ik(
     samples: Array | None = None,
     min_damping: float = _MIN_DAMPING,
 ) -> tuple[Array, Array]:
-    """Minimize task errors within the joint limits, starting from joint positions (m, n).
-
-    `samples` are the numbers by which `task_error` identifies the rows of `start`, by default 0 to m-1.
-    `min_damping` is the damping λ_min near singularities [m²]. Norms of the task errors [m] are returned,
-    too.
-    """
+    """Minimize task errors within the joint limits from joint positions (m, n); return norms [m], too."""
+    # `samples` are the numbers by which `task_error` identifies the rows of `start`, by default 0 to m-1.
+    # `min_damping` is the damping λ_min near singularities [m²].
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.validated_q(start), chain.lower, chain.upper)
     errors, jacobians = _errors_and_jacobians(chain, task_error, q, samples)

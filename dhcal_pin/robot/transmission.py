@@ -58,29 +58,19 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class GravityLoads:
-    """What joint errors need of a chain: gravity torques on its joints, and its link vectors.
+    """What joint errors need of a chain: gravity torques on its joints, and its link vectors."""
 
-    Attributes:
-        model: Pinocchio model of the whole robot.
-        moving_joints: Names of the k moving joints of the chain.
-        mimic_matrix: Matrix (k, n) from independent to moving joint positions.
-        mimic_offset: Constant part of the moving joint positions, shape (k,) [rad or m].
-        link_vectors: Vector from each joint to the next one, in the axes of the next one before its motion,
-            shape (k+1, 3) [m]. The first one begins at the base link. The last one ends at the tip and is in
-            the axes of the last joint.
-        reference_temperature: Temperature at which the links have the lengths of the model [°C].
-        tip: Name of the link that carries the payload.
-        payload: Payload that the model contains; None without.
-    """
-
-    model: pin.Model
-    moving_joints: tuple[str, ...]
-    mimic_matrix: Array
-    mimic_offset: Array
+    model: pin.Model  #: Pinocchio model of the whole robot
+    moving_joints: tuple[str, ...]  #: Names of the k moving joints of the chain
+    mimic_matrix: Array  #: Matrix (k, n) from independent to moving joint positions
+    mimic_offset: Array  #: Constant part of the moving joint positions, shape (k,) [rad or m]
+    #: Vector from each joint to the next one, in the axes of the next one before its motion, shape (k+1, 3)
+    #: [m]. The first one begins at the base link. The last one ends at the tip and is in the axes of the last
+    #: joint.
     link_vectors: Array
-    reference_temperature: float
-    tip: str
-    payload: Payload | None
+    reference_temperature: float  #: Temperature at which the links have the lengths of the model [°C]
+    tip: str  #: Name of the link that carries the payload
+    payload: Payload | None  #: Payload that the model contains; None without
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @property

@@ -239,10 +239,7 @@ class BatchResult:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariances of x by the stated standard deviations of the data, shape (b, p, p).
-
-        The diagonal is infinite where neither data nor priors determine a parameter.
-        """
+        """Covariances of x by the stated standard deviations, (b, p, p); infinite if not determined."""
         b, p = self.x.shape
         priors = np.tile(np.diag(self.batch.weights), (b, 1, 1))
         _, s, vt = np.linalg.svd(np.linalg.qr(np.concatenate([self.systems.r, priors], 1), mode="r"))
