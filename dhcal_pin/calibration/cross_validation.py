@@ -95,7 +95,7 @@ def cross_validate_folds(
             if is_unobserved
         }
         known = {name: v for name, v in problem.instruments(solution).items() if name not in unobserved}
-        held_out = [item.take(mask) for item, mask in zip(data, fold, strict=True) if mask.any()]
+        held_out = take_samples(data, fold)
         chain = problem.errors.at(solution[:robot])
         alone = bare.refitted(chain) if bare else None
         yield FoldErrors(
@@ -108,26 +108,19 @@ def cross_validate_folds(
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors of held-out samples.
+    """Errors of held-out samples."""
 
-    Attributes:
-        folds: Accuracy of the held-out samples of each fold, without outliers of the calibration.
-        errors: RMS of the held-out rows of each fold in standard deviations, (k,).
-        accuracy: The same of all folds together. A sample counts once for each fold that holds it out.
-    """
-
+    #: Accuracy of the held-out samples of each fold, without outliers of the calibration.
     folds: tuple[Accuracy, ...]
-    errors: Array
+    errors: Array  #: RMS of the held-out rows of each fold in standard deviations, (k,)
+    #: The same of all folds together. A sample counts once for each fold that holds it out.
     accuracy: Accuracy
 
 
 def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
-    """Fit a part of the samples of `fit.problem` by the same method, from an approximate solution (p,).
-
-    If there are parameters without a prior, the fit starts from the nominal robot, as the values of
-    undetermined parameters in x contain information of all samples. If the calibration did not converge, the
-    fit stops after as many iterations, at most `MAX_REFIT_ITERATIONS`.
-    """
+    """Fit some of the samples by the method of a calibration, from an approximate solution (p,)."""
+    # The values of undetermined parameters in x contain information of all samples: without priors, the fit
+    # starts from the nominal robot. If the calibration did not converge, it stops after as many iterations.
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
         loose = minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True)
@@ -201,11 +194,8 @@ class FoldComparison:
 
 
 def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> FoldComparison:
-    """Compare the accuracy of held-out samples before and after a calibration.
-
-    The nominal robot is judged in the same way: base, tool and instrument parameters are fitted to the other
-    samples of each fold.
-    """
+    """Compare the accuracy of held-out samples before and after a calibration."""
+    # The nominal robot is judged in the same way: its frames are fitted to the other samples of each fold.
     data = fit.inliers
     nominal = replace(fit.errors, chain=fit.nominal_refitted)
     before: list[dict[str, Array]] = []
@@ -213,36 +203,30 @@ def compare_folds(fit: FittedModel, folds: Sequence[Fold], title: Title) -> Fold
         fitted, held_out = (take_samples(data, masks) for masks in ([~mask for mask in fold], fold))
         chain, instruments = fit_nominal(nominal, fitted, fit.problem.known, fit.nominal_instruments)
         before += compute_errors(chain, held_out, instruments)
-    after: list[dict[str, Array]] = []
-    alone: list[dict[str, Array]] = []
-    largest_std = 0.0
     # The fits of the folds contain the outliers that the calibration contains, but no figure does.
-    is_counted = [
-        counted[is_fitted]
-        for counted, is_fitted in (
-            (c, w > robust.ZERO_WEIGHT) for c, w in zip(fit.is_counted, fit.weights, strict=True)
-        )
-        if is_fitted.any()
-    ]
+    is_counted = _counted_in(tuple(w > robust.ZERO_WEIGHT for w in fit.weights), fit.is_counted)
     is_judged = [judged for fold in folds for judged in _counted_in(fold, is_counted)]
-    for fold_after in cross_validate_folds(
-        fit.inlier_problem, fit.solution.x, data, folds, partial(refit, fit), fit.shrinkage_factor, fit.bare
-    ):
-        after += fold_after.errors
-        alone += fold_after.errors_alone
-        largest_std = max(largest_std, fold_after.prediction_std)
-    if not fit.shrinkage_factor:
-        # Without a correction the calibrated robot is the nominal one.
-        after = before
+    found = list(
+        cross_validate_folds(
+            fit.inlier_problem,
+            fit.solution.x,
+            data,
+            folds,
+            partial(refit, fit),
+            fit.shrinkage_factor,
+            fit.bare,
+        )
+    )
+    # Without a correction the calibrated robot is the nominal one.
+    after = [item for fold in found for item in fold.errors] if fit.shrinkage_factor else before
+    alone = [item for fold in found for item in fold.errors_alone]
     labels = configuration_groups(data)
     held_out_labels = np.concatenate([labels[np.concatenate(fold)] for fold in folds])
     before, after = (take_errors(errors, is_judged) for errors in (before, after))
-    alone = take_errors(alone, is_judged) if alone else []
-    held_out_labels = held_out_labels[np.concatenate(is_judged)]
     return FoldComparison(
-        _comparison(fit, title, before, after, alone),
-        largest_std,
-        PairedErrors.from_errors(before, after, held_out_labels),
+        _comparison(fit, title, before, after, take_errors(alone, is_judged) if alone else []),
+        max(fold.prediction_std for fold in found),
+        PairedErrors.from_errors(before, after, held_out_labels[np.concatenate(is_judged)]),
     )
 
 
@@ -251,11 +235,7 @@ def leave_regions_out(
     recalibrate: Callable[[list[Measurement]], FittedModel],
     progress: Progress | None,
 ) -> Comparison | None:
-    """Judge a calibration by further ones, each without the samples of a region of joint space.
-
-    Unlike in `compare_folds`, everything is estimated again without the region: noise, prior widths, outliers
-    and additional parameters. None if no region can be left out.
-    """
+    """Judge a calibration by further complete ones, each without a region; None without regions."""
     try:
         folds = blocked_folds(fit.data, groups=contact_groups(fit.problem, fit.x))
     except NotObservableError:
@@ -300,26 +280,21 @@ class Generalization:
     """Accuracy on configurations that are not fitted: within the measured region and beyond it.
 
     The shares are those of random configurations within the joint limits, see `measurements.measured_region`.
-
-    Attributes:
-        cross_validated: Accuracy within the measured region, from random folds of whole configurations; None
-            if it cannot be stated.
-        cross_validated_reason: Why it cannot be stated; empty if it can.
-        region_holdout: Accuracy beyond the measured region, from folds that leave out regions of joint space,
-            or from `leave_regions_out` if it was called; None if it cannot be stated.
-        region_holdout_reason: Why it cannot be stated; empty if it can.
-        covered_share: Share of the joint space in the measured region, 0 to 1.
-        reached_share: Share of the joint space that is no farther from the measured configurations than the
-            left-out regions are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share`
-            if that cannot be stated. Nothing is known about the rest. Both shares are None where joint values
-            have no meaning, as the poses of the tip were measured in their place.
     """
 
+    #: Accuracy within the measured region, from random folds of whole configurations; None if it cannot be
+    #: stated.
     cross_validated: Comparison | None
-    cross_validated_reason: str
+    cross_validated_reason: str  #: Why it cannot be stated; empty if it can
+    #: Accuracy beyond the measured region, from folds that leave out regions of joint space, or from
+    #: `leave_regions_out` if it was called; None if it cannot be stated.
     region_holdout: Comparison | None
-    region_holdout_reason: str
-    covered_share: float | None
+    region_holdout_reason: str  #: Why it cannot be stated; empty if it can
+    covered_share: float | None  #: Share of the joint space in the measured region, 0 to 1
+    #: Share of the joint space that is no farther from the measured configurations than the left-out regions
+    #: are from the others, 0 to 1: there `region_holdout` holds. It is `covered_share` if that cannot be
+    #: stated. Nothing is known about the rest. Both shares are None where joint values have no meaning, as
+    #: the poses of the tip were measured in their place.
     reached_share: float | None
 
 

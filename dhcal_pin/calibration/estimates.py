@@ -23,36 +23,22 @@ from ..robot.chain import BASE_FRAME, Chain
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of one parameter, in its unit (m, rad, or a rate).
+    """Estimate of one parameter, in its unit (m, rad, or a rate)."""
 
-    Attributes:
-        name: Name of the parameter.
-        unit: Unit of the parameter.
-        nominal: Value before the calibration.
-        value: Value after the calibration.
-        std: Standard deviation of the value; infinite if neither measurements nor a prior determine it.
-        prior: Standard deviation of its prior; infinite without a prior.
-        observability: Fraction of the parameter that the measurements determine, 0 to 1.
-        posterior_to_prior_std: Ratio of `std` to the standard deviation expected before the measurement.
-        fixed: Whether the parameter was held at its nominal value.
-        category: "robot", "frame" (base and tool) or "instrument".
-        frame: Frame in whose axes the parameter is defined, see `error_model.frame_name`; the measuring frame
-            for the base, the tip link for the tool, and empty for an instrument.
-        direction: Direction in this frame, such as "along x" or "about z".
-    """
-
-    name: str
-    unit: str
-    nominal: float
-    value: float
-    std: float
-    prior: float
-    observability: float
-    posterior_to_prior_std: float
-    fixed: bool
-    category: str
+    name: str  # Name of the parameter
+    unit: str  # Unit of the parameter
+    nominal: float  # Value before the calibration
+    value: float  # Value after the calibration
+    std: float  # Standard deviation of the value; infinite if neither measurements nor a prior determine it
+    prior: float  # Standard deviation of its prior; infinite without a prior
+    observability: float  # Fraction of the parameter that the measurements determine, 0 to 1
+    posterior_to_prior_std: float  # Ratio of `std` to the standard deviation expected before the measurement
+    fixed: bool  # Whether the parameter was held at its nominal value
+    category: str  # "robot", "frame" (base and tool) or "instrument"
+    # Frame in whose axes the parameter is defined, see `error_model.frame_name`; the measuring frame for the
+    # base, the tip link for the tool, and empty for an instrument.
     frame: str = ""
-    direction: str = ""
+    direction: str = ""  # Direction in this frame, such as "along x" or "about z"
 
     @property
     def change(self) -> float:

@@ -42,27 +42,17 @@ Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of the error norms of one group.
+    """Statistics of the error norms of one group."""
 
-    Attributes:
-        samples: Number of samples m.
-        rms: Root mean square.
-        rms_std: Standard error of `rms`.
-        mean: Mean.
-        p95: 95th percentile.
-        max: Largest.
-        axes_rms: RMS along each axis; None if the errors are not components along axes.
-        unit: Unit of all of these: "m", "rad" or "px".
-    """
-
-    samples: int
-    rms: float
-    rms_std: float
-    mean: float
-    p95: float
-    max: float
+    samples: int  #: Number of samples m
+    rms: float  #: Root mean square
+    rms_std: float  #: Standard error of `rms`
+    mean: float  #: Mean
+    p95: float  #: 95th percentile
+    max: float  #: Largest
+    #: RMS along each axis; None if the errors are not components along axes.
     axes_rms: tuple[float, ...] | None
-    unit: str
+    unit: str  #: Unit of all of these: "m", "rad" or "px"
 
     @classmethod
     def from_norms(cls, norms: Array, unit: str, axes: Sequence[Array]) -> ErrorStatistics:
@@ -86,11 +76,9 @@ class Accuracy(Mapping[str, Any]):
     """Error statistics of each group of errors that was measured.
 
     It is also a read-only mapping of the flat keys of the JSON document: `accuracy["position_rms_m"]`.
-
-    Attributes:
-        groups: Statistics by name of the error group, the most important group first.
     """
 
+    #: Statistics by name of the error group, the most important group first.
     groups: Mapping[str, ErrorStatistics] = field(default_factory=dict)
 
     @classmethod
@@ -236,10 +224,8 @@ def accuracy(
 
 
 def find_inliers(errors: Sequence[Mapping[str, Array]]) -> tuple[Array, ...]:
-    """Find the samples whose errors are no outliers among those of their measurement, (m,) each.
-
-    Only the first group of errors of a measurement is tested: of a pose, the position.
-    """
+    """Find the samples whose errors are no outliers among those of their measurement, (m,) each."""
+    # Only the first group of errors of a measurement is tested: of a pose, the position.
     tested = [next(iter(item.values())) for item in errors]
     return tuple(
         robust.standardize_mean_squares(np.mean(each**2, 1), each.shape[1]) <= robust.OUTLIER_THRESHOLD
@@ -285,10 +271,7 @@ class PairedErrors:
         return cls(*mean_squares, n_components=n_components)
 
     def without_outliers(self) -> PairedErrors:
-        """Leave out wrong measurements: outliers after the calibration whose error was large before, too.
-
-        An error that the calibration causes is far smaller before it.
-        """
+        """Leave out outliers after the calibration whose error was large before, too: wrong measurements."""
         t = robust.standardize_mean_squares(self.after, self.n_components)
         is_outlier = (t > robust.OUTLIER_THRESHOLD) & (self.before > MIN_RATIO_BEFORE**2 * self.after)
         return replace(self, before=self.before[~is_outlier], after=self.after[~is_outlier])
@@ -300,10 +283,7 @@ class PairedErrors:
 
     @property
     def t(self) -> float:
-        """Mean change of the squared error in standard errors: negative if the error fell; NaN if unknown.
-
-        Student's t statistic of paired differences, with u - 1 degrees of freedom.
-        """
+        """Student's t of the paired change of the squared error: negative if it fell; NaN if unknown."""
         change = self.after - self.before
         if len(change) < 2:
             return np.nan
@@ -313,27 +293,21 @@ class PairedErrors:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Accuracy before and after a calibration on the same samples.
+    """Accuracy before and after a calibration on the same samples."""
 
-    Attributes:
-        title: "hold-out", "region hold-out" (regions of joint space are judged by a fit without them, and may
-            overlap), "cross-validated" (each sample is judged by a fit without it) or "fitted".
-        n_samples: Number of samples, without outliers.
-        before: Accuracy of the nominal robot. Its base, tool and instrument parameters are fitted to the same
-            samples as those of the calibrated robot.
-        after: Accuracy of the calibrated robot.
-        n_outliers: Number of outliers; they are not in the figures.
-        after_with_outliers: `after` of hold-out samples with outliers; empty if there are none.
-        after_alone: Accuracy of the calibrated URDF without its sidecar, with the base and the tool that fit
-            it best; None if the sidecar has no errors of the arm.
-    """
-
+    #: "hold-out", "region hold-out" (regions of joint space are judged by a fit without them, and may
+    #: overlap), "cross-validated" (each sample is judged by a fit without it) or "fitted".
     title: Title
-    n_samples: int
+    n_samples: int  #: Number of samples, without outliers
+    #: Accuracy of the nominal robot. Its base, tool and instrument parameters are fitted to the same samples
+    #: as those of the calibrated robot.
     before: Accuracy
-    after: Accuracy
-    n_outliers: int = 0
+    after: Accuracy  #: Accuracy of the calibrated robot
+    n_outliers: int = 0  #: Number of outliers; they are not in the figures
+    #: `after` of hold-out samples with outliers; empty if there are none.
     after_with_outliers: Accuracy = field(default_factory=Accuracy)
+    #: Accuracy of the calibrated URDF without its sidecar, with the base and the tool that fit it best; None
+    #: if the sidecar has no errors of the arm.
     after_alone: Accuracy | None = None
 
     def to_dict(self) -> dict[str, Any]:

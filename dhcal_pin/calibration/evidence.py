@@ -60,44 +60,34 @@ def count_geometric_directions(fit: FittedModel, r: Array) -> int:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evidence(FittedModel):
-    """Fitted model with what the measurements say of its accuracy.
+    """Fitted model with what the measurements say of its accuracy."""
 
-    Attributes:
-        region_comparison: Accuracy on regions of joint space that were left out of further calibrations; None
-            if there were none, see `leave_regions_out`.
-        input_warnings: Warnings about the files of the measurements.
-        camera_stages: Unknowns of a calibration from images that were freed in turn, and what each group of
-            them improved; empty without images.
-        hand_eye_fit: Fit of cameras and boards on the nominal arm; None if the calibrated arm fits the
-            images, and without images.
-        board_size: Other size of the boards that makes the correction of the arm far smaller, if any.
-        is_kept_nominal: Whether the correction was not applied because of the verdict.
-        earlier_diagnosis: Mistakes that were looked for in the same measurements with the same nominal robot,
-            if they were.
-        session: What happened during the measurement; None if this was not examined.
-        with_auto: Function that calibrates with the loss "auto", whose verdict counts, too; None if this
-            calibration did.
-        with_full_set: Function that calibrates with all parameters of the arm, base and tool; None if this
-            calibration did, or if a smaller choice was deliberate.
-        has_default_sets: Whether the parameter sets are the default ones of the robot.
-        signs: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are
-            those of the URDF.
-        arm_type: Limits by which images are judged.
-    """
-
+    #: Accuracy on regions of joint space that were left out of further calibrations; None if there were none,
+    #: see `leave_regions_out`.
     region_comparison: Comparison | None = None
-    input_warnings: tuple[str, ...] = ()
+    input_warnings: tuple[str, ...] = ()  #: Warnings about the files of the measurements
+    #: Unknowns of a calibration from images that were freed in turn, and what each group of them improved;
+    #: empty without images.
     camera_stages: tuple[cameras.Stage, ...] = ()
+    #: Fit of cameras and boards on the nominal arm; None if the calibrated arm fits the images, and without
+    #: images.
     hand_eye_fit: cameras.HandEyeFit | None = None
+    #: Other size of the boards that makes the correction of the arm far smaller, if any.
     board_size: cameras.BoardSize | None = None
-    is_kept_nominal: bool = False
+    is_kept_nominal: bool = False  #: Whether the correction was not applied because of the verdict
+    #: Mistakes that were looked for in the same measurements with the same nominal robot, if they were.
     earlier_diagnosis: Diagnosis | None = None
-    session: Session | None = None
+    session: Session | None = None  #: What happened during the measurement; None if this was not examined
+    #: Function that calibrates with the loss "auto", whose verdict counts, too; None if this calibration did.
     with_auto: Callable[[], Evidence] | None = None
+    #: Function that calibrates with all parameters of the arm, base and tool; None if this calibration did,
+    #: or if a smaller choice was deliberate.
     with_full_set: Callable[[], Evidence] | None = None
-    has_default_sets: bool = False
+    has_default_sets: bool = False  #: Whether the parameter sets are the default ones of the robot
+    #: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are those
+    #: of the URDF.
     signs: plausibility.SignDecision | None = None
-    arm_type: ArmType = INDUSTRIAL
+    arm_type: ArmType = INDUSTRIAL  #: Limits by which images are judged
 
     @cached_property
     def rows_per_direction(self) -> float:
@@ -269,7 +259,7 @@ class Evidence(FittedModel):
     @cached_property
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
-        return estimate_generalization(self, self.random_folds, self._measured_region, self.region_comparison)
+        return estimate_generalization(self, self.random_folds, self.measured_region, self.region_comparison)
 
     @cached_property
     def position_std(self) -> float:
@@ -280,13 +270,9 @@ class Evidence(FittedModel):
             q = np.clip(drawn, self.chain.lower, self.chain.upper)
         return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
 
-    @property
+    @cached_property
     def measured_region(self) -> MeasuredRegion | None:
         """Region of joint space around the fitted configurations; None without joint values."""
-        return self._measured_region
-
-    @cached_property
-    def _measured_region(self) -> MeasuredRegion | None:
         return measured_region(self)
 
     def _compare_holdout(self) -> Comparison:

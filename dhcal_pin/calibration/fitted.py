@@ -65,41 +65,29 @@ MAX_TESTED = 200
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FittedModel:
-    """Model that was fitted to measurements, with the uncertainty of its parameters.
+    """Model that was fitted to measurements, with the uncertainty of its parameters."""
 
-    Attributes:
-        errors: Nominal chain and its p_robot unknown error parameters; unknown base and tool frames are
-            initialized from the data.
-        x: Identified errors of the robot, then of the instruments relative to their initial values, shape
-            (p,) [m or rad, or the unit of the parameter].
-        chain: Calibrated chain.
-        data: Fitted measurements.
-        holdout: Measurements that were held out.
-        problem: Least-squares problem with the final standard deviations, sample weights and priors.
-        solution: Solution of `problem`.
-        method: "lm" or "gn".
-        weights: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
-        shrinkage_factor: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see
-            `shrinkage`.
-        extension: Families of joint errors that were added, and how much the samples count; None if nothing
-            was tried.
-        bare: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
-        stage: Robust stage that the weights are from, see `robust.WEIGHT_FUNCTIONS`.
-    """
-
+    #: Nominal chain and its p_robot unknown error parameters; unknown base and tool frames are initialized
+    #: from the data.
     errors: ErrorModel
+    #: Identified errors of the robot, then of the instruments relative to their initial values, shape (p,) [m
+    #: or rad, or the unit of the parameter].
     x: Array
-    chain: Chain
-    data: tuple[Measurement, ...]
-    holdout: tuple[Measurement, ...]
-    problem: Problem
-    solution: SolverResult
-    method: str
+    chain: Chain  #: Calibrated chain
+    data: tuple[Measurement, ...]  #: Fitted measurements
+    holdout: tuple[Measurement, ...]  #: Measurements that were held out
+    problem: Problem  #: Least-squares problem with the final standard deviations, sample weights and priors
+    solution: SolverResult  #: Solution of `problem`
+    method: str  #: "lm" or "gn"
+    #: Robust weight of each fitted sample, one array of shape (m,) per measurement; 0 if rejected.
     weights: tuple[Array, ...]
+    #: Factor c in `x = c · solution.x`; below 1 if there are too few measurements, see `shrinkage`.
     shrinkage_factor: float = 1.0
+    #: Families of joint errors that were added, and how much the samples count; None if nothing was tried.
     extension: Extension | None = None
+    #: Geometry that fits best without joint errors, which the URDF has; None without joint errors.
     bare: BareGeometry | None = None
-    stage: str = robust.KEPT
+    stage: str = robust.KEPT  #: Robust stage that the weights are from, see `robust.WEIGHT_FUNCTIONS`
 
     @property
     def urdf_alone(self) -> Chain:
@@ -317,11 +305,9 @@ class FittedModel:
 
     @cached_property
     def _sigma_scale(self) -> float:
-        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined.
-
-        A noise scale that is estimated from few rows is uncertain itself, and the errors then have Student's
-        t distribution. The factor widens the standard deviations so that ±1.96 of them contain 95 % of it.
-        """
+        """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined."""
+        # A noise scale from few rows is uncertain itself: ±1.96 of the standard deviations contain 95 % of a
+        # t distribution.
         if all(item.has_stated_sigma for item in self.data):
             if not self.contradicts_sigma:
                 return 1.0
@@ -367,13 +353,9 @@ class FittedModel:
         out[unknown, unknown] = np.inf
         return out
 
-    @property
+    @cached_property
     def uncertainty(self) -> Uncertainty:
         """Uncertainty of the robot without that of the instruments, for predictions and for the sidecar."""
-        return self._uncertainty
-
-    @cached_property
-    def _uncertainty(self) -> Uncertainty:
         root, unbounded = self._scaled_sqrt_covariance
         robot = len(self.errors.parameters)
         # Predictions agree with the errors of left-out regions, see `model_selection`.
@@ -411,10 +393,7 @@ class FittedModel:
 
     @property
     def _complete_uncertainty(self) -> Uncertainty:
-        """Uncertainty with the errors, too, that the minimal set leaves out because others imitate them.
-
-        Where nothing is measured, their variances add to those of the others.
-        """
+        """Uncertainty with the errors, too, that the minimal set leaves out as others imitate them."""
         errors = replace(self.errors, chain=self.chain)
         left_out = redundant(errors)
         if not left_out or len(self.x) > MAX_COLUMNS or errors.undetermined:
@@ -454,10 +433,8 @@ class FittedModel:
 
     @property
     def _model_fit(self) -> ModelFit:
-        """How well the model explains the measurements.
-
-        Correlated residuals are errors of the model, which the uncertainty contains.
-        """
+        """How well the model explains the measurements."""
+        # Correlated residuals are errors of the model, which the uncertainty contains.
         is_stated = self.problem.temperature == 1 and all(item.has_stated_sigma for item in self.data)
         chi_square = self.unit_weight_std**2 * self.degrees_of_freedom
         has_chi_square = is_stated and np.isfinite(chi_square)
@@ -500,10 +477,8 @@ class FittedModel:
 
     @property
     def _model_std(self) -> tuple[float, float]:
-        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad].
-
-        It is that of the residuals of the inliers, without the noise of the instrument where it is stated.
-        """
+        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad]."""
+        # It is that of the residuals of the inliers, without the stated noise of the instrument.
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
         n_rows = sum(count for _, _, count in self._row_counts)
         per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0

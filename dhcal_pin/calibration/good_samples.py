@@ -77,31 +77,19 @@ MAX_EXTENSIONS = 20
 N_PERMUTATIONS = 1000
 
 
-@dataclass(frozen=True, eq=False)
-class GoodSamples:
-    """Result of the search for good samples."""
-
-    # Weights of each measurement's samples, shape (m,) each: 1 for good samples, ZERO_WEIGHT for others.
-    weights: list[Array]
-    # Robust stage that judges the samples with the nonlinear model: "reject" if outliers were found that are
-    # set apart from the other samples, "reject_regional" if these lie together in joint space, otherwise
-    # "reject_far".
-    stage: str
-
-
 def find_good_samples(
     problem: Problem,
     solution: SolverResult,
     data: Sequence[Measurement],
     groups: Array,
     previous: Sequence[Array],
-) -> GoodSamples:
-    """Find the samples that agree with the fit of a majority of the samples.
-
-    Samples that an earlier search found, by their weights, stay the good ones if they are far more likely.
-    """
+) -> tuple[list[Array], str]:
+    """Find the samples that agree with a majority; those of an earlier search may stay."""
+    # Weights (m,) of each measurement are 1 for good samples and ZERO_WEIGHT for others. The robust stage
+    # judges the samples with the nonlinear model: it is "reject" if outliers were found that are set apart
+    # from the other samples, "reject_regional" if these lie together in joint space, else "reject_far".
     counts = [len(item.rows) for item in data]
-    all_good = GoodSamples([np.ones(count) for count in counts], robust.FAR_REJECTED)
+    all_good = [np.ones(count) for count in counts], robust.FAR_REJECTED
     if _looks_like_noise(problem.with_data(data), solution.x, groups):
         return all_good
     drawn = _draw_samples(sum(counts))
@@ -129,20 +117,17 @@ def find_good_samples(
     threshold = robust.WEIGHT_FUNCTIONS[stage][1]
     if len(drawn) < len(groups):
         x = solution.x + root @ core.y
-        return GoodSamples(_judge(problem.with_data(data), x, rows, core.scales, threshold), stage)
+        return _judge(problem.with_data(data), x, rows, core.scales, threshold), stage
     weights = np.where(core.t > threshold, robust.ZERO_WEIGHT, 1.0)
-    return GoodSamples([weights[a:b] for a, b in pairwise(starts)], stage)
+    return [weights[a:b] for a, b in pairwise(starts)], stage
 
 
 def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int, float] | None:
-    """Find a majority that agrees better than samples of one normal distribution do; None without one.
-
-    With few samples, a fit adapts to many outliers so far that the likelihood does not prefer the good
-    samples. If all m samples had the variance s₀² of a fit to all, the mean square s_g² of n_g chosen ones
-    would be as small with a probability of at most C(m, n_g)·P(χ²_ν ≤ ν·s_g²/s₀²), with ν degrees of freedom.
-
-    Returns the number of other samples, and s₀/s_g.
-    """
+    """Find a hidden majority; return the number of other samples, and how much better it agrees."""
+    # With few samples, a fit adapts to many outliers so far that the likelihood does not prefer the good
+    # samples. If all m samples had the variance s₀² of a fit to all, the mean square s_g² of n_g chosen ones
+    # would be as small with a probability of at most C(m, n_g)·P(χ²_ν ≤ ν·s_g²/s₀²), with ν degrees of
+    # freedom.
     if len(groups) > MAX_FEW:
         return None
     from scipy.special import gammainc  # lazy import: slow
@@ -208,12 +193,9 @@ def _judge(problem: Problem, x: Array, rows: LinearizedRows, scales: Array, thre
 
 
 def _are_regional(data: Sequence[Measurement], groups: Array, is_outlier: Array) -> bool:
-    """Return whether outliers (m,) are in other places of joint space than the other samples.
-
-    Their places are compared by the energy test of two samples (Szekely & Rizzo 2013): 2·E‖a - b‖ - E‖a - a'‖
-    - E‖b - b'‖ is zero for configurations a and b of one distribution. A configuration is an outlier if half
-    of its samples are. Configurations of different measurements are not compared.
-    """
+    """Return whether outliers (m,) are in other places of joint space than the other samples."""
+    # Energy test of two samples (Szekely & Rizzo 2013): 2·E‖a - b‖ - E‖a - a'‖ - E‖b - b'‖ is zero for
+    # configurations a and b of one distribution. A configuration is an outlier if half of its samples are.
     rng, first = np.random.default_rng(0), 0
     energies = np.zeros(N_PERMUTATIONS + 1)
     for item in data:
@@ -286,11 +268,8 @@ def _best_core(
 
 
 def _extend(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: float) -> _Core:
-    """Extend the samples of a fit by all with small residuals, until they do not change.
-
-    The threshold is strict: a small outlier that is included too early would pull the fit towards itself and
-    stay.
-    """
+    """Extend the samples of a fit by all with small residuals, until they do not change."""
+    # The threshold is strict: a small outlier that is included too early would pull the fit towards itself.
     y, t = np.zeros(0), np.zeros(0)
     for _ in range(MAX_EXTENSIONS):
         weights = is_good[None].astype(float)
@@ -322,10 +301,7 @@ def _log_likelihood(rows: LinearizedRows, is_good: Array, scales: Array, redunda
 
 
 def _log_choices(m: int, n_good: int) -> float:
-    """Return the logarithm of the number of ways to choose the good ones of m samples.
-
-    The best of many choices fits better than a single one by chance.
-    """
+    """Return the logarithm of the number of choices: the best of many fits better than one by chance."""
     return math.lgamma(m + 1) - math.lgamma(n_good + 1) - math.lgamma(m - n_good + 1)
 
 

@@ -79,13 +79,13 @@ from ..estimation.folds import (
     solve_columns,
 )
 from ..estimation.parameters import EXTENSIONS, LOW_COST, PARAMETER_SETS
-from ..estimation.priors import PriorGroups, effective_parameters
+from ..estimation.priors import effective_parameters
 from ..estimation.problem import Problem, linearize_and_factor
 from ..estimation.solver import minimize
 from ..estimation.uncertainty import FamilyGain
 from ..exceptions import UnknownNameError
 from ..formatting import Table, format_fixed
-from ..identifiability.residual_correlation import design_effect, find_residual_correlation
+from ..identifiability.residual_correlation import MAX_WHITE_Z, design_effect, find_residual_correlation
 from ..measurements.base import known_conditions
 from ..robot.error_families import FAMILIES, HARMONICS
 from .partition import (
@@ -142,23 +142,15 @@ FULL_SET = "minimal,base,tool"
 
 @dataclass(frozen=True)
 class FamilyTrial:
-    """Effect of a family on top of those selected before it.
+    """Effect of a family on top of those selected before it."""
 
-    Attributes:
-        family: Name of the family, one of `estimation.EXTENSIONS`.
-        cv_before: Error of random held-out folds without the family, in standard deviations.
-        cv_after: The same with it; as before if its evidence is too small to try.
-        log_bayes_factor: Rise of the log evidence by the family.
-        prior_width: Standard deviation of its priors of greatest evidence, as a fraction of the default one.
-        is_selected: Whether it was added.
-    """
-
-    family: str
-    cv_before: float
-    cv_after: float
-    log_bayes_factor: float
+    family: str  #: Name of the family, one of `estimation.EXTENSIONS`
+    cv_before: float  #: Error of random held-out folds without the family, in standard deviations
+    cv_after: float  #: The same with it; as before if its evidence is too small to try
+    log_bayes_factor: float  #: Rise of the log evidence by the family
+    #: Standard deviation of its priors of greatest evidence, as a fraction of the default one.
     prior_width: float
-    is_selected: bool = False
+    is_selected: bool = False  #: Whether it was added
 
     @property
     def improvement(self) -> float:
@@ -200,23 +192,17 @@ def trial_table(trials: Sequence[FamilyTrial]) -> Table:
 
 @dataclass(frozen=True)
 class Extension:
-    """What a calibration added to the geometry, and how much its samples count.
+    """What a calibration added to the geometry, and how much its samples count."""
 
-    Attributes:
-        trials: Trials of the selected families in the order of selection, then of the others.
-        temperature: Temperature T of the residuals.
-        n_configurations: Number N of different fitted configurations.
-        prediction_scale: Factor to predicted standard deviations of the tool.
-        random_ratio: Error of random left-out samples as a fraction of that of the geometry alone; NaN if no
-            family was added.
-        region_ratio: The same of left-out regions of joint space; NaN if none can be left out.
-    """
-
+    #: Trials of the selected families in the order of selection, then of the others.
     trials: tuple[FamilyTrial, ...] = ()
-    temperature: float = 1.0
-    n_configurations: int = 0
-    prediction_scale: float = 1.0
+    temperature: float = 1.0  #: Temperature T of the residuals
+    n_configurations: int = 0  #: Number N of different fitted configurations
+    prediction_scale: float = 1.0  #: Factor to predicted standard deviations of the tool
+    #: Error of random left-out samples as a fraction of that of the geometry alone; NaN if no family was
+    #: added.
     random_ratio: float = float("nan")
+    #: The same of left-out regions of joint space; NaN if none can be left out.
     region_ratio: float = float("nan")
 
     @property
@@ -244,7 +230,7 @@ class Extension:
             for name in self.families
         )
         changes = [
-            f"{kind} {_percent(ratio)}"
+            f"{kind} {100 * (ratio - 1):+.0f} %"
             for kind, ratio in (("at random", self.random_ratio), ("by region", self.region_ratio))
             if np.isfinite(ratio)
         ]
@@ -271,46 +257,28 @@ class Extension:
         }
 
 
-def _percent(ratio: float) -> str:
-    """Format a ratio as a change in percent."""
-    return f"{100 * (ratio - 1):+.0f} %"
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Selected families, with the hyperparameters of greatest evidence.
+    """Selected families, with the hyperparameters of greatest evidence."""
 
-    Attributes:
-        widths: Standard deviation of the priors of each family, as a fraction of the expected one.
-        noise: Standard deviation of the whitened residuals.
-        log_evidence: Log evidence, up to a constant.
-        values: Values of its parameters by name.
-    """
-
+    # Standard deviation of the priors of each family, as a fraction of the expected one.
     widths: Mapping[str, float]
-    noise: float
-    log_evidence: float
-    values: Mapping[str, float]
+    noise: float  # Standard deviation of the whitened residuals
+    log_evidence: float  # Log evidence, up to a constant
+    values: Mapping[str, float]  # Values of its parameters by name
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
-    """Linear model around a fit with the columns of further families.
+    """Linear model around a fit with the columns of further families."""
 
-    Attributes:
-        problem: Problem with the parameters and the expected priors of all families.
-        x: Point of the linearization, (p,).
-        family: Name of the family of each unknown, "" for the unknowns of the fit, (p,).
-        rows: Rows of all data.
-        folds: Rows of random folds of whole configurations; empty if nothing is selected.
-        cv_errors: Error of the random folds with the families of each model that was asked for.
-    """
-
-    problem: Problem
-    x: Array
-    family: Array
-    rows: NoisyRows
+    problem: Problem  # Problem with the parameters and the expected priors of all families
+    x: Array  # Point of the linearization, (p,)
+    family: Array  # Name of the family of each unknown, "" for the unknowns of the fit, (p,)
+    rows: NoisyRows  # Rows of all data
+    # Rows of random folds of whole configurations; empty if nothing is selected.
     folds: tuple[NoisyFold, ...] = ()
+    # Error of the random folds with the families of each model that was asked for.
     cv_errors: dict[Model, float] = field(default_factory=dict)
 
     @classmethod
@@ -411,10 +379,7 @@ def _best_width(x: Array, determined: Array, expected: Array, members: Array) ->
 
 
 def _missing_parameters(problem: Problem, families: Sequence[str]) -> dict[str, list[ErrorParameter]]:
-    """Return the parameters of each family that are neither estimated nor fixed, if there are any.
-
-    Families whose condition is not known of any sample have none.
-    """
+    """Return the parameters of each family of a known condition that are not in the model."""
     errors, conditions = problem.errors, known_conditions(problem.data)
     known = {p.name for p in (*errors.parameters, *errors.fixed)}
     by_family = {
@@ -464,10 +429,7 @@ def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tupl
 
 
 def _may_have_curves(problem: Problem, x: Array, curves: Sequence[ErrorParameter], orders: range) -> bool:
-    """Check whether curves stand out of white residuals; this costs far less than a trial of them.
-
-    The prior weights of the problem are those that x was fitted with.
-    """
+    """Check whether curves stand out of the residuals at x; this costs far less than a trial of them."""
     if any(item.configurations_per_row != 1 for item in problem.data):
         return True
     if count_rows(problem) < MANY_ROWS_PER_LINE * len(curves):
@@ -476,12 +438,10 @@ def _may_have_curves(problem: Problem, x: Array, curves: Sequence[ErrorParameter
 
 
 def _line_excess(problem: Problem, x: Array, curves: Sequence[ErrorParameter]) -> float:
-    """Compute by how many standard deviations residuals along the columns of curves exceed white ones.
-
-    With M = I - J·(Jᵀ·J + W²)⁻¹·Jᵀ, white noise ε of variance σ² leaves the residuals r = M·ε. Their
-    components along the unit columns A of the curves have the sum of squares ‖Aᵀ·r‖². For B = M·A, its mean
-    is σ²·‖B‖² and its variance 2·σ⁴·‖Bᵀ·B‖². The estimate of σ² is ‖r‖²/‖M‖².
-    """
+    """Compute by how many standard deviations residuals along the columns of curves exceed white ones."""
+    # With M = I - J·(Jᵀ·J + W²)⁻¹·Jᵀ, white noise ε of variance σ² leaves the residuals r = M·ε. Along the
+    # unit columns A of the curves, their sum of squares is ‖Aᵀ·r‖². For B = M·A, its mean is σ²·‖B‖² and its
+    # variance 2·σ⁴·‖Bᵀ·B‖². The estimate of σ² is ‖r‖²/‖M‖².
     extended, start, family = _with_families(problem, x, {HARMONICS: list(curves)})
     linearization = extended.linearize(start)
     rows = np.concatenate(
@@ -499,15 +459,9 @@ def _line_excess(problem: Problem, x: Array, curves: Sequence[ErrorParameter]) -
 
 
 def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
-    """Check whether lines stand out of the spectrum of the residuals over the joint values.
-
-    With the whitened column a of a joint, the residuals r with standard deviation 1, and white residuals, the
-    sums
-
-        z² = (Σ a·r·sin kq)² / Σ |a|²·sin² kq,    and the same with the cosine,
-
-    are distributed as χ²_1, or smaller where the fit has taken up a part.
-    """
+    """Check whether lines stand out of the spectrum of the residuals over the joint values."""
+    # With the whitened column a of a joint and white residuals r of variance 1, (Σ a·r·sin kq)² / Σ |a|²·sin²
+    # kq, and the same with the cosine, are distributed as χ²_1, or smaller where the fit has taken up a part.
     robot = len(problem.errors.parameters)
     chain = problem.errors.at(x[:robot])
     first = [p for p in PARAMETER_SETS[HARMONICS](chain) if p.name.endswith(("sin1", "cos1"))]
@@ -546,26 +500,16 @@ def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _RegionErrors:
-    """Errors of left-out regions of joint space, with their prediction.
+    """Errors of left-out regions of joint space, with their prediction."""
 
-    Attributes:
-        n_rows: Number of held-out rows of each region, (k,).
-        squares: Mean square of the held-out rows, in units of the residual variance, (k,).
-        variances: Mean variance of these rows by the uncertainty of the fit, in the same units, (k,).
-        noise: Standard deviation of the whitened residuals.
-    """
-
-    n_rows: Array
-    squares: Array
-    variances: Array
-    noise: float
+    n_rows: Array  # Number of held-out rows of each region, (k,)
+    squares: Array  # Mean square of the held-out rows, in units of the residual variance, (k,)
+    variances: Array  # Mean variance of these rows by the uncertainty of the fit, in the same units, (k,)
+    noise: float  # Standard deviation of the whitened residuals
 
     @property
     def prediction_scale(self) -> float:
-        """Factor to standard deviations by the uncertainty of the fit that the held-out errors agree with.
-
-        Each held-out row also has the variance 1 of the residuals.
-        """
+        """Factor to standard deviations of the fit that agrees with the held-out errors."""
         excess = np.sum(self.n_rows * (self.squares - 1)) / np.sum(self.n_rows * self.variances)
         return float(np.sqrt(max(excess, 0.0)))
 
@@ -637,9 +581,7 @@ def extend(
     stage = _rejection_stage(extended) if fit.stage == robust.REJECTED else fit.stage
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
-    groups = PriorGroups.none()
-    final = reweight(extended, (stage,), groups, max_iterations, progress, leverages)
-    return final, extension
+    return reweight(extended, (stage,), (), max_iterations, progress, leverages), extension
 
 
 def with_selected(
@@ -679,10 +621,8 @@ def _fit_selected(
 
 
 def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tuple[Array, ...]:
-    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x (p,).
-
-    Samples of low previous weight do not count for the scale of the residuals.
-    """
+    """Return the weight of each sample (m,) of each measurement: 1, or hardly any for outliers at x."""
+    # Samples of low previous weight do not count for the scale of the residuals.
     weights = []
     for residual, w in zip(problem.residuals(x, problem.data), previous, strict=True):
         is_outlier = robust.standardized_residuals(residual, None, w > 0.5) > robust.OUTLIER_THRESHOLD
@@ -691,11 +631,8 @@ def outlier_weights(problem: Problem, x: Array, previous: Sequence[Array]) -> tu
 
 
 def _rejection_stage(fit: Fit) -> str:
-    """Return the robust stage for outliers that were set apart from the other samples before an extension.
-
-    Residuals that only the geometry leaves may look like outliers. They then have all sizes with the
-    families, too.
-    """
+    """Return the robust stage for outliers that were set apart from the other samples before an extension."""
+    # Outliers that only the geometry leaves have all sizes with the families.
     data = [item.with_weights(1 / w) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     t = [np.empty(0)]
     for residual, w in zip(fit.problem.residuals(fit.solution.x, data), fit.weights, strict=True):
@@ -720,11 +657,10 @@ def families_by_stage(names: Iterable[str]) -> list[tuple[str, ...]]:
 def select_families(
     fit: Fit, names: Sequence[str], factor: FactorFolds = _factor_folds
 ) -> tuple[tuple[FamilyTrial, ...], Model, float, dict[str, list[ErrorParameter]]]:
-    """Select families of joint errors among those of some names.
-
-    The function that factors the rows says what is known of their noise. The error of random folds with the
-    selected families relative to that of the geometry follows, and the parameters of these families.
-    """
+    """Select families of joint errors among those of some names."""
+    # The function that factors the rows says what is known of their noise. Returned are the trials, the
+    # model, the error of random folds relative to that of the geometry, and the parameters of the selected
+    # families.
     missing = _missing_parameters(fit.problem, names)
     trials: list[FamilyTrial] = []
     model, random_ratio = Model({}, _noise(fit), float("nan"), {}), float("nan")
@@ -774,15 +710,13 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     if noise < MIN_CORRELATED_NOISE:
         return False
     system = fit.solution.system.scaled(1 / noise)
-    return find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights).is_significant
+    return (
+        abs(find_residual_correlation(fit.problem, fit.solution.x, system, noise, fit.weights)) > MAX_WHITE_Z
+    )
 
 
 def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:
-    """Compute what each family that is not in the model would explain of the residuals.
-
-    The gains are computed from a linearization around the fit and at most `MAX_HINT_SAMPLES` samples of each
-    measurement.
-    """
+    """Compute what each family that is not in the model would explain of the residuals."""
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
     missing = _missing_parameters(solved, [name for name in EXTENSIONS if not FAMILIES[name].is_curve])
@@ -802,11 +736,9 @@ def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[st
 
 
 def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
-    """Suggest an extension if one family explains a significant part of the residuals.
-
-    It requires a change of the cost that chance causes less than once in a million fits, by the bound
-    P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) of Laurent and Massart (2000).
-    """
+    """Suggest an extension if one family explains a significant part of the residuals."""
+    # Chance causes such a change of the cost less than once in a million fits: P(χ²_q > q + 2·sqrt(q·t) +
+    # 2·t) <= exp(-t) (Laurent and Massart 2000).
     best = MAX_HINT_RATIO, ""
     for name, each in family_gains(solved, x, weights).items():
         threshold = each.added + 2 * np.sqrt(HINT_LOG_P * each.added) + 2 * HINT_LOG_P

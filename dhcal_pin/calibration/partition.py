@@ -105,12 +105,10 @@ def _merge_groups(labels: Array, others: Array) -> Array:
 
 
 def configuration_groups(data: Sequence[Measurement]) -> Array:
-    """Label the samples of measurements, those of the same configuration by the same label.
-
-    Labels are numbered in the order of the joint values. A sample with several configurations, such as a
-    relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
-    distance between points, has a label of its own; these are the last, in the order of their names.
-    """
+    """Label the samples of measurements, those of the same configuration by the same label."""
+    # Labels are numbered in the order of the joint values. A sample with several configurations, such as a
+    # relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
+    # distance between points, has a label of its own; these are the last, in the order of their names.
     counts = [len(item.rows) for item in data]
     starts = np.cumsum([0, *counts])
     labels = np.arange(starts[-1])
@@ -302,11 +300,7 @@ def blocked_folds(
 def region_partitions(
     data: Measurement | Sequence[Measurement], groups: Array
 ) -> tuple[tuple[Fold, ...], ...]:
-    """Divide the measured joint space into four regions, once per pair of principal directions.
-
-    The medians along two principal directions of the joint values divide the samples. Samples that belong
-    together are in one region, see `blocked_folds`.
-    """
+    """Divide the samples into four regions by the medians along each pair of principal directions."""
     data = as_measurements(data)
     along, label, is_counted = _principal_coordinates(data, groups)
     partitions = []
@@ -346,11 +340,7 @@ def _principal_coordinates(data: tuple[Measurement, ...], groups: Array | None) 
 
 
 def contact_groups(problem: Problem, x: Array) -> Array:
-    """Label samples that touch the same thing by the same label.
-
-    Points that are joined by a known distance count as the same thing. A sample that touches nothing has a
-    label of its own.
-    """
+    """Label samples that touch the same thing, or points joined by a known distance, by the same label."""
     chain = problem.chain(x)
     node = {parameter.name: i for i, parameter in enumerate(merge_instrument_parameters(problem.data))}
     # Nodes of the graph: instrument parameters, then samples; a contact links a sample to its parameters.

@@ -35,7 +35,13 @@ from ..estimation import robust
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
 from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
-from ..estimation.priors import PriorGroups, Priors, has_default_prior, prior_weights
+from ..estimation.priors import (
+    PriorGroups,
+    Priors,
+    group_default_priors,
+    has_default_prior,
+    prior_weights,
+)
 from ..estimation.problem import Problem, merge_instrument_parameters
 from ..estimation.solver import METHODS, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
@@ -48,7 +54,7 @@ from ..parallel import SERIAL, TaskExecutor
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import has_enough_rows
-from ..robot.chain import BASE_FRAME, Chain
+from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES
 from ..session import Session, can_have_session, find_scale
@@ -64,13 +70,13 @@ from .cameras import (
     split_sets,
 )
 from .cross_validation import leave_regions_out
-from .evaluation import accuracy, fit_nominal
+from .evaluation import accuracy
 from .evidence import diagnose, positions_beside_images
 from .result import Result, make_result
 from .reweighting import Fit, reweight
 from .session_check import SessionFit, SessionModels, fit_session
 from .shrinkage import compute_shrinkage_factor
-from .verdict import MAX_FRAME_ITERATIONS, MAX_FRAME_RATIO, MAX_USUAL_ERROR
+from .verdict import MAX_USUAL_ERROR, needed_frames
 
 # Decimals of the reference temperature of a model [°C].
 REFERENCE_DECIMALS = 1
@@ -350,25 +356,18 @@ def _full_set(setup: _Setup) -> dict[str, Any]:
 
 
 def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
-    """Raise an error if measurements beside images fit only if base or tool are estimated, too.
-
-    Images fit nevertheless, and their errors do not show the cause.
-    """
-    errors = fit.problem.errors
-    frames = {"base": BASE_FRAME, "tool": errors.chain.tool_frame_index}
-    estimated = {parameter.error_frame for parameter in errors.parameters}
-    missing = [name for name, frame in frames.items() if frame not in estimated]
+    """Raise an error if measurements beside images fit only if base or tool are estimated, too."""
+    # Images fit nevertheless, and their errors do not show the cause.
+    problem, x = fit.problem, fit.solution.x
     others = tuple(item for item in fit.data if item.rig is None)
-    if not missing or not has_enough_rows(others):
+    if not has_enough_rows(others):
         return
-    chain, known, x = errors.chain, fit.problem.known, fit.solution.x
-    fitted = accuracy(fit.problem.chain(x), others, fit.problem.instruments(x))
-    group, found = next(iter(fitted.groups.items()))
-    if found.rms <= MAX_USUAL_ERROR[found.unit] * (workspace_radius(chain) if found.unit == "m" else 1.0):
+    fitted = accuracy(problem.chain(x), others, problem.instruments(x))
+    found = next(iter(fitted.groups.values()))
+    size = workspace_radius(problem.errors.chain) if found.unit == "m" else 1.0
+    if found.rms <= MAX_USUAL_ERROR[found.unit] * size:
         return
-    free = initialize_frames(select_parameters(chain, "base,tool"), others, known, MAX_FRAME_ITERATIONS)
-    nominal, instruments = fit_nominal(free, others, known)
-    if accuracy(nominal, others, instruments).groups[group].rms < MAX_FRAME_RATIO * found.rms:
+    if missing := needed_frames(problem, others, others, fitted):
         sources = list(dict.fromkeys(item.source or item.kind for item in others))
         raise InvalidArgumentError(
             f"{join_names(sources)}: the measurements fit this arm only with another {join_names(missing)}; "
@@ -379,7 +378,7 @@ def _require_frames(fit: Fit, sets: Sequence[str]) -> None:
 def _prior_groups(fit: Fit, priors: Priors) -> PriorGroups:
     """Return the groups of parameters whose prior widths are estimated."""
     errors = fit.problem.errors
-    return PriorGroups.from_expected(errors, fit.problem.weights, has_default_prior(errors, priors))
+    return group_default_priors(errors, fit.problem.weights, has_default_prior(errors, priors))
 
 
 def _first_fit(setup: _Setup, data: tuple[Measurement, ...], errors: ErrorModel) -> Fit:
@@ -441,7 +440,7 @@ def _calibrate_samples(
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     fit, holdout, families = begun.fit, begun.holdout, setup.families
     inliers = fit.without_rejected().problem
-    shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups.groups())
+    shrinkage_factor = compute_shrinkage_factor(inliers, fit.solution, groups)
     result = make_result(fit, shrinkage_factor, holdout, "lm")
     result = replace(result, signs=setup.signs, earlier_diagnosis=begun.diagnosis)
     # Residuals of mixed-up measurements say nothing about other errors.

@@ -58,13 +58,9 @@ class Result(Evidence, ResultPlots):
     def _probe(self) -> ObservabilityProbe:
         return ObservabilityProbe(self.problem, self.x)
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """Whether the calibrated robot may be used, with the reasons."""
-        return self._verdict
-
-    @cached_property
-    def _verdict(self) -> Verdict:
         return self.decision or judge(self)
 
     @property

@@ -172,13 +172,14 @@ def _next_round(
     scales = estimate_variance_components(solved, fit.data, weights, lost_freedom)
     weighted = with_sigma_scales(fit.data, scales)
     if stage == robust.TRIMMED:
-        found = find_good_samples(problem, solution, weighted, configuration_groups(fit.data), fit.weights)
-        weights, change = found.weights, robust.weight_change(found.weights, fit.weights)
+        groups_of_samples = configuration_groups(fit.data)
+        weights, last = find_good_samples(problem, solution, weighted, groups_of_samples, fit.weights)
+        change = robust.weight_change(weights, fit.weights)
         # The rounds go on with these weights, then with another search or with those of the nonlinear model.
         # A fit to all parts of joint space does not show that one of them agrees better by itself.
-        n_searches = MAX_SEARCHES if found.stage == robust.REGIONAL else state.n_searches + 1
+        n_searches = MAX_SEARCHES if last == robust.REGIONAL else state.n_searches + 1
         next_search = (robust.TRIMMED,) if change.size and n_searches < MAX_SEARCHES else ()
-        state = replace(state, stages=(robust.KEPT, *next_search, found.stage), n_searches=n_searches)
+        state = replace(state, stages=(robust.KEPT, *next_search, last), n_searches=n_searches)
     elif stage in robust.WEIGHT_FUNCTIONS:
         residuals = studentized_residuals(solved, weighted, weights)
         wanted = [
@@ -222,13 +223,10 @@ def estimate_variance_components(
     weights: Sequence[Array],
     lost_freedom: LostFreedom,
 ) -> Array:
-    """Estimate one noise scale per residual group from the residuals of a fit.
-
-    Groups with stated standard deviations keep scale 1, and so do all groups if there are not more rows than
-    determined parameters. A group with no more rows than that could be fitted exactly, so its residuals
-    do not show its noise. It takes the pooled scale of all groups of its unit that do not state their
-    standard deviations, or 1 if it is the only one.
-    """
+    """Estimate one noise scale per residual group from the residuals of a fit; 1 for stated groups."""
+    # A group with no more rows than determined parameters could be fitted exactly, so its residuals do not
+    # show its noise. It takes the pooled scale of all groups of its unit that do not state their standard
+    # deviations, or 1 if it is the only one. All scales are 1 if there are not more rows in all.
     if all(item.has_stated_sigma for item in data):
         return np.ones(sum(len(item.residual_groups) for item in data))
     problem, solution = solved.problem, solved.solution

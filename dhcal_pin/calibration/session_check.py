@@ -53,38 +53,25 @@ MAX_WIDTH = 8.0
 
 @dataclass(frozen=True)
 class SessionFit:
-    """First fit of measurements, with what happened during the session.
+    """First fit of measurements, with what happened during the session."""
 
-    Attributes:
-        fit: First fit, with the changes that are believed.
-        holdout: Measurements that are not fitted, with these changes.
-        session: What happened; None if it was not looked for.
-        diagnosis: Diagnosis of mistakes in the measurements; None if none was made.
-    """
-
-    fit: Fit
-    holdout: tuple[Measurement, ...]
-    session: Session | None = None
-    diagnosis: Diagnosis | None = None
+    fit: Fit  # First fit, with the changes that are believed
+    holdout: tuple[Measurement, ...]  # Measurements that are not fitted, with these changes
+    session: Session | None = None  # What happened; None if it was not looked for
+    diagnosis: Diagnosis | None = None  # Diagnosis of mistakes in the measurements; None if none was made
 
 
 @dataclass(frozen=True)
 class SessionModels:
-    """Fits that are compared to decide whether changes are believed.
+    """Fits that are compared to decide whether changes are believed."""
 
-    Attributes:
-        errors: Errors of the robot that are unknown.
-        start: Fit measurements for the first time, with given errors that are unknown.
-        reweighted: Fit with robust weights, from a first fit.
-        extended: Fit with robust weights and all families of joint errors, from a first fit.
-        sets: Name of the widths of ordinary errors in `plausibility.evidence`.
-    """
-
-    errors: ErrorModel
+    errors: ErrorModel  # Errors of the robot that are unknown
+    # Fit measurements for the first time, with given errors that are unknown.
     start: Callable[[tuple[Measurement, ...], ErrorModel], Fit]
-    reweighted: Callable[[Fit], Fit]
+    reweighted: Callable[[Fit], Fit]  # Fit with robust weights, from a first fit
+    # Fit with robust weights and all families of joint errors, from a first fit.
     extended: Callable[[Fit], Fit]
-    sets: str
+    sets: str  # Name of the widths of ordinary errors in `plausibility.evidence`
 
 
 def fit_session(
@@ -95,10 +82,7 @@ def fit_session(
     is_ordered: bool,
     progress: Progress | None,
 ) -> SessionFit:
-    """Find what happened during a session, and fit the measurements again with the changes that are believed.
-
-    `fit` is the first fit of `data`.
-    """
+    """Find what happened during a session, and fit the measurements of a first fit again with it."""
     unweighted = replace(fit.problem, data=fit.data)
     found = find_session(unweighted, fit.solution.x, holdout, is_ordered)
     if found.changes.is_empty:
@@ -116,10 +100,7 @@ def fit_session(
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
-    """Hold what no row shows of base and tool, such as the rotation of a tool of which a point is measured.
-
-    Changes of the tool act in its axes. These axes would turn until the changes fit better by chance.
-    """
+    """Hold what no row shows of base and tool: changes act in these axes, which would turn by chance."""
     system, n = solution.system, len(errors.parameters)
     is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
     held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
@@ -160,12 +141,9 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
 
 
 def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
-    """Return whether changes explain measurements beside all families of joint errors.
-
-    `without` and `fit` are the first fits without and with the changes; `extended` adds all families of joint
-    errors that the measurements support without the changes. They are fitted to both. Joint errors do not
-    imitate changes that are far larger than what they leave.
-    """
+    """Return whether changes explain measurements beside all families of joint errors, in first fits."""
+    # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
+    # families that the measurements support without the changes.
     changes = [cause for cause in session.causes if not cause.block.is_constant]
     numbers = session.timeline.fitted_numbers
     shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]

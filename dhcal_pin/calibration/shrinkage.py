@@ -40,11 +40,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from .._typing import Array
+from ..estimation.priors import PriorGroups
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem
 from ..estimation.solver import SolverResult
@@ -63,9 +63,7 @@ NOISE_FLOOR = 1e-6
 N_FACTORS = 101
 
 
-def compute_shrinkage_factor(
-    problem: Problem, solution: SolverResult, groups: Sequence[tuple[Sequence[int], float]]
-) -> float:
+def compute_shrinkage_factor(problem: Problem, solution: SolverResult, groups: PriorGroups) -> float:
     """Compute the largest factor of a solution that is hardly worse than the nominal robot."""
     errors, x = problem.errors, solution.x
     n_rows = sum(len(item.rows) * item.residual_dim for item in problem.data)
@@ -80,21 +78,17 @@ def compute_shrinkage_factor(
     change = displacement @ x[robot]
     # Stated priors and those of joint errors keep their widths; they form the last group, of width 1.
     std, members_of = 1 / problem.weights[robot], []
-    for members, default_weight in groups:
-        if errors.parameters[members[0]].coefficient_index is None:
-            members_of.append(np.isin(robot, members))
-            std[members_of[-1]] = 1 / default_weight
+    for group in groups:
+        if errors.parameters[group.members[0]].coefficient_index is None:
+            members_of.append(np.isin(robot, group.members))
+            std[members_of[-1]] = 1 / group.expected_weight
     widths = np.array([[*row, 1.0] for row in itertools.product(PRIOR_WIDTHS, repeat=len(members_of))])
     members_of.append(~np.any(members_of, 0))
     rows, effect = rows * std, displacement.T @ change * std
     noise = max(1.0, NOISE_FLOOR * float(np.abs(rows).max()) * PRIOR_WIDTHS.max())
     rows, measured = rows / noise, measured / noise
-    log_evidence, mean, effect_std = _Evidence(
-        np.stack([rows[:, group] @ rows[:, group].T for group in members_of]),
-        np.stack([rows[:, group] @ effect[group] for group in members_of]),
-        np.array([np.sum(effect[group] ** 2) for group in members_of]),
-        measured,
-    ).at(widths)
+    parts = [(rows[:, group], effect[group]) for group in members_of]
+    log_evidence, mean, effect_std = _evidence(parts, measured, widths)
     log_posterior = log_evidence - 0.5 * np.sum((np.log(widths) / LOG_WIDTH_STD) ** 2, 1)
     posterior = np.exp(log_posterior - log_posterior.max())
     return _largest_safe_factor(mean, effect_std, posterior / posterior.sum(), float(change @ change))
@@ -123,32 +117,24 @@ def _displacements(problem: Problem, x: Array, robot: Array, dependence: Array) 
     return jacobian[:, robot] + np.delete(jacobian, robot, 1) @ dependence
 
 
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """Gaussian model of the measurements y and the effect a, with f groups of errors of unknown width."""
-
-    covariances: Array  # Covariance of y by each group at width 1, (f, r, r)
-    cross_covariances: Array  # Covariance of y and a by each group at width 1, (f, r)
-    effect_variances: Array  # Variance of a by each group at width 1, (f,)
-    measured: Array  # Measurements y, (r,)
-
-    def at(self, widths: Array) -> tuple[Array, Array, Array]:
-        """Compute log evidence, mean and standard deviation of a, (w,) each, for widths (w, f)."""
-        squares = widths**2
-        covariance = np.tensordot(squares, self.covariances, 1) + np.eye(len(self.measured))
-        root = np.linalg.cholesky(covariance)
-        right = np.stack(
-            [
-                np.broadcast_to(self.measured, (len(widths), len(self.measured))),
-                squares @ self.cross_covariances,
-            ],
-            2,
-        )
-        measured, cross = np.moveaxis(np.linalg.solve(root, right), 2, 0)
-        log_evidence = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) - 0.5 * np.sum(measured**2, 1)
-        variance = squares @ self.effect_variances - np.sum(cross**2, 1)
-        std = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
-        return log_evidence, np.sum(measured * cross, 1), std
+def _evidence(
+    parts: Sequence[tuple[Array, Array]], measured: Array, widths: Array
+) -> tuple[Array, Array, Array]:
+    """Compute log evidence, mean and standard deviation of a, (w,) each, for widths (w, f) of groups."""
+    # Covariance of y, of y and a, and variance of a by each group at width 1.
+    covariances = np.stack([rows @ rows.T for rows, _ in parts])
+    cross_covariances = np.stack([rows @ effect for rows, effect in parts])
+    effect_variances = np.array([np.sum(effect**2) for _, effect in parts])
+    squares = widths**2
+    covariance = np.tensordot(squares, covariances, 1) + np.eye(len(measured))
+    root = np.linalg.cholesky(covariance)
+    repeated = np.broadcast_to(measured, (len(widths), len(measured)))
+    right = np.stack([repeated, squares @ cross_covariances], 2)
+    y, cross = np.moveaxis(np.linalg.solve(root, right), 2, 0)
+    log_evidence = -np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) - 0.5 * np.sum(y**2, 1)
+    variance = squares @ effect_variances - np.sum(cross**2, 1)
+    std = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+    return log_evidence, np.sum(y * cross, 1), std
 
 
 def _largest_safe_factor(mean: Array, std: Array, posterior: Array, squared_change: float) -> float:

@@ -68,26 +68,17 @@ def _read(part: Part) -> Measurement:
 
 @dataclass(frozen=True, eq=False)
 class StreamResult:
-    """Calibration from a stream of samples.
+    """Calibration from a stream of samples."""
 
-    Attributes:
-        problem: Problem with the nominal chain, its base and tool as initialized from the first part, and p
-            unknowns.
-        x: Identified errors, (p,) [m or rad].
-        chain: Calibrated chain.
-        solution: Solution of `problem`.
-        n_samples: Number of samples.
-        before: RMS errors of all samples before, by name: "position" [m], "orientation" [rad].
-        after: RMS errors of all samples after.
-    """
-
+    #: Problem with the nominal chain, its base and tool as initialized from the first part, and p unknowns.
     problem: StreamProblem
-    x: Array
-    chain: Chain
-    solution: SolverResult
-    n_samples: int
+    x: Array  #: Identified errors, (p,) [m or rad]
+    chain: Chain  #: Calibrated chain
+    solution: SolverResult  #: Solution of `problem`
+    n_samples: int  #: Number of samples
+    #: RMS errors of all samples before, by name: "position" [m], "orientation" [rad].
     before: Mapping[str, float]
-    after: Mapping[str, float]
+    after: Mapping[str, float]  #: RMS errors of all samples after
 
     @property
     def converged(self) -> bool:

@@ -147,22 +147,14 @@ def file_table(names: Sequence[str], comparisons: Sequence[Comparison]) -> Table
 
 @dataclass(frozen=True)
 class Headline:
-    """Most important figure of a calibration.
+    """Most important figure of a calibration."""
 
-    Attributes:
-        text: Sentence with the figure.
-        before: RMS error before, with its unit.
-        after: RMS error after, with its unit.
-        percent_reduction: Reduction of the RMS error in percent; negative if the error grew.
-        group: Name of the group of errors, see `measurements.groups.ERROR_GROUPS`.
-        comparison: Comparison that the figure is taken from; `n_samples` counts the samples of the group.
-    """
-
-    text: str
-    before: str
-    after: str
-    percent_reduction: float
-    group: str
+    text: str  # Sentence with the figure
+    before: str  # RMS error before, with its unit
+    after: str  # RMS error after, with its unit
+    percent_reduction: float  # Reduction of the RMS error in percent; negative if the error grew
+    group: str  # Name of the group of errors, see `measurements.groups.ERROR_GROUPS`
+    # Comparison that the figure is taken from; `n_samples` counts the samples of the group.
     comparison: Comparison
 
 
@@ -210,10 +202,7 @@ def judged_regions(
 def generalization_lines(
     generalization: Generalization, comparisons: Sequence[Comparison]
 ) -> tuple[str, str]:
-    """State the accuracy within the measured region and beyond it, one line each.
-
-    Where joint values have no meaning, the lines speak of the measured poses, and state no shares.
-    """
+    """State the accuracy in the measured region and beyond it, one line each; shares need joint values."""
     inside, beyond = judged_regions(generalization, comparisons)
     covered, reached = generalization.covered_share, generalization.reached_share
     region, pronoun, rest = "Among the measured poses", "them", ""

@@ -11,7 +11,7 @@ The limits separate simulated mistakes from honest measurements of robots with e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -21,12 +21,14 @@ import numpy as np
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
+from ..estimation.problem import Problem
 from ..estimation.solver import minimize
 from ..exceptions import ConvergenceError
 from ..formatting import capitalized, format_below, format_count, format_quantity, join_names
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
+from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
@@ -34,7 +36,7 @@ from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
 from . import cameras
-from .evaluation import MIN_SAMPLES, accuracy, fit_nominal
+from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions
 from .model_selection import FULL_SET
 from .partition import configuration_groups
@@ -106,32 +108,21 @@ MIN_STATED_ROWS_PER_DIRECTION = 1.5
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about a calibration that its user must know.
+    """Something about a calibration that its user must know."""
 
-    Attributes:
-        status: Verdict that this finding alone leads to.
-        reason: What was found and what to do, in one or two sentences.
-        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
-    """
-
-    status: Status
-    reason: str
-    keeps_nominal: bool = False
+    status: Status  # Verdict that this finding alone leads to
+    reason: str  # What was found and what to do, in one or two sentences
+    keeps_nominal: bool = False  # Whether the nominal robot should be used in place of the calibrated one
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a calibrated robot may be used.
+    """Whether a calibrated robot may be used."""
 
-    Attributes:
-        status: "ok", "caution" or "refused".
-        reasons: Sentences, those of the most severe findings first; empty if the status is "ok".
-        keeps_nominal: Whether the nominal robot should be used in place of the calibrated one.
-    """
-
-    status: Status
+    status: Status  #: "ok", "caution" or "refused"
+    #: Sentences, those of the most severe findings first; empty if the status is "ok".
     reasons: tuple[str, ...] = ()
-    keeps_nominal: bool = False
+    keeps_nominal: bool = False  #: Whether the nominal robot should be used in place of the calibrated one
 
     @property
     def is_refused(self) -> bool:
@@ -202,10 +193,8 @@ def judge(fit: Evidence) -> Verdict:
 
 
 def _other_loss(fit: Evidence, verdict: Verdict) -> list[Finding]:
-    """Return the findings of the loss "auto" if its verdict is more severe, or if outliers spoil the fit.
-
-    A loss must not hide mistakes. The method of the paper only asks if there are outliers.
-    """
+    """Return the findings of the loss "auto" if its verdict is more severe, or if outliers spoil the fit."""
+    # A loss must not hide mistakes. The method of the paper only asks if there are outliers.
     if fit.with_auto is None or verdict.is_refused or (fit.method != "lm" and not fit.n_outliers):
         return []
     auto = fit.with_auto()
@@ -495,17 +484,24 @@ def _describe(size: CorrectionSize) -> str:
 
 def _missing_frames(fit: Evidence) -> list[str]:
     """Return which of base and tool are not estimated, if the nominal robot fits much better with them."""
-    frames = {"base": BASE_FRAME, "tool": fit.errors.chain.tool_frame_index}
-    estimated = {parameter.error_frame for parameter in fit.errors.parameters}
+    return needed_frames(fit.problem, fit.data, fit.inliers, fit.comparisons[-1].before)
+
+
+def needed_frames(
+    problem: Problem, data: tuple[Measurement, ...], inliers: Sequence[Measurement], before: Accuracy
+) -> list[str]:
+    """Return which of base and tool a problem lacks, if the nominal robot fits much better with them."""
+    chain, known = problem.errors.chain, problem.known
+    frames = {"base": BASE_FRAME, "tool": chain.tool_frame_index}
+    estimated = {parameter.error_frame for parameter in problem.errors.parameters}
     missing = [name for name, frame in frames.items() if frame not in estimated]
     if not missing:
         return []
-    errors = select_parameters(fit.errors.chain, "base,tool")
-    errors = initialize_frames(errors, fit.data, fit.problem.known, MAX_FRAME_ITERATIONS)
-    chain, instruments = fit_nominal(errors, fit.inliers, fit.problem.known)
-    group, before = next(iter(fit.comparisons[-1].before.groups.items()))
-    with_frames = accuracy(chain, fit.inliers, instruments).groups[group]
-    return missing if with_frames.rms < MAX_FRAME_RATIO * before.rms else []
+    errors = initialize_frames(select_parameters(chain, "base,tool"), data, known, MAX_FRAME_ITERATIONS)
+    nominal, instruments = fit_nominal(errors, inliers, known)
+    group, found = next(iter(before.groups.items()))
+    is_needed = accuracy(nominal, inliers, instruments).groups[group].rms < MAX_FRAME_RATIO * found.rms
+    return missing if is_needed else []
 
 
 def _configuration_checks(fit: Evidence) -> str:
@@ -642,10 +638,7 @@ def _regional_errors(fit: Evidence) -> list[Finding]:
 
 
 def _overfitting(fit: Evidence) -> float:
-    """Return the increase of the squared error that the uncertainty of the parameters causes, relative to it.
-
-    A robot that needs no correction becomes worse by this much, which is no reason to doubt the measurements.
-    """
+    """Return the relative increase of the squared error that uncertain parameters cause in any robot."""
     return fit.random_folds.prediction_std**2 if fit.random_folds else np.inf
 
 
@@ -657,10 +650,7 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
-    """Advise caution if the measurements could not have revealed outliers.
-
-    Stated standard deviations that the residuals do not contradict need fewer rows for it.
-    """
+    """Advise caution if the measurements could not have revealed outliers; stated errors need fewer rows."""
     is_image = bool(fit.camera_stages or fit.hand_eye)
     if is_image or not fit.shrinkage_factor:
         return []
@@ -689,10 +679,8 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 
 def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
-    """Return the number of different configurations that gives this number of independent rows per direction.
-
-    The present rows may be too few to determine all directions that many rows would determine.
-    """
+    """Return the number of configurations with this number of independent rows per direction."""
+    # The present rows may be too few to determine all directions that many rows would determine.
     factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)
     n_configurations = len(np.unique(configuration_groups(fit.data)))
@@ -701,10 +689,8 @@ def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
 
 
 def _few_judged(fit: Evidence) -> list[Finding]:
-    """Advise caution if all samples together are too few to judge the accuracy.
-
-    Few hold-out samples say nothing against the fit of the others.
-    """
+    """Advise caution if all samples together are too few to judge the accuracy."""
+    # Few hold-out samples say nothing against the fit of the others.
     judged = headline(fit.comparisons).comparison
     if judged.title in ("fitted", "hold-out") or not small_sample_note(judged):
         return []

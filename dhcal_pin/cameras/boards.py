@@ -26,42 +26,26 @@ RULER = 0.15
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """Board of a rig.
+    """Board of a rig."""
 
-    Attributes:
-        name: Name of the board.
-        link: Link that carries it, "world" or "tip".
-        type: One of `BOARD_TYPES`.
-        columns: Number of squares or tags along x; 0 for points.
-        rows: Number of squares or tags along y; 0 for points.
-        square: Side of a square [m]; for an aprilgrid, of a tag.
-        marker: Side of a marker of a ChArUco board [m].
-        spacing: Gap between two tags of an aprilgrid [m].
-        dictionary: Name of the dictionary of the markers.
-        is_legacy: Whether a ChArUco board begins with a black square although it has an even number of rows.
-        listed_points: Points of the type "points", shape (c, 3) [m].
-        has_free_points: Whether the positions of the corners are estimated.
-        has_exact_points: Whether they are exact, so that it is not tried to estimate them.
-        pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
-        source: File and table that describe it, for messages; empty for a board from Python.
-        print_scale: Size of the print relative to the drawn board; all lengths here are those of the print.
-    """
-
-    name: str
-    link: str
-    type: str
-    columns: int = 0
-    rows: int = 0
-    square: float = 0.0
-    marker: float = 0.0
-    spacing: float = 0.0
-    dictionary: str = ""
+    name: str  # Name of the board
+    link: str  # Link that carries it, "world" or "tip"
+    type: str  # One of `BOARD_TYPES`
+    columns: int = 0  # Number of squares or tags along x; 0 for points
+    rows: int = 0  # Number of squares or tags along y; 0 for points
+    square: float = 0.0  # Side of a square [m]; for an aprilgrid, of a tag
+    marker: float = 0.0  # Side of a marker of a ChArUco board [m]
+    spacing: float = 0.0  # Gap between two tags of an aprilgrid [m]
+    dictionary: str = ""  # Name of the dictionary of the markers
+    # Whether a ChArUco board begins with a black square although it has an even number of rows.
     is_legacy: bool = False
+    # Points of the type "points", shape (c, 3) [m].
     listed_points: Array = field(default_factory=lambda: np.empty((0, 3)))
-    has_free_points: bool = False
-    has_exact_points: bool = False
-    pose: Array | None = None
-    source: str = ""
+    has_free_points: bool = False  # Whether the positions of the corners are estimated
+    has_exact_points: bool = False  # Whether they are exact, so that it is not tried to estimate them
+    pose: Array | None = None  # First guess of its pose in the link, shape (4, 4) [m]; None without one
+    source: str = ""  # File and table that describe it, for messages; empty for a board from Python
+    # Size of the print relative to the drawn board; all lengths here are those of the print.
     print_scale: float = 1.0
 
     @property

@@ -39,11 +39,9 @@ _N_SAMPLES, _SAMPLE_SIZE, _N_CHOICES = 300, 4, 5
 
 
 def solve_hand_eye(link_poses: Array, board_poses: Array, where: str) -> tuple[Array, Array]:
-    """Solve A_i·B = C·P_i for the pose C of the camera and the pose B of the board in their links.
-
-    A_i is the pose of the board's link in the camera's link, P_i that of the board in the camera, shape (i,
-    4, 4) [m] each. Too few images, or links that turn about one axis only, raise `NotObservableError`.
-    """
+    """Solve A_i·B = C·P_i, (i, 4, 4) [m], for the poses C of the camera and B of the board in their links."""
+    # A_i is the pose of the board's link in the camera's link, P_i that of the board in the camera. Too few
+    # images, or links that turn about one axis only, raise `NotObservableError`.
     if len(link_poses) < MIN_IMAGES:
         images = "usable image" if len(link_poses) == 1 else "usable images"
         raise NotObservableError(

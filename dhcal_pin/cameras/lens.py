@@ -49,17 +49,11 @@ _BLOCK = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Lens model.
+    """Lens model."""
 
-    Attributes:
-        name: Name in rig files: "pinhole" or "fisheye".
-        coefficients: Names of the coefficients of the distortion.
-        distort: Function of the distortion.
-    """
-
-    name: str
-    coefficients: tuple[str, ...]
-    distort: Distortion
+    name: str  # Name in rig files: "pinhole" or "fisheye"
+    coefficients: tuple[str, ...]  # Names of the coefficients of the distortion
+    distort: Distortion  # Function of the distortion
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,11 +61,8 @@ class Lens:
         return FOCAL_AND_CENTRE + self.coefficients
 
     def project(self, points: Array, values: Array) -> tuple[Array, Array, Array]:
-        """Project points (3, m) in the camera frame [m] to pixels (2, m) by the values of the lens.
-
-        The derivatives of the pixels by the points, shape (2, 3, m) [px/m], and by the values, shape (2, s,
-        m), follow.
-        """
+        """Project points in the camera frame [m] to pixels (2, m) by the values of the lens."""
+        # The derivatives of the pixels by the points, (2, 3, m) [px/m], and by the values, (2, s, m), follow.
         depth = np.maximum(points[2], MIN_DEPTH)
         plane = points[:2] / depth
         distorted, by_plane, by_coefficients = self.distort(plane, values[4:])
@@ -89,11 +80,9 @@ class Lens:
         return pixels, by_points, by_values
 
     def normalize(self, pixels: Array, values: Array) -> Array:
-        """Compute undistorted image coordinates X/Z, Y/Z of pixels by Newton's method, shape (2, m).
-
-        They are those of the undistorted lens where the distortion has no inverse. All pixels of an image are
-        computed in blocks that stay in the cache.
-        """
+        """Compute undistorted image coordinates X/Z, Y/Z of pixels (2, m) by Newton's method."""
+        # They are those of the undistorted lens where the distortion has no inverse. The pixels are computed
+        # in blocks that stay in the cache.
         if pixels.shape[1] > _BLOCK:
             starts = range(0, pixels.shape[1], _BLOCK)
             return np.concatenate([self.normalize(pixels[:, k : k + _BLOCK], values) for k in starts], 1)

@@ -86,10 +86,8 @@ def fit_camera(views: Sequence[View], camera: Camera, *, repeats_errors: bool = 
 
 
 def _lens_widths(camera: Camera) -> Array:
-    """Return the standard deviations of the first values of a lens, (s,) [px and 1]; 0 if they are fixed.
-
-    Few images determine a lens badly. It stays near stated values, even if the calibration leaves them free.
-    """
+    """Return the standard deviations of the first values of a lens, (s,) [px and 1]; 0 if they are fixed."""
+    # Few images determine a lens badly. It stays near stated values, even if the calibration frees them.
     n_coefficients = len(camera.lens.coefficients)
     if camera.intrinsics == "fixed":
         return np.zeros(len(FOCAL_AND_CENTRE) + n_coefficients)
@@ -100,12 +98,8 @@ def _lens_widths(camera: Camera) -> Array:
 def fit_lens(
     views: Sequence[View], lens: Lens, values: Array, std: Array, *, repeats_errors: bool = False
 ) -> LensFit:
-    """Fit the lens of a camera and the poses of boards to its images.
-
-    Each view has the points of a board, shape (m, 3) [m], and their pixels, shape (m, 2). Standard deviations
-    are 0 for values of the lens that are held. All views count as one if `repeats_errors`: points are wrong,
-    and so in every view.
-    """
+    """Fit the lens of a camera, but for values of std 0, and the poses of boards to its images."""
+    # All views count as one if `repeats_errors`: points are wrong, and so in every view.
     poses = _find_poses(views, lens, values, [None] * len(views))
     usable = [(i, found[0]) for i, found in enumerate(poses) if found and np.isfinite(found[0][1])]
     known = [found[0][0] if found else None for found in poses]

@@ -92,10 +92,8 @@ def _line_distances(points: Array, first: int, second: int) -> Array:
 
 
 def agreeing_points(points: Array, image: Array) -> Array:
-    """Find the image points that agree with a projective map of most points (least quantile of squares).
-
-    All agree if one map fits them all, or if the points that determine a map are half of them or more.
-    """
+    """Find the image points that agree with a projective map of most points (least quantile of squares)."""
+    # All agree if one map fits them all, or if the points that determine a map are half of them or more.
     everything = np.ones(len(points), bool)
     if len(points) <= 2 * MIN_POINTS:
         return everything
@@ -128,11 +126,8 @@ def _transfer_distances(source: Array, image: Array, chosen: Array) -> Array:
 
 
 def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
-    """Estimate the pose of points (m, 3) [m] from undistorted image coordinates X/Z, Y/Z (m, 2) of one image.
-
-    The result is the pose of their frame in the camera, shape (4, 4) [m], and the RMS distance in the image;
-    None if there are too few points.
-    """
+    """Estimate the pose (4, 4) [m] of points in the camera from one image; None with too few points."""
+    # The image coordinates are undistorted, X/Z and Y/Z. The RMS distance in the image follows.
     found = estimate_poses([(points, image)])[0]
     return found[0] if found else None
 
@@ -140,13 +135,8 @@ def estimate_pose(points: Array, image: Array) -> tuple[Array, float] | None:
 def estimate_poses(
     views: Sequence[tuple[Array, Array]], known: Sequence[Array | None] | None = None
 ) -> list[list[tuple[Array, float]]]:
-    """Estimate the poses of points that explain each of several images.
-
-    Each view has the points, shape (m, 3) [m], and their undistorted image coordinates X/Z, Y/Z, shape (m,
-    2). A known pose near that of the image is tried with its mirror image instead of closed forms. The poses
-    in the camera come with their RMS distances in the image, the smallest first; none where there are too few
-    points.
-    """
+    """Estimate poses that explain each of several images, points and X/Z, Y/Z, the best first."""
+    # A known pose near that of the image is tried with its mirror image instead of closed forms.
     candidates = [
         _first_poses(*view) if pose is None else [pose, *_mirror(pose, view[0])]
         for view, pose in zip(views, known or [None] * len(views), strict=True)
@@ -197,10 +187,7 @@ def _flat_poses(points: Array, image: Array) -> list[Array]:
 
 
 def _mirror_plane(pose: Array) -> list[Array]:
-    """Return the mirror image in depth of the pose of a plane, whose origin is fixed; none without tilt.
-
-    A board that is tilted the other way about the line of sight looks nearly the same.
-    """
+    """Return the pose of a plane tilted the other way, which looks nearly the same; none without tilt."""
     position = pose[:3, 3]
     sight, normal = position / np.linalg.norm(position), pose[:3, 2]
     mirrored = 2 * (normal @ sight) * sight - normal
@@ -226,10 +213,7 @@ def _mirror(pose: Array, points: Array) -> list[Array]:
 
 
 def _orthographic_pose(points: Array, image: Array) -> Array:
-    """Return the pose of points (m, 3) that are not flat from their scaled orthographic projection.
-
-    The projection is along the line of sight to the middle of the image points (m, 2).
-    """
+    """Return the pose of points (m, 3) that are not flat from their scaled orthographic projection."""
     sights = np.column_stack([image, np.ones(len(image))])
     sights /= np.linalg.norm(sights, axis=1)[:, None]
     axis = sights.mean(0) / np.linalg.norm(sights.mean(0))
@@ -313,9 +297,6 @@ def _jacobian(local: Array) -> Array:
 
 
 def pose_information(pose: Array, points: Array) -> Array:
-    """Return the information about a twist [v, ω] in camera axes of a pose (4, 4) of points (m, 3), (6, 6).
-
-    It is for unit noise of the image coordinates X/Z, Y/Z.
-    """
+    """Return the information (6, 6) about the twist of a pose in camera axes, for unit noise of X/Z, Y/Z."""
     rows = _jacobian(se3.transform_points(pose, points)).reshape(-1, 6)
     return rows.T @ rows

@@ -22,27 +22,16 @@ DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Camera of a rig.
+    """Camera of a rig."""
 
-    Attributes:
-        name: Name of the camera.
-        link: Link that carries it, "world" or "tip".
-        lens: Lens model.
-        width: Width of its images [px].
-        height: Height of its images [px].
-        values: Values of the lens, shape (s,) [px and 1]; fx, fy, cx, cy are NaN if they are not known.
-        intrinsics: "fixed", "prior" or "free".
-        pose: First guess of its pose in the link, shape (4, 4) [m]; None without one.
-    """
-
-    name: str
-    link: str
-    width: int
-    height: int
-    values: Array
-    lens: Lens = field(default_factory=lambda: LENSES["pinhole"])
-    intrinsics: str = "prior"
-    pose: Array | None = None
+    name: str  # Name of the camera
+    link: str  # Link that carries it, "world" or "tip"
+    width: int  # Width of its images [px]
+    height: int  # Height of its images [px]
+    values: Array  # Values of the lens, shape (s,) [px and 1]; fx, fy, cx, cy are NaN if they are not known
+    lens: Lens = field(default_factory=lambda: LENSES["pinhole"])  # Lens model
+    intrinsics: str = "prior"  # "fixed", "prior" or "free"
+    pose: Array | None = None  # First guess of its pose in the link, shape (4, 4) [m]; None without one
 
     @property
     def has_intrinsics(self) -> bool:
@@ -57,17 +46,11 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras and boards of a set-up.
+    """Cameras and boards of a set-up."""
 
-    Attributes:
-        cameras: Cameras by name.
-        boards: Boards by name.
-        source: Name of the file; empty for a rig from Python.
-    """
-
-    cameras: Mapping[str, Camera]
-    boards: Mapping[str, Board]
-    source: str = ""
+    cameras: Mapping[str, Camera]  # Cameras by name
+    boards: Mapping[str, Board]  # Boards by name
+    source: str = ""  # Name of the file; empty for a rig from Python
 
     @property
     def is_complete(self) -> bool:

@@ -34,7 +34,7 @@ def move_zeros(fit: Result, servos: ServoFile) -> tuple[Result, ServoFile]:
     vars(written).update(
         chain=fit.chain.with_zeros_moved(summands),
         bare=bare,
-        _measured_region=region and region.moved(summands),
+        measured_region=region and region.moved(summands),
     )
     return written, corrected
 

@@ -176,10 +176,7 @@ def _find_markers(board: Board, image: Array) -> Markers:
 
 
 def _find(board: Board, layout: Layout, image: Array, markers: Markers) -> tuple[Array, Array]:
-    """Return the numbers (c,) and image coordinates (c, 2) of the corners of a board in an image.
-
-    The markers of a board are the same in all layouts.
-    """
+    """Return numbers (c,) and image coordinates (c, 2) of corners; the markers are those of all layouts."""
     columns, rows = (board.columns, board.rows)
     if layout.is_exchanged:
         columns, rows = rows, columns
@@ -269,10 +266,8 @@ def _find_checkerboard(board: Board, image: Array, _: Markers) -> tuple[Array, A
 
 
 def _first_square_is_white(board: Board, image: Array, corners: Array) -> bool:
-    """Return whether corners (c, 2) are numbered from the wrong end: the first square of a board is black.
-
-    The board looks the same from both ends if the sum of its columns and rows is even.
-    """
+    """Return whether corners (c, 2) are numbered from the wrong end: the first square of a board is black."""
+    # The board looks the same from both ends if the sum of its columns and rows is even.
     homography = direct_linear_transform(board.points[:, :2] / board.square, corners)
     y, x = np.mgrid[1 : board.rows - 1, 1 : board.columns - 1].reshape(2, -1)
     centres = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ homography.T

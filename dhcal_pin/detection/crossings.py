@@ -34,12 +34,8 @@ _MIN_CORRELATION = 0.8
 
 
 def refine_crossings(image: Array, points: Array, pixels: Array, width: float) -> tuple[Array, Array]:
-    """Improve the corners of a board, and judge whether each is visible.
-
-    The points are corners in squares, the pixels their image coordinates, shape (c, 2) each. Within `width`
-    squares from the edges there is nothing but the four squares. Corners that determine no homography are
-    returned as they are.
-    """
+    """Improve corners (c, 2) of a board, and judge whether each is visible; all stay without a homography."""
+    # Within `width` squares from the edges there is nothing but the four squares.
     if not determines_homography(points):
         return pixels, np.ones(len(points), bool)
     sides = _sides(points, pixels)

@@ -22,10 +22,7 @@ def require_opencv() -> ModuleType:
 
 @contextmanager
 def silent_opencv_log() -> Iterator[None]:
-    """Silence the log of OpenCV in the `with` block, in all threads of this process.
-
-    Its lines name neither the image nor the board; the project reports boards that are not found itself.
-    """
+    """Silence the log of OpenCV in the `with` block, in all threads: it does not name the image."""
     logging = require_opencv().utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)

@@ -93,10 +93,8 @@ def _sight_of_pixel_corners(camera: Camera) -> Array:
 
 
 def _ideal_image(sight: Array, sheets: Sequence[tuple[_Print, Array]], n: int) -> Array:
-    """Return the mean grey values of all pixels, (height, width), from n·n points per pixel at the edges.
-
-    Each print comes with the pose of the camera in the frame of its board.
-    """
+    """Return mean grey values (height, width) of prints, each with the pose of the camera in its board."""
+    # Pixels at edges are the mean of n·n points.
     shape = sight.shape[1] - 1, sight.shape[2] - 1
     flat = sight.reshape(2, -1)
     image, nearest = np.full(shape, BACKGROUND), np.full(shape, np.inf)
@@ -123,11 +121,7 @@ def _ideal_image(sight: Array, sheets: Sequence[tuple[_Print, Array]], n: int) -
 
 
 def _hits(sight: Array, inverse: Array) -> tuple[Array, Array]:
-    """Return where lines of sight X/Z, Y/Z (2, m) meet the plane of a board, by the pose of the camera in it.
-
-    The depths (m,) [m] are infinite without a hit of the printed side. The points on the board are
-    (2, m) [m].
-    """
+    """Return points (2, m) [m] of a board on lines of sight X/Z, Y/Z, and depths, infinite without a hit."""
     direction = inverse[:3, :2] @ sight + inverse[:3, 2:3]
     is_hit = (direction[2] > _MIN_COSINE) & (inverse[2, 3] < 0)
     depth = np.where(is_hit, -inverse[2, 3] / np.where(is_hit, direction[2], 1.0), np.inf)

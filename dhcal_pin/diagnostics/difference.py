@@ -83,34 +83,22 @@ STEP_TOL = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Robot with what its calibration says of it.
+    """Robot with what its calibration says of it."""
 
-    Attributes:
-        chain: Robot.
-        uncertainty: Uncertainty of its calibration; None if it is not known.
-        region: Measured region; None if it is not known.
-        source: File of the robot.
-    """
-
-    chain: Chain
-    uncertainty: Uncertainty | None = None
-    region: MeasuredRegion | None = None
-    source: str = ""
+    chain: Chain  #: Robot
+    uncertainty: Uncertainty | None = None  #: Uncertainty of its calibration; None if it is not known
+    region: MeasuredRegion | None = None  #: Measured region; None if it is not known
+    source: str = ""  #: File of the robot
 
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Distances of two tools in m configurations.
+    """Distances of two tools in m configurations."""
 
-    Attributes:
-        position: Distances of the tool points, (m,) [m].
-        orientation: Angles between the tools, (m,) [rad]; None if one calibration does not determine them.
-        expected: RMS distance that the uncertainties explain [m]; None if they are not known.
-    """
-
-    position: Array
+    position: Array  # Distances of the tool points, (m,) [m]
+    # Angles between the tools, (m,) [rad]; None if one calibration does not determine them.
     orientation: Array | None
-    expected: float | None
+    expected: float | None  # RMS distance that the uncertainties explain [m]; None if they are not known
 
     def to_dict(self) -> dict[str, Any]:
         """Return RMS, 95th percentile and maximum for a JSON document."""
@@ -134,17 +122,11 @@ STATISTICS = {
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """Chi-square of a hypothesis.
+    """Chi-square of a hypothesis."""
 
-    Attributes:
-        value: Chi-square.
-        freedom: Degrees of freedom.
-        constant: Part of both that does not scatter, as the noise was estimated from it.
-    """
-
-    value: float
-    freedom: float
-    constant: float = 0.0
+    value: float  # Chi-square
+    freedom: float  # Degrees of freedom
+    constant: float = 0.0  # Part of both that does not scatter, as the noise was estimated from it
 
     @property
     def reduced(self) -> float:
@@ -177,30 +159,21 @@ class ChiSquare:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Difference of two calibrations of one robot.
+    """Difference of two calibrations of one robot."""
 
-    Attributes:
-        first: First robot.
-        second: Second robot, with the base and tool that fit those of the first one best.
-        region: Distances in the measured region of both; None without a common one.
-        everywhere: Distances in configurations drawn from the joint limits.
-        q: These configurations, (m, n) [rad or m].
-        of_parameters: Chi-square of the difference of the parameters; None if no uncertainty is known.
-        overall: Chi-square of the residuals of both calibrations and of the difference.
-        unexplained: RMS distance that no uncertainty can explain [m].
-        joints: Joints that differ, that of the largest part of chi-square first, and these parts.
-        lacking: Families of joint errors that both models lack, and the probability that chance causes it.
-    """
-
-    first: Chain
-    second: Chain
-    region: Distances | None
-    everywhere: Distances
-    q: Array
+    first: Chain  #: First robot
+    second: Chain  #: Second robot, with the base and tool that fit those of the first one best
+    region: Distances | None  #: Distances in the measured region of both; None without a common one
+    everywhere: Distances  #: Distances in configurations drawn from the joint limits
+    q: Array  #: These configurations, (m, n) [rad or m]
+    #: Chi-square of the difference of the parameters; None if no uncertainty is known.
     of_parameters: ChiSquare | None = None
+    #: Chi-square of the residuals of both calibrations and of the difference.
     overall: ChiSquare | None = None
-    unexplained: float = 0.0
+    unexplained: float = 0.0  #: RMS distance that no uncertainty can explain [m]
+    #: Joints that differ, that of the largest part of chi-square first, and these parts.
     joints: dict[str, float] = field(default_factory=dict)
+    #: Families of joint errors that both models lack, and the probability that chance causes it.
     lacking: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -267,18 +240,7 @@ def _interval(found: ChiSquare) -> str:
 
 
 def compare(first: Calibrated, second: Calibrated) -> Difference:
-    """Compare two calibrations of one robot.
-
-    Args:
-        first: One calibration, or the nominal robot.
-        second: The other one.
-
-    Returns:
-        Distances of the tools with the best common base and tool, and whether the uncertainties explain them.
-
-    Raises:
-        InvalidArgumentError: They are different robots.
-    """
+    """Compare the tools of two calibrations of one robot with the best common base and tool."""
     a, b = first.chain, second.chain
     for what in ("joint_names", "tip"):
         if getattr(a, what) != getattr(b, what):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.evaluation import Accuracy, compute_errors
+from ..calibration.evaluation import Accuracy, compute_errors, take_errors
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
@@ -104,13 +104,7 @@ def find_extrapolation(
     ]
     is_outside = [each > region.radius for each in distances]
     inside, outside = (
-        Accuracy.from_errors(
-            [
-                {name: values[mask] for name, values in each.items()}
-                for each, mask in zip(errors, masks, strict=True)
-                if mask.any()
-            ]
-        )
+        Accuracy.from_errors(take_errors(errors, masks))
         for masks in ([np.logical_not(mask) for mask in is_outside], is_outside)
     )
     q = np.concatenate([item.configurations() for item in data] or [np.empty((0, chain.n_joints))])

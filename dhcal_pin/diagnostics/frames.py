@@ -28,10 +28,7 @@ def fit_frames(
     known: Mapping[str, float] | None = None,
     frames: str = "base,tool",
 ) -> Result:
-    """Fit base and tool to measurements; the rest of the robot is kept.
-
-    All samples have the same weight unless there are outliers, which would move base and tool.
-    """
+    """Fit base and tool to measurements; samples have equal weights unless there are outliers."""
     fit = calibrate(chain, data, frames, known=known, loss="linear")
     if fit.n_outliers:
         fit = calibrate(chain, data, frames, known=known, loss="tukey")

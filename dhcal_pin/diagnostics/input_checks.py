@@ -105,10 +105,8 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
 
 
 def require_joint_units(chain: Chain, file: MeasurementFile) -> None:
-    """Raise an error if most joints of images turn farther than joints can.
-
-    A fit to such images takes long, and its result does not show the cause.
-    """
+    """Raise an error if most joints of images turn farther than joints can."""
+    # A fit to such images takes long, and its result does not show the cause.
     if file.data.rig is None:
         return
     warnings = list(_check_joint_units(chain, file).values())
@@ -362,11 +360,9 @@ def _check_repeated_rows(file: MeasurementFile) -> list[str]:
 
 
 def _check_repeated_corners(item: Measurement) -> list[str]:
-    """Return a warning about corners that an image has at several places.
-
-    Several photographs in the same configuration are no mistake: they have different names or, without names,
-    repeat most corners. Rows that are equal in every digit have their own warning.
-    """
+    """Return a warning about corners that an image has at several places."""
+    # Several photographs in the same configuration are no mistake: they have different names or, without
+    # names, repeat most corners. Rows that are equal in every digit have their own warning.
     own = np.arange(len(item.rows))
     view = first_equal_rows([item.image, item.board, item.image_names])
     corner = first_equal_rows([view, item.corner])

@@ -49,11 +49,9 @@ class UnreachableRow:
 
 
 def reach_sphere(chain: Chain) -> tuple[Array, float]:
-    """Return the centre and radius of a sphere that the tool point cannot leave.
-
-    The centre moves up the chain as long as the next origin lies on the axis just passed. For most robots it
-    is the shoulder. Prismatic joints add their longest stroke; one without limits makes the radius infinite.
-    """
+    """Return the centre and radius of a sphere that the tool point cannot leave."""
+    # The centre moves up the chain as long as the next origin lies on the axis just passed; it is mostly the
+    # shoulder. Prismatic joints add their longest stroke; one without limits makes the radius infinite.
     origins = np.concatenate([chain.origins[:-1], (chain.origins[-1] @ chain.tool)[None]])
     frame = chain.base @ origins[0]
     first = 1

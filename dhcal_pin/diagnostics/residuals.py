@@ -94,10 +94,7 @@ class JointProfile:
 
 
 def joint_offset_profiles(fit: Result) -> list[JointProfile]:
-    """Compute the residual joint error of each moving joint over its position.
-
-    The samples are those held out, or the fitted ones if none are held out, without outliers.
-    """
+    """Compute the residual error of each moving joint over its position, of held-out or of fitted samples."""
     data = [item for item in fit.counted_holdout or fit.counted if item.configurations_per_row == 1]
     if not data or not fit.has_joint_values:
         return []

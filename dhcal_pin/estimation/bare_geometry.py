@@ -40,21 +40,13 @@ UNIT = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class BareGeometry:
-    """Geometric errors that fit best without joint errors.
+    """Geometric errors that fit best without joint errors."""
 
-    Attributes:
-        errors: Nominal chain without joint errors, and its unknown geometric errors.
-        x: Identified geometric errors, shape (g,) [m or rad].
-        configurations: Measured configurations, then those of the joint space, shape (m, n).
-        weights: Weight of each of them, shape (m,).
-        lever: Lever ℓ by which differences of the orientation count as distances [m].
-    """
-
-    errors: ErrorModel
-    x: Array
-    configurations: Array
-    weights: Array
-    lever: float
+    errors: ErrorModel  # Nominal chain without joint errors, and its unknown geometric errors
+    x: Array  # Identified geometric errors, shape (g,) [m or rad]
+    configurations: Array  # Measured configurations, then those of the joint space, shape (m, n)
+    weights: Array  # Weight of each of them, shape (m,)
+    lever: float  # Lever ℓ by which differences of the orientation count as distances [m]
 
     @cached_property
     def chain(self) -> Chain:
@@ -80,10 +72,8 @@ class BareGeometry:
 def fit_bare_geometry(
     errors: ErrorModel, x: Array, complete: Chain, data: Sequence[Measurement]
 ) -> BareGeometry | None:
-    """Fit the geometry without joint errors to a complete model with the errors x; None if it has none.
-
-    Distances and angles have the weights that they have in the measurements.
-    """
+    """Fit the geometry without joint errors to a complete model with errors x; None without joint errors."""
+    # Distances and angles have the weights that they have in the measurements.
     if not complete.error_families:
         return None
     geometric = tuple(p for p in errors.parameters if p.coefficient_index is None)

@@ -43,27 +43,21 @@ class ErrorParameter:
     """Scalar kinematic error.
 
     `definition` says in which frame and direction it is defined.
-
-    Attributes:
-        name: Name for users, such as `d2` or `elbow_joint.rx`.
-        unit: Unit of the value: "m" or "rad" for a geometric error; "1", "rad", "rad/Nm", "rad/rad",
-            "rad/m" or "1/K" for a transmission coefficient.
-        nominal: Nominal value in that unit: the DH table entry or the transmission coefficient; zero for
-            errors that are differences.
-        error_frame: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool.
-        twist: Twist [v, ω] per unit of the error, in axes of the error frame.
-        prior: Standard deviation expected before any measurement, in the unit of the value.
-        coefficient_index: Index of the transmission coefficient; None for a geometric error.
-        quantity: What a transmission coefficient changes: "position" of a joint or "length" of a link.
     """
 
-    name: str
+    name: str  #: Name for users, such as `d2` or `elbow_joint.rx`
+    #: Unit of the value: "m" or "rad" for a geometric error; "1", "rad", "rad/Nm", "rad/rad", "rad/m" or
+    #: "1/K" for a transmission coefficient.
     unit: str
+    #: Nominal value in that unit: the DH table entry or the transmission coefficient; zero for errors that
+    #: are differences.
     nominal: float
-    error_frame: int
-    twist: tuple[float, ...]
-    prior: float
+    error_frame: int  #: Index of the error frame: 0 base, 2j joint j, 2j+1 link j, 2k+2 tip, 2k+3 tool
+    twist: tuple[float, ...]  #: Twist [v, ω] per unit of the error, in axes of the error frame
+    prior: float  #: Standard deviation expected before any measurement, in the unit of the value
+    #: Index of the transmission coefficient; None for a geometric error.
     coefficient_index: int | None = None
+    #: What a transmission coefficient changes: "position" of a joint or "length" of a link.
     quantity: str = ""
 
     def definition(self, chain: Chain) -> tuple[str, str]:
@@ -75,19 +69,14 @@ class ErrorParameter:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Nominal chain and p unknown errors.
+    """Nominal chain and p unknown errors."""
 
-    Attributes:
-        chain: Nominal chain.
-        parameters: Unknown errors, length p, sorted by error frame; transmission coefficients last.
-        fixed: Parameters of the same sets that are held at their nominal values.
-        undetermined: Those of them that no measurement shows.
-    """
-
-    chain: Chain
+    chain: Chain  #: Nominal chain
+    #: Unknown errors, length p, sorted by error frame; transmission coefficients last.
     parameters: tuple[ErrorParameter, ...]
+    #: Parameters of the same sets that are held at their nominal values.
     fixed: tuple[ErrorParameter, ...] = ()
-    undetermined: tuple[ErrorParameter, ...] = ()
+    undetermined: tuple[ErrorParameter, ...] = ()  #: Those of them that no measurement shows
 
     @cached_property
     def _n_geometric(self) -> int:
@@ -147,10 +136,7 @@ class ErrorModel:
         return displacements[0], twists[0]
 
     def at(self, x: Array) -> Chain:
-        """Build the chain with given errors.
-
-        The gravity torques remain those of the nominal chain; see `with_current_loads`.
-        """
+        """Build the chain with given errors; its gravity torques are nominal, see `with_current_loads`."""
         x = np.ascontiguousarray(x, float)
         return self._with_transmission(self.chain.perturbed(self._perturb_frames(x)[0]), x)
 
@@ -174,12 +160,9 @@ class ErrorModel:
         return replace(self, chain=self.chain.with_transmission(transmission))
 
     def derivative(self, x: Array) -> tuple[Chain, Array, Array]:
-        """Compute the chain at x and its derivative by each error.
-
-        The derivative consists of the body that each error moves, shape (p,), and the twist of that body in
-        its own frame, shape (p, 6), as `Chain.tool_jacobian` takes them. Transmission coefficients have
-        numbers above those of the bodies.
-        """
+        """Compute the chain at x, and its derivative by each error."""
+        # The derivative is the body (p,) that each error moves, and its twist (p, 6) in its own frame, as
+        # `Chain.tool_jacobian` takes them. Transmission coefficients have numbers above those of the bodies.
         x = np.ascontiguousarray(x, float)
         displacements, twists = self._perturb_frames(x)
         chain, bodies = self._with_transmission(self.chain.perturbed(displacements), x), self.bodies

@@ -67,10 +67,7 @@ class FoldSystems:
         return self.fitted.is_unobserved
 
     def error(self, weights: Array, x: Array, columns: Array) -> float:
-        """Compute the RMS of the held-out whitened rows under the fit of the other rows.
-
-        Unknowns that only the held-out rows depend on are fitted to these.
-        """
+        """Compute the RMS of the held-out whitened rows; unknowns of these rows alone are fitted to them."""
         step = np.zeros(len(x))
         step[columns] = solve_columns(self.fitted, weights, x, columns)[0]
         own = self._own_unknowns(columns)
@@ -105,11 +102,9 @@ class FoldSystems:
 
 
 def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: Array) -> tuple[Array, float]:
-    """Solve a triangular system with priors for some of the unknowns.
-
-    Directions that neither rows nor priors determine return to 0, as x may contain information on them from
-    held-out rows.
-    """
+    """Solve a triangular system with priors for some of the unknowns."""
+    # Directions that neither rows nor priors determine return to 0: x may contain information from held-out
+    # rows.
     prior = weights[columns]
     if prior.all():
         return system.select(columns).solve(prior, x[columns])
@@ -228,11 +223,7 @@ class NoisyRows:
         return 0.5 * sum(one.n_rows * float(np.log(one.variance(noise))) for one in self.classes)
 
     def noise_after(self, noise: float, step: Array, root: Array, n_determined: float) -> float:
-        """Return the noise that the rows show after a step (p,), from the noise before.
-
-        The root is that of the covariance of the unknowns, see `TriangularSystem.sqrt_covariance`;
-        `n_determined` is the number of unknowns that all rows together determine.
-        """
+        """Return the noise that the rows show after a step (p,), from the noise before and the root."""
         total = weight = smallest = 0.0
         others = [one.system.predicted_variance(root) / one.variance(noise) for one in self.classes[1:]]
         for one, determined in zip(self.classes, (n_determined - sum(others), *others), strict=True):

@@ -78,12 +78,9 @@ def best_frames_std(uncertainty: Uncertainty, q: Array) -> float:
 
 
 def tool_gauge_covariance(priors: Uncertainty) -> Array:
-    """Compute the covariance (6, 6) of the tool pose that errors of the arm can imitate everywhere.
-
-    The columns of `priors` are the errors of the arm, each by one standard deviation. The tool pose is a
-    twist [v, ω] in axes of the tool. Images do not show it: a camera or a board on the tool that moves
-    against the tool has the same effect.
-    """
+    """Compute the covariance (6, 6) of the tool pose that errors of the arm can imitate everywhere."""
+    # The columns of `priors` are the errors of the arm, each by one standard deviation. Images do not show
+    # the pose: a camera or a board on the tool that moves against the tool has the same effect.
     chain, n_errors = priors.chain, priors.sqrt_covariance.shape[1]
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_COMPARED + n_errors, chain.n_joints))
     lever = max(se3.rms_radius(chain.poses(q)[:, :3, 3]), MIN_LEVER)
@@ -105,10 +102,7 @@ def _gauge_directions(uncertainty: Uncertainty, undetermined: Array, lever: floa
 
 
 def frame_combinations(effects: Array, frames: Array, smallest: float) -> Array:
-    """Return combinations (d, g) of effects (k, d) that are those of base and tool poses, (k, c).
-
-    The combined effects are orthonormal. Effects of relative size `NO_EFFECT_RTOL` of `smallest` are none.
-    """
+    """Return orthonormal combinations (d, g) of effects (k, d) that are effects of base and tool (k, c)."""
     left, s, right = np.linalg.svd(effects, full_matrices=False)
     has_effect = s > NO_EFFECT_RTOL * max(s[0], smallest)
     frames, frame_s, _ = np.linalg.svd(frames, full_matrices=False)

@@ -104,10 +104,7 @@ def positions_at_end(item: Measurement) -> Array:
 def candidate_frames(
     chain: Chain, data: Sequence[Measurement], is_base_unknown: bool, is_tool_unknown: bool
 ) -> Iterator[Chain]:
-    """Generate chains with base and tool computed from the measured positions, the best aligned first.
-
-    Nothing is generated with fewer than three measured positions.
-    """
+    """Generate chains with frames from at least three measured positions, the best aligned first."""
     with_positions = [item for item in data if len(item.positions())]
     bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
     tips = [bare.poses(item.conditions().of_arm) for item in with_positions]
@@ -233,10 +230,7 @@ def _largest_distance(distances: Array, measured: Array) -> float:
 def make_problem(
     errors: ErrorModel, data: tuple[Measurement, ...], weights: Array, known: Mapping[str, float]
 ) -> Problem:
-    """Make the least-squares problem of a robot and its instruments.
-
-    Instrument parameters have priors of their own.
-    """
+    """Make the least-squares problem of a robot and its instruments, which have priors of their own."""
     wide = np.array(
         [
             1 / parameter.prior

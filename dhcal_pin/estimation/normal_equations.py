@@ -50,11 +50,7 @@ class NormalEquations(TriangularSystem):
 
     @cached_property
     def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """[R z; 0 ρ], upper triangular, shape (p+1, p+1).
-
-        Directions that the rows determine by less than a millionth of the norm of a column count as
-        undetermined.
-        """
+        """[R z; 0 ρ], (p+1, p+1); a millionth of the norm of a column or less counts as undetermined."""
         matrix, scale = self._with_unit_diagonal(np.zeros(len(self.products) - 1))
         root, pivots, rank, _ = lapack.dpstrf(matrix, tol=_MIN_PIVOT)
         order, right = pivots - 1, self.products[:-1, -1] / scale
@@ -123,10 +119,7 @@ class NormalEquations(TriangularSystem):
         return posterior.substitute(), posterior.min_cost
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
-        """Compute a square root of the covariance of data and priors together; see `qr.TriangularSystem`.
-
-        The weights are positive, so there are no undetermined directions.
-        """
+        """Compute a root of the covariance of data and priors; positive weights determine all directions."""
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):
             vars(self)["_inverse_root"] = _inverse(root)
@@ -182,10 +175,7 @@ class DeterminedSystem(TriangularSystem):
     """Triangular system of normal equations to which diagonal rows were appended: priors, and a damping."""
 
     def __init__(self, equations: NormalEquations, diagonal: Array, right: Array, cost: float):
-        """Store the equations, the squares (p,) of the appended rows, and what both have on the right side.
-
-        That is Jᵀr of shape (p,), and ‖r‖².
-        """
+        """Store the equations, the squares (p,) of appended rows, and Jᵀr (p,) and ‖r‖² of both."""
         vars(self).update(_equations=equations, _diagonal=diagonal, _right=right, _cost=cost)
 
     @cached_property
@@ -247,11 +237,9 @@ class DeterminedSystem(TriangularSystem):
         return self.substitute() if is_well_conditioned(self._cholesky[0]) else super().best_step()
 
     def _refined_step(self, before: DeterminedSystem) -> Array | None:
-        """Compute the best step from the decomposition without the last rows; None if they are too large.
-
-        With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at the solution
-        for A + E. A damping is mostly so small that it takes some steps only.
-        """
+        """Compute the best step from the decomposition without the last rows; None if they are too large."""
+        # With A of that decomposition and E of these rows, the iteration δ ← A⁻¹·(b - E·δ) ends at the
+        # solution for A + E. A damping is mostly so small that it takes some steps only.
         root, scale = before._cholesky
         added, right = (self._diagonal - before._diagonal) / scale**2, self._right / scale
         step, change = lapack.dpotrs(root, right)[0], np.inf

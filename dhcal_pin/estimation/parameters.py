@@ -150,12 +150,9 @@ def placement(chain: Chain) -> list[ErrorParameter]:
 
 
 def minimal(chain: Chain) -> list[ErrorParameter]:
-    """Build the independent errors of each joint's axis.
-
-    A joint origin moves in all directions but along and about its axis. Those two commute with the joint's
-    motion; they pass on to the next joint, and from the last joint to the tool. A translation of a prismatic
-    joint's axis passes on in the same way.
-    """
+    """Build the independent errors of each joint's axis."""
+    # Motions along and about the axis commute with the joint's motion and pass on to the next joint, from the
+    # last joint to the tool. So do all translations of a prismatic joint's axis.
     out = []
     for j, (name, axis, is_prismatic) in enumerate(
         zip(chain.moving_joints, chain.axes, chain.prismatic, strict=True)
@@ -184,11 +181,7 @@ def minimal(chain: Chain) -> list[ErrorParameter]:
 
 
 def redundant(errors: ErrorModel) -> list[ErrorParameter]:
-    """Build the errors of joint origins that the set `minimal` leaves out; none if a model lacks that set.
-
-    Other errors imitate them: those along and about the axis of each joint, and all translations of the axis
-    of a prismatic joint.
-    """
+    """Build the errors of joint origins that the set `minimal` leaves out; none if a model lacks that set."""
     chain = errors.chain
     known = {
         (p.error_frame, tuple(sign * v for v in p.twist)) for p in errors.parameters for sign in (1.0, -1.0)
@@ -286,15 +279,10 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Parameter set that users select by name; calling it returns its parameters.
+    """Parameter set that users select by name; calling it returns its parameters."""
 
-    Attributes:
-        build: Function from a chain to the parameters of the set.
-        help: One line for help texts.
-    """
-
-    build: Callable[[Chain], list[ErrorParameter]]
-    help: str
+    build: Callable[[Chain], list[ErrorParameter]]  #: Function from a chain to the parameters of the set
+    help: str  #: One line for help texts
 
     def __call__(self, chain: Chain) -> list[ErrorParameter]:
         """Build the parameters of the set."""

@@ -32,6 +32,7 @@ from ..exceptions import InvalidArgumentError, UnknownNameError
 from .error_model import ErrorModel
 from .parameters import fold_harmonics
 from .problem import Problem
+from .qr import TriangularSystem
 from .solver import SolverResult
 
 Priors = Literal["default", "none"] | Mapping[str, float]
@@ -80,59 +81,42 @@ def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
     return np.fromiter(is_default, bool)
 
 
-@dataclass(frozen=True, eq=False)
-class PriorGroups:
-    """Groups of parameters whose default priors share one scale: those of one unit and one expected size."""
+@dataclass(frozen=True)
+class PriorGroup:
+    """Parameters whose priors share one scale."""
 
-    members: Array  # Indices of the parameters in any group, shape (n,)
-    group_index: Array  # Group of each of them, shape (n,)
-    expected_weights: Array  # Reciprocal expected standard deviation of each group, shape (g,)
-    min_weights: Array  # Smallest weight of each group, shape (g,)
-    max_weights: Array  # Largest weight of each group, shape (g,)
-    # Number of determined parameters that the expected standard deviation of each group counts for against
-    # smaller errors, shape (g,).
-    expectation_counts: Array
+    members: list[int]  # Indices of the parameters
+    expected_weight: float  # Reciprocal of their expected standard deviation
+    min_weight: float  # Smallest weight
+    max_weight: float  # Largest weight
+    # Number of determined parameters that the expected standard deviation counts for against smaller errors.
+    expectation_count: float
 
-    @classmethod
-    def from_expected(cls, errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
-        """Group the parameters of the robot that have default priors; base and tool are left out."""
-        inside = np.flatnonzero(errors.is_of_arm & default).tolist()
+
+# Groups of a problem; the priors of all other parameters keep their standard deviations.
+PriorGroups = tuple[PriorGroup, ...]
+
+
+def group_default_priors(errors: ErrorModel, expected: Array, default: Array) -> PriorGroups:
+    """Group the default priors of the arm, those of one unit and one expected size together."""
+    groups: dict[tuple[tuple[str, bool], float], list[int]] = {}
+    for i in np.flatnonzero(errors.is_of_arm & default).tolist():
+        parameter = errors.parameters[i]
         # Angles of the geometry and of the transmission count as different units.
-        units = [(errors.parameters[i].unit, errors.parameters[i].coefficient_index is None) for i in inside]
-        keys = list(zip(units, expected[inside].tolist(), strict=True))
-        distinct = list(dict.fromkeys(keys))
-        max_weights = [max(weight for unit, weight in distinct if unit == own) for own, _ in distinct]
-        return cls(
-            np.array(inside, int),
-            np.array([distinct.index(key) for key in keys], int),
-            np.array([weight for _, weight in distinct]),
-            np.zeros(len(distinct)),
-            np.array(max_weights),
-            np.full(len(distinct), EXPECTATION_COUNT),
+        unit = parameter.unit, parameter.coefficient_index is None
+        groups.setdefault((unit, float(expected[i])), []).append(i)
+    return tuple(
+        PriorGroup(
+            members, weight, 0.0, max(other for own, other in groups if own == unit), EXPECTATION_COUNT
         )
+        for (unit, weight), members in groups.items()
+    )
 
-    @classmethod
-    def none(cls) -> PriorGroups:
-        """Return no groups: all priors keep their standard deviations."""
-        return cls(np.empty(0, int), np.empty(0, int), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
-    def joined(self, other: PriorGroups) -> PriorGroups:
-        """Return these groups and others."""
-        return PriorGroups(
-            np.concatenate([self.members, other.members]),
-            np.concatenate([self.group_index, other.group_index + len(self.expected_weights)]),
-            np.concatenate([self.expected_weights, other.expected_weights]),
-            np.concatenate([self.min_weights, other.min_weights]),
-            np.concatenate([self.max_weights, other.max_weights]),
-            np.concatenate([self.expectation_counts, other.expectation_counts]),
-        )
-
-    def groups(self) -> list[tuple[list[int], float]]:
-        """List the groups."""
-        return [
-            (self.members[self.group_index == i].tolist(), weight)
-            for i, weight in enumerate(self.expected_weights.tolist())
-        ]
+def determined_fractions(system: TriangularSystem, weights: Array) -> Array:
+    """Return the fraction γ (p,) of each unknown that the data determine, with prior weights (p,)."""
+    root = np.ascontiguousarray(system.sqrt_covariance(weights)[0])
+    return np.fmax(0.0, 1 - np.einsum("ij,ij->i", root, root) * weights**2)
 
 
 def effective_parameters(problem: Problem, solution: SolverResult) -> float:
@@ -143,17 +127,12 @@ def effective_parameters(problem: Problem, solution: SolverResult) -> float:
 
 def update_prior_scales(problem: Problem, solution: SolverResult, groups: PriorGroups) -> Array:
     """Estimate the scale of each group's priors from the errors in a solution (evidence procedure)."""
-    weights, members, group_index = problem.weights.copy(), groups.members, groups.group_index
-    if not len(members):
-        return weights
-    expected = groups.expected_weights
-    root = solution.system.sqrt_covariance(problem.weights)[0][members]
-    # γ: fraction of each parameter that the data determine.
-    determined = np.fmax(0.0, 1 - np.einsum("ij,ij->i", root, root) * problem.weights[members] ** 2)
-    squares = np.bincount(group_index, solution.x[members] ** 2) * expected**2
-    count = np.bincount(group_index, determined)
-    extra = np.where(squares <= count, groups.expectation_counts, 0.0)
-    updated = expected * np.sqrt(np.fmax(count + extra, _SMALLEST) / np.fmax(squares + extra, _SMALLEST))
-    updated = np.fmin(np.fmax(updated, groups.min_weights), groups.max_weights)
-    weights[members] = updated[group_index]
+    weights = problem.weights.copy()
+    determined = determined_fractions(solution.system, problem.weights) if groups else weights
+    for group in groups:
+        expected, count = group.expected_weight, sum(determined[group.members].tolist())
+        square = sum((solution.x[group.members] ** 2).tolist()) * expected**2
+        extra = group.expectation_count if square <= count else 0.0
+        updated = expected * np.sqrt(max(count + extra, _SMALLEST) / max(square + extra, _SMALLEST))
+        weights[group.members] = min(max(updated, group.min_weight), group.max_weight)
     return weights

@@ -448,11 +448,8 @@ class UnfactoredSystem(NormalEquations):
 
 
 def uses_normal_equations(problem: Problem) -> bool:
-    """Check whether the normal equations of a problem take much less time than the R factor of its rows.
-
-    They are accurate if all unknowns have priors. There are many transmission coefficients, and one
-    configuration per row.
-    """
+    """Check whether normal equations take much less time than the R factor of the rows."""
+    # They are accurate if all unknowns have priors.
     return (
         problem.errors.n_coefficients > MANY_COLUMNS
         and not problem.instrument_parameters

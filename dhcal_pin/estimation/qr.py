@@ -180,11 +180,7 @@ class TriangularSystem:
         return append_rows(self, weights, -(weights * x))
 
     def solve(self, weights: Array, x: Array | float) -> tuple[Array, float]:
-        """Compute the best step δ from x with priors, and the cost of rows and priors after it.
-
-        The weights are reciprocal prior standard deviations 1/σ, zero without a prior. x is the current value
-        of shape (p,), or 0 [m and rad].
-        """
+        """Compute the best step δ from x with prior weights 1/σ, and the cost of rows and priors after it."""
         posterior = self.with_priors(weights, x)
         return posterior.best_step(), posterior.min_cost
 
@@ -197,14 +193,10 @@ class TriangularSystem:
         return TriangularSystem(append_diagonal(self.rows[None], diagonal[None], right[None])[0])
 
     def sqrt_covariance(self, weights: Array) -> tuple[Array, Array]:
-        """Compute a square root of the covariance of data and priors together.
-
-        The covariance is C = S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights), on the directions that data or priors
-        determine. Where [R; W] is ill-conditioned, parameter space is split by the rank of R: in the
-        observable directions data and priors count, in the others the priors alone. Exact data with tiny
-        standard deviations would otherwise hide the information of the priors. S has shape (p, r). An
-        orthonormal basis of the directions that neither data nor priors determine follows, shape (p, p-r).
-        """
+        """Compute a square root (p, r) of the covariance, and a basis (p, p-r) of undetermined directions."""
+        # S·Sᵀ = (RᵀR + W²)⁻¹, W = diag(weights). Where [R; W] is ill-conditioned, parameter space is split by
+        # the rank of R: in the observable directions data and priors count, in the others the priors alone.
+        # Exact data with tiny standard deviations would otherwise hide the information of the priors.
         if not len(weights):
             return np.empty((0, 0)), np.empty((0, 0))
         full = self.with_priors(weights, 0.0).r
@@ -264,10 +256,7 @@ def merge_r_factors(factors: Sequence[Array]) -> Array:
 
 
 def combine_r_factors(factors: Iterable[Array], p: int) -> TriangularSystem:
-    """Merge the R factors of all chunks of data, one after the other.
-
-    Two factors are in memory at a time. The plain rows of small chunks are collected first.
-    """
+    """Merge the R factors of chunks one after the other; plain rows of small chunks are collected first."""
     merged: Array | None = None
     pending: list[Array] = []
     for factor in factors:
@@ -298,10 +287,7 @@ def is_well_conditioned(r: Array) -> bool:
 
 
 def pseudo_inverse(r: Array, z: Array) -> Array:
-    """Compute the minimum-norm least-squares solution R⁺·z, shape (p,).
-
-    Singular values below RANK_RTOL times the largest count as zero.
-    """
+    """Compute the minimum-norm least-squares solution R⁺·z (p,) by the singular values above RANK_RTOL."""
     # Back substitution takes a hundredth of the time of the singular value decomposition.
     if is_well_conditioned(r):
         return lapack.dtrtrs(r, z)[0]

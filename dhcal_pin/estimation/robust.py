@@ -93,30 +93,15 @@ def _uniform(t: Array) -> Array:
     return np.ones_like(t)
 
 
-def _huber(t: Array) -> Array:
-    """Return the weights of Huber's loss."""
-    return 1.345 / np.maximum(t, 1.345)
-
-
-def _cauchy(t: Array) -> Array:
-    """Return the weights of Cauchy's loss."""
-    return 1 / (1 + (np.maximum(t, 0) / 2.385) ** 2)
-
-
-def _tukey(t: Array) -> Array:
-    """Return the weights of Tukey's biweight loss."""
-    return np.maximum(1 - (np.clip(t, 0, 4.685) / 4.685) ** 2, 0) ** 2
-
-
 # Weight function of each stage, and the standardized residual above which its weight is zero. Without that
 # limit every outlier keeps a constant influence: with 10 % outliers the error is about 25 % larger.
 WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
     REJECTED: (_uniform, REJECTION_THRESHOLD),
     FAR_REJECTED: (_uniform, FAR_THRESHOLD),
     REGIONAL: (_uniform, FAR_THRESHOLD),
-    "huber": (_huber, OUTLIER_THRESHOLD),
-    "cauchy": (_cauchy, OUTLIER_THRESHOLD),
-    "tukey": (_tukey, OUTLIER_THRESHOLD),
+    "huber": (lambda t: 1.345 / np.maximum(t, 1.345), OUTLIER_THRESHOLD),
+    "cauchy": (lambda t: 1 / (1 + (np.maximum(t, 0) / 2.385) ** 2), OUTLIER_THRESHOLD),
+    "tukey": (lambda t: np.maximum(1 - (np.clip(t, 0, 4.685) / 4.685) ** 2, 0) ** 2, OUTLIER_THRESHOLD),
 }
 
 
@@ -144,11 +129,8 @@ LOSSES: dict[str, Loss] = {
 def standardized_residuals(
     residual: Array, covariances: Array | None = None, is_good: Array | None = None
 ) -> Array:
-    """Compute the residual t of each sample of one measurement, standard normal for good samples.
-
-    The whitened residuals have shape (k, m), their covariances up to a common factor (m, k, k); None is the
-    identity. `is_good` marks the samples that count for the scale, all if None.
-    """
+    """Compute the residual t of each sample of one measurement, standard normal for good samples."""
+    # Whitened residuals are (k, m), their covariances (m, k, k), up to a factor that good samples determine.
     k = len(residual)
     if covariances is None:
         return standardize_mean_squares(np.sum(residual**2, 0) / k, k, is_good)
@@ -161,10 +143,7 @@ def standardized_residuals(
 
 
 def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None = None) -> Array:
-    """Transform mean squares of k residuals each to standardized residuals t (Wilson & Hilferty).
-
-    `is_good` marks the samples that count for the median, all if None. t is zero if the median is zero.
-    """
+    """Transform mean squares of k residuals to standardized residuals t (Wilson & Hilferty)."""
     mean = 1 - 2 / (9 * k)
     # The median of χ²_k/k is mean³.
     inliers = mean_squares if is_good is None else mean_squares[is_good]
@@ -203,12 +182,10 @@ def sample_weights(t: Array, stage: str) -> Array:
 
 
 def reject_groups(weights: Array, t: Array, item: Measurement) -> Array:
-    """Reject all samples of each group that is wrong as a whole, such as an image of another configuration.
-
-    Some of its samples are rejected then, and the residuals t of the others are larger than in other groups.
-    Good groups differ, too, where their samples share an error of the arm. The spread of all groups is
-    therefore estimated by the median absolute deviation. Samples of wrong groups get ZERO_WEIGHT.
-    """
+    """Reject all samples of each group that is wrong as a whole, such as an image of another pose."""
+    # Some of its samples are rejected then, and the residuals t of the others are larger than in other
+    # groups. Good groups differ, too, where their samples share an error of the arm. The spread of all groups
+    # is therefore estimated by the median absolute deviation.
     is_kept = weights > ZERO_WEIGHT
     if is_kept.all():
         return weights
@@ -242,15 +219,11 @@ class WeightChange:
 def update_weights(
     previous: Sequence[Array], weights: Sequence[Array], stage: str, last: WeightChange
 ) -> tuple[list[Array], WeightChange]:
-    """Compute the weights of the next round of IRLS from those that the residuals ask for.
-
-    Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of samples
-    with much leverage alternate again after that. From the second time on, every round makes a part of the
-    change only, and half of that part after each further time.
-
-    Where samples either count or are rejected, the residual of a sample near the limit may agree with
-    neither. A sample that is rejected for the second time stays rejected.
-    """
+    """Compute the weights of the next round of IRLS from those that the residuals ask for."""
+    # Weights whose change hardly falls alternate between two sets; their mean is used then. Weights of
+    # samples with much leverage alternate again after that: from the second time on, every round makes a part
+    # of the change only, half of it after each further time. A sample that is rejected for the second time
+    # stays rejected: the residual of a sample near the limit may agree with neither choice.
     weights = list(weights)
     if WEIGHT_FUNCTIONS[stage][0] is _uniform:
         has_returned = last.has_returned or [np.zeros(len(w), bool) for w in weights]
@@ -289,11 +262,8 @@ class SolvedProblem:
 
     @cached_property
     def prediction_covariances(self) -> list[Array]:
-        """w_i·H_i, shape (m, k, k), of the samples of each measurement: the uncertainty of the fit there.
-
-        With the whitened Jacobian J_i of sample i, without its weight w_i, and the covariance C of the
-        unknowns, H_i = J_i·C·J_iᵀ. The diagonal of w_i·H_i has the leverages of the rows of the problem.
-        """
+        """w_i·H_i, (m, k, k) of each measurement, with the leverages of the rows on the diagonal."""
+        # H_i = J_i·C·J_iᵀ with the whitened Jacobian of a sample, without its weight, and the covariance C.
         problem, solution = self.problem, self.solution
         system, model = solution.system, problem.linearize(solution.x)
         if solution.converged and not isinstance(system, NormalEquations):
@@ -355,12 +325,10 @@ def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:
 
 
 def residual_covariances(predictions: Sequence[Array], weights: Sequence[Array]) -> list[Array]:
-    """Compute the covariance of each sample's whitened residual in a fit of good samples.
-
-    With the weight w_i of sample i and H_i = J_i·C·J_iᵀ of the predictions, the covariance is
-    I + (1 - 2·w_i)·H_i. A sample of weight 1 has less than unit covariance, I - H_i, as it pulls the fit
-    towards itself. A rejected sample has more, I + H_i, as the fit is uncertain there.
-    """
+    """Compute the covariance of each sample's whitened residual in a fit of good samples."""
+    # It is I + (1 - 2·w_i)·H_i with the predictions w_i·H_i. A sample of weight 1 has less than unit
+    # covariance, as it pulls the fit towards itself. A rejected sample has more, as the fit is uncertain
+    # there.
     out = []
     for covariances, weight in zip(predictions, weights, strict=True):
         w = weight[:, None, None]

@@ -63,10 +63,7 @@ class ScaleGauge:
         return _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
 
     def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
-        """Compute growth rate and mean angular velocity in the measuring frame per unit of e errors, (e, 4).
-
-        Bodies and twists are those of `Chain.tool_jacobian`.
-        """
+        """Compute growth rate and mean angular velocity in the measuring frame per unit error, (e, 4)."""
         rates = np.zeros((len(bodies), 4))
         if self.nominal:
             frames = chain.forward_kinematics(self.q)

@@ -165,10 +165,7 @@ def _is_stationary(
 def gauss_newton(
     problem: Problem, x: Array, max_iterations: int, progress: IterationCallback | None = None
 ) -> SolverResult:
-    """Minimize by undamped steps with a pseudo-inverse: the paper's iteration, equations (37) to (39).
-
-    Rotation errors are those of equation (36), and the Jacobian is the paper's matrix as printed.
-    """
+    """Minimize by undamped steps with a pseudo-inverse: the paper's iteration, equations (36) to (39)."""
     iterates, converged, iteration = [x], False, 0
     while iteration < max_iterations and not converged:
         data = linearize_and_factor(problem, x, small_angle=True)
@@ -207,10 +204,8 @@ def _extrapolated(
     system: TriangularSystem,
     steps: tuple[Array, Array],
 ) -> tuple[Array, TriangularSystem] | None:
-    """Return a better point on the way to the limit of slow steps, with its system; None if there is none.
-
-    The last two steps led to x, the last one second; the undamped system is that before it.
-    """
+    """Return a better point on the way to the limit of slow steps, with its system; None without one."""
+    # The last two steps led to x, the last one second; the undamped system is that before it.
     last_change, change = map(undamped.residual_change, steps)
     factor = rules.extrapolation_factor(change, last_change)
     cost = _cost(problem, system, x)

@@ -103,11 +103,9 @@ def _select(condition: Any, if_true: Any, if_false: Any) -> Any:
 def step_is_negligible(
     change: _Number, residual_norm: _Number, last_change: _Number, roundoff: _Number, rtol: float = STEP_RTOL
 ) -> Any:
-    """Decide whether a step changes the whitened rows by a negligible amount.
-
-    Three cases are negligible: the change is below a fraction of the rows' norm, or below the rounding error
-    of the model, or steps shrink quadratically and the next change will be below that fraction.
-    """
+    """Decide whether a step changes the whitened rows by a negligible amount."""
+    # The change is below a fraction of the rows' norm, or below the rounding error of the model, or steps
+    # shrink quadratically and the next change will be below that fraction.
     tolerance = rtol * residual_norm
     is_quadratic = (change < MAX_QUADRATIC_RATIO * last_change) & (
         change * change < 0.1 * tolerance * last_change
@@ -116,10 +114,7 @@ def step_is_negligible(
 
 
 def cost_roundoff(residual_norm: _Number, roundoff: _Number) -> _Number:
-    """Compute the rounding error of a cost.
-
-    A predicted reduction below this value cannot be verified by comparing costs.
-    """
+    """Compute the rounding error of a cost; costs do not show whether it falls by less."""
     return (ROUNDOFF_FACTOR * roundoff) ** 2 + 2 * roundoff * residual_norm
 
 
@@ -167,12 +162,10 @@ def is_growing(change: float, next_change: float, roundoff: float) -> bool:
 
 
 def extrapolation_factor(change: Array, last_change: Array) -> float:
-    """Compute the further multiple of the last step that leads to the limit of slowly shrinking steps.
-
-    Steps δ, ρ·δ, ρ²·δ, … end after a further ρ/(1 - ρ) of the last one (Aitken). The changes of the rows (p,)
-    by the last two steps give ρ, which is negative if the steps alternate. The factor is 0 if the directions
-    of the steps differ or convergence is fast.
-    """
+    """Compute the further multiple of the last step that leads to the limit of slowly shrinking steps."""
+    # Steps δ, ρ·δ, ρ²·δ, … end after a further ρ/(1 - ρ) of the last one (Aitken). The changes of the rows
+    # (p,) by the last two steps give ρ, which is negative if the steps alternate. The factor is 0 if the
+    # directions of the steps differ or convergence is fast.
     product, square = float(change @ last_change), float(last_change @ last_change)
     same_direction = MIN_SAME_DIRECTION * float(np.sqrt(square * (change @ change)))
     ratio = product / square if square else 0.0
@@ -181,20 +174,14 @@ def extrapolation_factor(change: Array, last_change: Array) -> float:
 
 
 def undamped_steps_are_due(iteration: Any, last_undamped: Any) -> Any:
-    """Decide whether a series of undamped steps is tried after this iteration.
-
-    The first series follows iteration UNDAMPED_INTERVAL; the iteration number of each further one is twice
-    that of the last.
-    """
+    """Decide whether a series of undamped steps is tried after this iteration."""
+    # The first follows iteration UNDAMPED_INTERVAL; each further one, twice the iteration of the last.
     return (iteration >= UNDAMPED_INTERVAL) & (iteration >= 2 * last_undamped)
 
 
 def is_slow_and_short(remaining: float, last_remaining: float) -> bool:
-    """Decide whether undamped steps are short against the standard deviations, and hardly become shorter.
-
-    The arguments are the changes of the whitened rows by an undamped step, now and one iteration before. Each
-    is the largest ratio of the step to its standard deviation in any direction.
-    """
+    """Decide whether undamped steps are short against the standard deviations, and hardly shrink."""
+    # The change of the whitened rows by an undamped step is its largest ratio to a standard deviation.
     return remaining <= MAX_DEVIATION and remaining > MIN_CREEPING_RATIO * last_remaining
 
 

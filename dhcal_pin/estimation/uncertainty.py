@@ -112,9 +112,9 @@ class Predictor(Protocol):
 class FamilyGain:
     """What a family of joint errors that a model lacks would explain of the residuals."""
 
-    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`.
-    added: int  #: Number of its parameters.
-    remaining: int  #: Number of rows less the number of all parameters.
+    gain: float  #: Decrease of the cost, relative to the variance of what remains; like χ² with `added`
+    added: int  #: Number of its parameters
+    remaining: int  #: Number of rows less the number of all parameters
 
     @property
     def ratio(self) -> float:
@@ -124,17 +124,13 @@ class FamilyGain:
 
 @dataclass(frozen=True)
 class ModelFit:
-    """How well a model explains the measurements that it was fitted to.
+    """How well a model explains the measurements that it was fitted to."""
 
-    Attributes:
-        chi_square: Sum of the squared residuals in stated standard deviations of the instrument; None if they
-            are not stated.
-        freedom: Degrees of freedom of the residuals.
-        gains: Families of joint errors that the model lacks, by name, and what they would explain.
-    """
-
+    # Sum of the squared residuals in stated standard deviations of the instrument; None if they are not
+    # stated.
     chi_square: float | None
-    freedom: float
+    freedom: float  # Degrees of freedom of the residuals
+    # Families of joint errors that the model lacks, by name, and what they would explain.
     gains: Mapping[str, FamilyGain]
 
 
@@ -147,11 +143,11 @@ class Uncertainty:
     their own link frames.
     """
 
-    chain: Chain  #: Calibrated chain.
-    entries: Array  #: Indices of the uncertain coefficients in the flattened transmission, shape (e,).
-    sqrt_covariance: Array  #: Square root of the covariance, shape (6(k+1)+e, r).
-    unbounded_directions: Array  #: Directions that neither data nor priors determine, shape (6(k+1)+e, h).
-    temperature: float = 1.0  #: Factor on the variance of correlated residuals that the covariance contains.
+    chain: Chain  #: Calibrated chain
+    entries: Array  #: Indices of the uncertain coefficients in the flattened transmission, shape (e,)
+    sqrt_covariance: Array  #: Square root of the covariance, shape (6(k+1)+e, r)
+    unbounded_directions: Array  #: Directions that neither data nor priors determine, shape (6(k+1)+e, h)
+    temperature: float = 1.0  #: Factor on the variance of correlated residuals that the covariance contains
     #: Standard deviation of the errors that the model lacks, per axis, of the position [m] and of the
     #: orientation [rad] of the tool.
     model_std: tuple[float, float] = (0.0, 0.0)
@@ -171,10 +167,7 @@ class Uncertainty:
 
     @property
     def relative(self) -> Uncertainty:
-        """Uncertainty relative to the base and tool poses that fit the measured configurations best.
-
-        It is the same if the measurements determine these poses.
-        """
+        """Uncertainty relative to the base and tool poses that fit the measured configurations best."""
         if not self.has_free_frames:
             return self
         parts = np.split(self.frame_part, [self.sqrt_covariance.shape[1]], axis=1)
@@ -214,12 +207,9 @@ class Uncertainty:
         )
 
     def of_parameters(self, errors: ErrorModel, scale: Array) -> tuple[Array, Array]:
-        """Compute the covariance of further parameters of the calibrated chain.
-
-        Parameters are matched by their effect on the tool (least squares). Effects shared by several
-        parameters are distributed in proportion to `scale`; effects outside the parameters' span are
-        projected onto it.
-        """
+        """Compute the covariance of further parameters of the calibrated chain, matched by their effects."""
+        # Effects shared by several parameters are distributed in proportion to `scale`; effects outside the
+        # parameters' span are projected onto it.
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (N_MATCHING_SAMPLES, self.chain.n_joints))
         chain, bodies, twists = errors.derivative(np.zeros(len(scale)))
         effects = chain.tool_jacobian(chain.forward_kinematics(q), bodies, twists) * scale[:, None, None]
@@ -256,11 +246,9 @@ class Uncertainty:
 
     @cached_property
     def _shared_and_own(self) -> tuple[Array, Array]:
-        """Directions (6(k+1)+e, s) that move bodies, and the covariance (e, e) of the coefficients besides.
-
-        An orthogonal transformation of the columns of the square root separates the columns that all bodies
-        have in common, of which there are at most 6(k+1), from those of the coefficients alone.
-        """
+        """Directions (6(k+1)+e, s) that move bodies, and the covariance (e, e) of the coefficients alone."""
+        # An orthogonal transformation of the columns of the square root separates the columns that all bodies
+        # have in common, of which there are at most 6(k+1), from those of the coefficients alone.
         bodies, coefficients = np.split(self.sqrt_covariance, [len(self.sqrt_covariance) - len(self.entries)])
         basis, factor = np.linalg.qr(bodies.T)
         shared = coefficients @ basis

@@ -197,11 +197,8 @@ class Explainer:
     def _describe_observable(
         self, group: UnobservableGroup, names: list[str], listed: str = "", by: str = ""
     ) -> str:
-        """Describe which combinations of the members are identifiable.
-
-        The count refers to the null space of the group's cause, because other groups may share its members.
-        With `listed`, the text names the members, otherwise it refers to names that precede it.
-        """
+        """Describe which combinations of the members, `listed` or named before, are identifiable."""
+        # The count refers to the null space of the group's cause, because other groups may share its members.
         members, r = group.members, group.vectors.shape[1]
         _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
         n_lost = int(np.sum(s > NEGLIGIBLE))
@@ -218,15 +215,10 @@ class Explainer:
         if len(members) > r + 1:
             return f"only {len(members) - r} combinations of {whole} {several}{by}"
         weights = vt[-1]
-        has_mixed_units = len({self._unit(i) for i in members}) > 1
+        has_mixed_units = len({self.probe.problem.parameters[i].unit for i in members}) > 1
         if has_mixed_units or np.abs(weights).min() < _ZERO_WEIGHT:
             return f"only one combination of {whole} {one}{by}"
         return f"only {_weighted_sum(names, weights)} {one}{by}"
-
-    def _unit(self, i: int) -> str:
-        """Return the unit of an unknown."""
-        problem = self.probe.problem
-        return problem.parameters[i].unit
 
     def _robot_part(self, group: UnobservableGroup) -> tuple[list[ErrorParameter], Propagation | None]:
         """Return the geometric errors of a group, and their propagation if the group has no other members."""
@@ -495,10 +487,8 @@ def label_unobservable(sentence: str) -> str:
 
 
 def _merge_groups(groups: list[UnobservableGroup]) -> list[UnobservableGroup]:
-    """Merge groups of one cause if their union has one identifiable combination.
-
-    Groups of the causes "poses" and "unmoved" are always merged.
-    """
+    """Merge groups of one cause if their union has one identifiable combination."""
+    # Groups of the causes "poses" and "unmoved" are always merged.
     out: list[UnobservableGroup] = []
     for group in groups:
         for i, other in enumerate(out):

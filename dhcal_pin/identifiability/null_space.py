@@ -120,10 +120,7 @@ class ObservabilityProbe:
         return rng.uniform(low, high, (m, chain.n_joints))
 
     def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
-        """Return a measurement with some joints drawn anew; contacts are returned unchanged.
-
-        Joints of images are drawn near the measured ones, so that boards stay in view.
-        """
+        """Return a measurement with joints drawn anew, in images near the measured ones."""
         if item.is_contact:
             return item
         if len(joints) == self.chain.n_joints and not item.instrument_parameters:
@@ -230,11 +227,7 @@ def _sort_key(row: Array) -> tuple[int, int, int]:
 
 
 def group_directions(layers: Sequence[tuple[Cause, Array]], error_frames: Array) -> list[UnobservableGroup]:
-    """Group the unobservable directions by cause and by part of the chain.
-
-    Every direction belongs to one group. A group has sparse combinations on the shortest possible part of the
-    chain.
-    """
+    """Group the unobservable directions by cause and by part of the chain."""
     p = layers[-1][1].shape[0]
     frames = np.unique(error_frames)
     spans = sorted(

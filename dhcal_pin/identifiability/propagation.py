@@ -88,11 +88,9 @@ def propagate_along_chain(errors: PlainErrors, vectors: Array) -> Propagation | 
 
 
 def axis_angle_and_distance(chain: Chain, first: int, second: int) -> tuple[float, float]:
-    """Compute the angle and the distance of two joint axes.
-
-    The distance is that of the second joint's origin from the first axis. The joints between them are at
-    zero; for parallel and coincident axes the result does not depend on that.
-    """
+    """Compute the angle of two joint axes, and the distance of the second joint's origin from the first."""
+    # The joints between them are at zero; for parallel and coincident axes the result does not depend on
+    # that.
     transform = np.eye(4)
     for j in range(first, second):
         transform = transform @ chain.link_transforms[j]

@@ -31,7 +31,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -61,25 +60,10 @@ SAME_CONFIGURATION = 1e-10
 FAR_CORRELATION, NEAR_CORRELATION, CORRELATION_LENGTH = 0.015, 0.15, 0.5
 
 
-@dataclass(frozen=True)
-class ResidualCorrelation:
-    """Correlation of the residuals of a fit between configurations."""
-
-    z: float  # Score of the length at which it is farthest from 0, standard normal for independent residuals
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the residuals contradict independence."""
-        return abs(self.z) > MAX_WHITE_Z
-
-
 def find_residual_correlation(
     problem: Problem, x: Array, system: TriangularSystem, noise: float, weights: Sequence[Array]
-) -> ResidualCorrelation:
-    """Test whether the residuals of neighbouring configurations are correlated.
-
-    The system at x is that of the rows divided by the noise.
-    """
+) -> float:
+    """Return z of the length at which it is farthest from 0, by the rows divided by the noise."""
     linearization, chain = problem.linearize(x), problem.chain(x)
     excess, variance, is_exact = np.zeros(len(LENGTHS)), np.zeros(len(LENGTHS)), True
     quadratic = np.zeros((len(LENGTHS), 1, 1))
@@ -108,7 +92,7 @@ def find_residual_correlation(
     z = np.where(is_known, excess / np.sqrt(np.where(is_known, variance, 1.0)), 0.0)
     if not is_exact:
         z = np.maximum(z, 0.0)
-    return ResidualCorrelation(float(z[np.argmax(np.abs(z))]))
+    return float(z[np.argmax(np.abs(z))])
 
 
 class _ScoreTerms(NamedTuple):

@@ -79,7 +79,7 @@ class Wires(PointMeasurement):
             lengths: Measured lengths, (m, w), or (m,) for one wire [m].
             sigma: Standard deviations, one number or (m, w) [m]; estimated with the fit if None.
             anchors: Anchors, (w, 3) [m]; estimated with the fit if None.
-            offsets: Constants that the lengths contain, one number or (w,) [m]; estimated with the fit if None.
+            offsets: Constants that the lengths contain, one number or (w,) [m]; estimated if None.
 
         Raises:
             InvalidArgumentError: The offsets are neither one number nor one per wire.

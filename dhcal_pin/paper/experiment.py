@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .. import se3
-from .._typing import Array
 from ..calibration.evaluation import Accuracy, Comparison, accuracy, compute_errors
 from ..calibration.procedure import calibrate
 from ..calibration.result import Result
@@ -50,11 +49,6 @@ def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Ac
     rows = np.arange(len(data.q))
     errors = [compute_errors(fit(data.take(rows != row)).chain, [data.take(rows == row)])[0] for row in rows]
     return Accuracy.from_errors(errors)
-
-
-def _rms(differences: Array) -> float:
-    """Return the root mean square of the norms of vectors, shape (m, 3)."""
-    return se3.rms_length(differences)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +99,10 @@ def run_experiment() -> PaperExperiment:
         "least_squares": accuracy(fit.chain, [data])["position_rms_m"],
         "least_squares_left_out": cross_validated["position_rms_m"],
         "published_parameters": accuracy(paper_arm("experiment_published"), [data])["position_rms_m"],
-        "paper_before": _rms((measured - commanded)[is_reachable]),
-        "paper_after": _rms((after - commanded)[is_reachable]),
-        "paper_before_all": _rms(measured - commanded),
-        "paper_after_all": _rms(after - commanded),
+        "paper_before": se3.rms_length((measured - commanded)[is_reachable]),
+        "paper_after": se3.rms_length((after - commanded)[is_reachable]),
+        "paper_before_all": se3.rms_length(measured - commanded),
+        "paper_after_all": se3.rms_length(after - commanded),
     }
     mm = {key: f"{1e3 * value:.3f}" for key, value in figures.items()}
     rows = [

@@ -37,19 +37,12 @@ _KINDS = ("theta", "d", "a", "alpha")
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of one route with the paper's R.
+    """Agreement of one route with the paper's R."""
 
-    Attributes:
-        route: Name of the route.
-        columns: Number of columns of R that were compared; 0 for a comparison of poses.
-        difference: Largest absolute difference [m or rad].
-        tolerance: Largest allowed difference [m or rad].
-    """
-
-    route: str
-    columns: int
-    difference: float
-    tolerance: float
+    route: str  #: Name of the route
+    columns: int  #: Number of columns of R that were compared; 0 for a comparison of poses
+    difference: float  #: Largest absolute difference [m or rad]
+    tolerance: float  #: Largest allowed difference [m or rad]
 
     @property
     def agrees(self) -> bool:
@@ -113,11 +106,7 @@ def augmented_jacobian(table: DHTable, q: Array) -> Array:
 
 
 def regressor_jacobian(chain: Chain, errors: ErrorModel, q: Array) -> Array:
-    """Compute the Jacobian from Pinocchio's kinematic regressor.
-
-    The regressor is the derivative of the tip frame with respect to a right perturbation of each joint
-    placement. It is multiplied by the matrix K from errors to perturbations.
-    """
+    """Compute the Jacobian from Pinocchio's kinematic regressor of each joint placement, and the matrix K."""
     model, frame = chain.model, chain.frame_id
     data = model.createData()
     n_moving = len(chain.moving_joints)

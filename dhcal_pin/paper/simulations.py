@@ -130,10 +130,7 @@ def simulate(
 
 
 def _iterate(problem: Problem, steps: int, x: Array | None = None) -> Array:
-    """Return all iterates of the paper's loop, shape (steps+1, p), or fewer if it converges earlier.
-
-    If the loop diverges, the start is returned twice.
-    """
+    """Return all iterates of the paper's loop, (steps+1, p) or fewer; twice the start if it diverges."""
     x = np.zeros(len(problem.weights)) if x is None else x
     try:
         return gauss_newton(problem, x, steps, None).iterates

@@ -125,11 +125,9 @@ class EOptimality:
         return 2 * float(np.log(np.linalg.norm(self.observable @ sqrt_covariance, 2)))
 
     def gains(self, rows: Array, sqrt_covariance: Array) -> Array:
-        """Compute the decrease of a smooth substitute; see `Criterion.gains`.
-
-        The substitute is the sum of the variances of the principal axes of V·C·Vᵀ, weighted by a high power
-        of their standard deviations, so that the largest ones dominate.
-        """
+        """Compute the decrease of a smooth substitute; see `Criterion.gains`."""
+        # The sum of the variances of the principal axes of V·C·Vᵀ, weighted by a high power of their standard
+        # deviations, so that the largest ones dominate.
         directions, std, _ = np.linalg.svd(self.observable @ sqrt_covariance, full_matrices=False)
         weighted = self.observable.T @ directions * (std / std[0]) ** _E_WEIGHT_POWER
         return AOptimality(weighted).gains(rows, sqrt_covariance)
@@ -156,11 +154,10 @@ class BiasVarianceCriterion:
     target_bias: Array  # Bias G of a fit to the task itself, shape (w, f)
 
     def _fit_covariance_and_bias(self, sqrt_covariance: Array) -> tuple[Array, Array]:
-        """Compute the square root (p, p) of the covariance C_f of the fit, and the bias B (p, f).
-
-        Both follow from the joint covariance of all unknowns: C_f is the conditional covariance of the fitted
-        ones for known omitted ones, and -B is the regression matrix of the fitted on the omitted ones.
-        """
+        """Compute the square root (p, p) of the covariance C_f of the fit, and the bias B (p, f)."""
+        # Both follow from the joint covariance of all unknowns: C_f is the conditional covariance of the
+        # fitted ones for known omitted ones, and -B is the regression matrix of the fitted on the omitted
+        # ones.
         fitted, omitted = sqrt_covariance[self.fitted], sqrt_covariance[~self.fitted]
         q, r = np.linalg.qr(omitted.T)
         shared = fitted @ q

@@ -21,18 +21,13 @@ from .information import Information
 
 @dataclass(frozen=True)
 class CurvePrediction:
-    """Expected knowledge of the joint correction curves after some poses.
+    """Expected knowledge of the joint correction curves after some poses."""
 
-    Attributes:
-        n_poses: Number of planned poses.
-        filled_share: Share of the bins that candidates or existing measurements visit in which there is at
-            least one planned pose or existing measurement.
-        curve_std: Standard deviation of the curves, RMS over these bins of all joints [rad].
-    """
-
-    n_poses: int
+    n_poses: int  #: Number of planned poses
+    #: Share of the bins that candidates or existing measurements visit in which there is at least one planned
+    #: pose or existing measurement.
     filled_share: float
-    curve_std: float
+    curve_std: float  #: Standard deviation of the curves, RMS over these bins of all joints [rad]
 
 
 def predict_curves(

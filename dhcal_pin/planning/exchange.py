@@ -113,10 +113,8 @@ def select_greedily(
     selected: Array,
     existing: Array,
 ) -> Array:
-    """Add candidates to a selection, each the best one to add next; fewer if no more are feasible.
-
-    They keep their distance to the coordinates (n, d) of existing measurements.
-    """
+    """Add candidates, each the best one to add next; fewer if no more are feasible."""
+    # They keep their distance to the coordinates (n, d) of existing measurements.
     every = np.arange(candidates.rows.shape[2])
     out = list(map(int, selected))
     for _ in range(count):
@@ -140,10 +138,7 @@ def improve_by_exchange(
     existing: Array,
     max_passes: int = MAX_PASSES,
 ) -> Array:
-    """Exchange selected candidates one at a time for better ones, until a pass gains too little.
-
-    They keep their distance to the coordinates (n, d) of existing measurements.
-    """
+    """Exchange selected candidates one at a time for better ones, until a pass gains too little."""
     selected = selected.copy()
 
     every = np.arange(candidates.rows.shape[2])

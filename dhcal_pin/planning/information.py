@@ -131,11 +131,9 @@ class Information:
         return found.reshape(len(found), -1).T / np.sqrt(len(q))
 
     def relative_combinations(self, q: Array, undetermined: Array) -> tuple[Array, bool]:
-        """Compute the combinations of errors relative to base and tool poses that fit the task best.
-
-        Of these, only poses that measurements leave free count, by directions (p+s', d) that they do not
-        determine. Return, too, whether there are any.
-        """
+        """Return the errors relative to the free base and tool poses that fit the task best."""
+        # Poses are free in directions (p+s', d) that measurements do not determine. Return, too, if there are
+        # any.
         rows = self._task_rows(q)
         frames = self.instrument.frame_displacements(self._model, q)
         is_free = bool(undetermined.size and frames.size)
@@ -284,10 +282,8 @@ def _before_measuring(planned: PlannedCalibration, q: Array) -> _Before:
 
 
 def _before_images(planned: PlannedCalibration, images: PlannedImages, q: Array) -> _Before:
-    """Return what is known before images at configurations like q, shape (m, n).
-
-    Existing images are linearized at the nominal robot: a plan does not depend on their measured values.
-    """
+    """Return what is known before images at configurations like q, (m, n)."""
+    # Existing images are linearized at the nominal robot: a plan does not depend on their measured values.
     chain = planned.chain
     robot_sets, rig_sets = split_sets(
         planned.parameters if planned.parameters is not None else image_sets(chain)
@@ -309,10 +305,8 @@ def _before_images(planned: PlannedCalibration, images: PlannedImages, q: Array)
 
 
 def _information_rows(sqrt_covariance: Array, unbounded_directions: Array) -> Array:
-    """Compute rows (p, p) with the information of a covariance (p, r), given as its square root.
-
-    Unknowns, and unbounded directions (p, h), that the calibration did not estimate keep their prior.
-    """
+    """Compute rows (p, p) with the information of a covariance, given as its square root (p, r)."""
+    # Unknowns, and unbounded directions (p, h), that the calibration did not estimate keep their prior.
     n_missing = max(0, len(sqrt_covariance) - sqrt_covariance.shape[1])
     axes, std, _ = np.linalg.svd(np.pad(sqrt_covariance, ((0, 0), (0, n_missing))))
     has_covariance = std > ZERO_STD_RTOL * std[0]

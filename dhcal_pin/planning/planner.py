@@ -314,25 +314,16 @@ def _report_phases(progress: Progress | None) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Configurations from which the poses are selected.
+    """Configurations from which the poses are selected."""
 
-    Attributes:
-        chain: Nominal robot.
-        q: Joint positions, shape (m, n) [rad or m].
-        task_q: Joint positions of the task, shape (t, n) [rad or m].
-        images: Cameras and boards; a board must be in view. None for other measurements of the tool.
-        sampler: Sampler that has drawn them; None if they are given.
-        collision: Collision checks of the robot.
-        notes: What is not checked and why.
-    """
-
-    chain: Chain
-    q: Array
-    task_q: Array
+    chain: Chain  # Nominal robot
+    q: Array  # Joint positions, shape (m, n) [rad or m]
+    task_q: Array  # Joint positions of the task, shape (t, n) [rad or m]
+    # Cameras and boards; a board must be in view. None for other measurements of the tool.
     images: PlannedImages | None
-    sampler: ConfigurationSampler | None
-    collision: CollisionChecker
-    notes: tuple[str, ...]
+    sampler: ConfigurationSampler | None  # Sampler that has drawn them; None if they are given
+    collision: CollisionChecker  # Collision checks of the robot
+    notes: tuple[str, ...]  # What is not checked and why
 
 
 def _collect_pool(
@@ -437,10 +428,7 @@ def _prepare(
 def _expected_error(
     information: Information, observable: Array, task_q: Array
 ) -> tuple[TaskError, bool, float]:
-    """Return the error to expect, relative to base and tool poses that measurements leave free.
-
-    Return, too, whether there are such poses, and the part of the error that only priors limit [m].
-    """
+    """Return the expected error [m], whether base or tool are free, and the part that priors limit."""
     undetermined = null_space(observable)
     combinations, has_free_frames = information.relative_combinations(task_q, undetermined)
     hidden = float(np.linalg.norm(undetermined.T @ combinations))
@@ -552,11 +540,7 @@ def _predict(
 
 
 def _error_with_points(planned: PlannedCalibration, pool: _Pool, refined: Array) -> float | None:
-    """Predict the error of a plan if the calibration finds that corners of boards must be estimated.
-
-    It is None if the rig states for each board whether its corners are estimated, or if the calibration does
-    not judge them.
-    """
+    """Predict the error of a plan if the calibration finds that corners of boards must be estimated."""
     if planned.images is None:
         return None
     judged = judged_boards(planned.images.rig.boards)

@@ -59,11 +59,8 @@ def find_tour(
     can_turn: Array,
     rng: np.random.Generator,
 ) -> Tour:
-    """Find a short order of poses with free moves between them.
-
-    Without geometry all moves count as free. The positions of joints that `can_turn` may change by a whole
-    turn if that makes a move free.
-    """
+    """Find a short order of poses with free moves between them; without geometry, all moves are free."""
+    # The positions of joints that `can_turn` may change by a whole turn if that makes a move free.
     order, is_direct = _order_with_fewest_collisions(q, checker)
     q = q[order]
     # Parts of the tour with free moves between their poses; the longest one stays as it is.
@@ -130,11 +127,8 @@ def connected(
     can_turn: Array,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, bool]:
-    """Find a free way to a part of a tour; the moves within the part are free.
-
-    All poses of the part may turn together, so that the moves between them stay the same. The result is the
-    part, possibly turned, way points (w, dof), and whether a free way was found.
-    """
+    """Find a free way to a part of a tour; the moves within the part are free."""
+    # All poses of the part may turn together. Return it, way points (w, dof), and whether a way was found.
     variants = [part]
     for joint in np.flatnonzero(can_turn):
         for turn in (-2 * np.pi, 2 * np.pi):
@@ -183,10 +177,7 @@ class _Tree:
 def find_way(
     checker: CollisionChecker, start: Array, end: Array, low: Array, high: Array, rng: np.random.Generator
 ) -> Array:
-    """Find way points (w, dof) between two poses by two trees that grow towards each other (RRT-Connect).
-
-    There are none if no free way was found.
-    """
+    """Find way points (w, dof) between two poses by RRT-Connect, two trees that grow towards each other."""
     first, second = _Tree(checker, [start], [-1]), _Tree(checker, [end], [-1])
     # Joints without limits have a range of two turns.
     low, high = np.maximum(low, -2 * np.pi), np.minimum(high, 2 * np.pi)

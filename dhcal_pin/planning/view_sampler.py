@@ -177,10 +177,7 @@ class ViewSampler(ConfigurationSampler):
 
     @cached_property
     def _blocking(self) -> dict[tuple[int, int], dict[str, frozenset[int]]]:
-        """Shapes that move with a camera or a board and hide every view, by pair and by its name.
-
-        Points that are not on a flat board may be all around their link: such pairs are missing.
-        """
+        """Shapes that move with a camera or a flat board and hide every view, by pair and by its name."""
         rig, q = self.images.rig, 0.5 * (self.low + self.high)
         tool, out = self.chain.poses(q[None])[0], {}
         for camera, board in self.images.pairs:

@@ -142,10 +142,7 @@ class PlannedImages:
 
 
 def _default_distances(camera: Camera, board: Board) -> tuple[float, float]:
-    """Return the smallest and the largest useful distance [m].
-
-    Nearer, the board does not fit into the image; farther, its details or the board itself are too small.
-    """
+    """Return the useful distances [m] between which a board fits into the image and is not too small."""
     focal, points = float(camera.values[:2].min()), board.points
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     if board.type == "points":
@@ -236,21 +233,15 @@ def _towards(directions: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraViews:
-    """Planned images of a camera.
+    """Planned images of a camera."""
 
-    Attributes:
-        camera: Name of the camera.
-        n_images: Number of configurations in which it sees a board.
-        covered_share: Share of the 10 x 10 cells of its image in which there is at least one corner.
-        distances: Smallest and largest distance of the middle of a board [m]; NaN without images.
-        max_angle: Largest angle between the normal of a board and the line of sight [rad]; NaN for points
-            that are not on a board.
-    """
-
-    camera: str
-    n_images: int
-    covered_share: float
+    camera: str  #: Name of the camera
+    n_images: int  #: Number of configurations in which it sees a board
+    covered_share: float  #: Share of the 10 x 10 cells of its image in which there is at least one corner
+    #: Smallest and largest distance of the middle of a board [m]; NaN without images.
     distances: tuple[float, float]
+    #: Largest angle between the normal of a board and the line of sight [rad]; NaN for points that are not on
+    #: a board.
     max_angle: float
 
 

@@ -629,10 +629,8 @@ class Chain:
     def _fill_transmission_jacobian(
         self, frames: FrameBatch, entries: Array, out: Array, body: int | None
     ) -> None:
-        """Compute the tool twist per unit of transmission coefficients (e,) into an array (e, 6, m).
-
-        All coefficients of a joint share the twist of its motion, which each one scales by its own term.
-        """
+        """Compute the tool twist per unit of transmission coefficients (e,) into an array (e, 6, m)."""
+        # All coefficients of a joint share the twist of its motion, which each one scales by its own term.
         numbers, terms = self.transmission_terms(frames, entries)
         motions = self.motions(frames, numbers, body)
         for number, term, column in zip(numbers, terms, out, strict=True):
@@ -790,10 +788,7 @@ def bodies_of_frames(chain: Chain, error_frames: ArrayLike) -> Array:
 def twists_in_bodies(
     chain: Chain, error_frames: Array, twists: ArrayLike, frame_transforms: Array | None = None
 ) -> tuple[Array, Array]:
-    """Transform twists at error frames to body numbers (p,) and twists in the frames of those bodies (p, 6).
-
-    The twists may be given in frames relative to the error frames, shape (p, 4, 4).
-    """
+    """Transform twists at error frames, or relative frames (p, 4, 4), to bodies (p,) and twists there."""
     unperturbed = np.tile(np.eye(4), (chain.tool_frame_index + 1, 1, 1))
     frames = error_frame_poses(chain.body_from_urdf, chain.origins, chain.tool, unperturbed)[error_frames]
     frames = frames if frame_transforms is None else frames @ frame_transforms

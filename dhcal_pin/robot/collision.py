@@ -137,12 +137,10 @@ class CollisionChecker:
         )
 
     def has_line_of_sight(self, q: Array, eye: Array, point: Array) -> bool:
-        """Return whether robot and obstacles leave the line between two points free.
-
-        The points are in the frame of the first link of the chain. The links behind the last moving joint are
-        ignored, because the measured point is on them. The floor is ignored, because it may end before the
-        instrument.
-        """
+        """Return whether robot and obstacles leave the line between two points free."""
+        # The points are in the frame of the first link. The links behind the last moving joint are ignored,
+        # because the measured point is on them, and so is the floor, because it may end before the
+        # instrument.
         return self.shapes_on_line(q, eye, point) <= self.shapes_on_end(True)
 
     def shapes_on_end(self, is_tip: bool) -> frozenset[int]:
@@ -167,11 +165,8 @@ class CollisionChecker:
         return self._touched(q, line, se3.transform(rotation, (start + end) / 2))
 
     def is_view_free(self, q: Array, eye: Array, points: Array, ignored: frozenset[int]) -> bool:
-        """Return whether nothing but ignored shapes blocks the view from a point to others.
-
-        The points are in the frame of the first link of the chain. The view is the convex hull of all points.
-        The floor is ignored, because a board may lie on it.
-        """
+        """Return whether nothing but ignored shapes blocks the view from a point to the hull of others."""
+        # The floor is ignored, because a board may lie on it.
         if self.geometry is None:
             return True
         hull = _convex_hull(np.concatenate([eye[None], points]))
@@ -214,10 +209,7 @@ def _convex_hull(points: Array) -> Any:
 
 
 def obstacles_from_urdf(urdf: Urdf) -> list[Obstacle]:
-    """Read the collision shapes of a scene that stands still.
-
-    The root link of the scene is that of the robot. The joints of the scene are at their neutral positions.
-    """
+    """Read the collision shapes of a scene, whose root is that of the robot, at neutral joint positions."""
     model = build_model(urdf)
     geometry, problem = _load_geometry(urdf, model)
     if geometry is None:

@@ -32,28 +32,19 @@ MIN_MOTION = 1e-4
 
 @dataclass(frozen=True)
 class Condition:
-    """Condition of a sample that a measurement file can state.
+    """Condition of a sample that a measurement file can state."""
 
-    Attributes:
-        name: Name of the column and of the attribute of `Conditions`.
-        quantity: "time" [s], "temperature" [°C], "mass" [kg] or "direction" (-1, 0 or 1).
-        description: What it is, for messages.
-        low: Lowest value, in the unit of the quantity.
-        high: Highest value.
-        is_per_joint: Whether each joint has a column `NAME_JOINT`.
-        draw: Function that draws the values of simulated samples from a random generator, the shape (m, n) of
-            their joint positions and the reference temperature [°C]; None if no joint error depends on it.
-        resolution: Samples of one configuration are repetitions if they are equal in multiples of this step,
-            in the unit of the quantity; 0 for a condition that no model depends on.
-    """
-
-    name: str
-    quantity: str
-    description: str
-    low: float
-    high: float
-    is_per_joint: bool = False
+    name: str  #: Name of the column and of the attribute of `Conditions`
+    quantity: str  #: "time" [s], "temperature" [°C], "mass" [kg] or "direction" (-1, 0 or 1)
+    description: str  #: What it is, for messages
+    low: float  #: Lowest value, in the unit of the quantity
+    high: float  #: Highest value
+    is_per_joint: bool = False  #: Whether each joint has a column `NAME_JOINT`
+    #: Function that draws the values of simulated samples from a random generator, the shape (m, n) of their
+    #: joint positions and the reference temperature [°C]; None if no joint error depends on it.
     draw: Callable[[np.random.Generator, tuple[int, ...], float], Array] | None = None
+    #: Samples of one configuration are repetitions if they are equal in multiples of this step, in the unit
+    #: of the quantity; 0 for a condition that no model depends on.
     resolution: float = 0.0
 
     @property
@@ -74,16 +65,6 @@ class Condition:
         return None
 
 
-def _draw_directions(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
-    """Draw directions of the joints."""
-    return rng.choice([-1.0, 1.0], shape)
-
-
-def _draw_temperatures(rng: np.random.Generator, shape: tuple[int, ...], reference: float) -> Array:
-    """Draw temperatures around the reference temperature."""
-    return reference + rng.uniform(-MAX_RISE, MAX_RISE, shape[0])
-
-
 CONDITIONS = {
     condition.name: condition
     for condition in (
@@ -95,7 +76,7 @@ CONDITIONS = {
             -1,
             1,
             is_per_joint=True,
-            draw=_draw_directions,
+            draw=lambda rng, shape, reference: rng.choice([-1.0, 1.0], shape),
             resolution=1,
         ),
         Condition(
@@ -103,7 +84,7 @@ CONDITIONS = {
             "temperature",
             "temperature of the robot",
             *TEMPERATURE_RANGE,
-            draw=_draw_temperatures,
+            draw=lambda rng, shape, reference: reference + rng.uniform(-MAX_RISE, MAX_RISE, shape[0]),
             resolution=1,
         ),
         Condition("payload", "mass", "mass at the tip", 0, MAX_PAYLOAD, resolution=0.01),
@@ -113,33 +94,23 @@ CONDITIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Conditions:
-    """Conditions of m samples; None for a condition that is not known.
+    """Conditions of m samples; None for a condition that is not known."""
 
-    Attributes:
-        q: Commanded positions of the independent joints, shape (m, n) [rad or m].
-        order: Number of each sample in the order of measurement, shape (m,).
-        time: Time of each sample, shape (m,) [s].
-        approach: Direction of the last motion of each joint, -1, 0 or 1, shape (m, n); 0 if it is not known.
-        temperature: Temperature of the robot, shape (m,) [°C].
-        payload: Mass at the tip, shape (m,) [kg].
-        base_motion: Motion C of the base in the measuring frame: its pose is C·B with the pose B of the
-            chain, shape (m, 4, 4) [m].
-        tool_motion: Motion D of the tool in its own frame: its pose is T·D with the pose T of the chain,
-            shape (m, 4, 4) [m].
-        zeros: Differences of the joint positions from q, shape (m, n) [rad or m].
-        growth: Relative growth of each link, shape (m, k+1).
-    """
-
-    q: Array
-    order: Array | None = None
-    time: Array | None = None
+    q: Array  #: Commanded positions of the independent joints, shape (m, n) [rad or m]
+    order: Array | None = None  #: Number of each sample in the order of measurement, shape (m,)
+    time: Array | None = None  #: Time of each sample, shape (m,) [s]
+    #: Direction of the last motion of each joint, -1, 0 or 1, shape (m, n); 0 if it is not known.
     approach: Array | None = None
-    temperature: Array | None = None
-    payload: Array | None = None
+    temperature: Array | None = None  #: Temperature of the robot, shape (m,) [°C]
+    payload: Array | None = None  #: Mass at the tip, shape (m,) [kg]
+    #: Motion C of the base in the measuring frame: its pose is C·B with the pose B of the chain, shape (m, 4,
+    #: 4) [m].
     base_motion: Array | None = None
+    #: Motion D of the tool in its own frame: its pose is T·D with the pose T of the chain, shape (m, 4, 4)
+    #: [m].
     tool_motion: Array | None = None
-    zeros: Array | None = None
-    growth: Array | None = None
+    zeros: Array | None = None  #: Differences of the joint positions from q, shape (m, n) [rad or m]
+    growth: Array | None = None  #: Relative growth of each link, shape (m, k+1)
 
     def __getitem__(self, index: Array | slice) -> Conditions:
         """Return the samples of an index, mask or slice."""
@@ -213,10 +184,7 @@ def concatenate_conditions(parts: Sequence[Conditions | None]) -> Conditions | N
 
 
 def directions_in_order(q: Array) -> Array:
-    """Return the direction of the last motion of each joint for samples in the order of measurement, (m, n).
-
-    A joint that does not move keeps its direction. The direction before the first motion is not known: 0.
-    """
+    """Return the direction of the last motion of each joint (m, n), samples in order; 0 before the first."""
     steps = np.diff(q, axis=0, prepend=q[:1])
     directions = np.where(np.abs(steps) < MIN_MOTION, 0.0, np.sign(steps))
     rows = np.arange(len(q))[:, None]

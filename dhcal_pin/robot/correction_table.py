@@ -40,11 +40,7 @@ class JointCorrection:
 
 
 def joint_corrections(chain: Chain) -> list[JointCorrection]:
-    """Compute the corrections of all revolute joints with harmonics.
-
-    The values are the multiples of 1° within the joint limits, and the limits themselves. A joint without
-    limits has the values from -180° to 180°.
-    """
+    """Compute the corrections of revolute joints with harmonics, at multiples of 1° and at the limits."""
     if chain.transmission is None:
         return []
     lower, upper = _value_range(chain)

@@ -29,10 +29,7 @@ CONVENTIONS = ("standard", "modified")
 
 
 def axis_rotation(axis: int, angle: Array) -> Array:
-    """Compute rotations about a coordinate axis.
-
-    Quarter turns are exact: the cosine of 90° is 0, not 6e-17.
-    """
+    """Compute rotations about a coordinate axis; those by quarter turns are exact."""
     c, s = np.cos(angle), np.sin(angle)
     c, s = np.where(np.abs(c) < 1e-16, 0.0, c), np.where(np.abs(s) < 1e-16, 0.0, s)
     i, j = (axis + 1) % 3, (axis + 2) % 3

@@ -184,13 +184,11 @@ def extract_dh(
 
 
 def normalize_offsets(table: DHTable) -> DHTable:
-    """Remove large offsets that only cancel each other; most tables are returned unchanged.
-
-    Plain rows of axes that are parallel up to a milliradian have their common normals far outside the robot.
-    Each joint frame is moved along its own axis, back to where the axis passes the frame before; this changes
-    no pose. The result is used if it shortens the whole chain by a third or more; its rows then have β.
-    Exactly parallel axes stay as they are.
-    """
+    """Remove large offsets that only cancel each other; most tables are returned unchanged."""
+    # Plain rows of axes that are parallel up to a milliradian have their common normals far outside the
+    # robot. Each joint frame is moved along its own axis, back to where the axis passes the frame before;
+    # this changes no pose. The result is used if it shortens the whole chain by a third or more; its rows
+    # then have β.
     origins = table.origins()
     moved = origins.copy()
     shift = 0.0
@@ -211,11 +209,9 @@ def normalize_offsets(table: DHTable) -> DHTable:
 def _base_transform(
     origin: Array, arm_length: float, max_tilt: float, standard: bool
 ) -> tuple[Array, _OriginParameters]:
-    """Split the origin of joint 1 between base and row 1.
-
-    The base can contain any motion, so it takes everything except the offset along an upright axis 1. Only an
-    origin that already is a modified row goes to the table.
-    """
+    """Split the origin of joint 1 between base and row 1."""
+    # The base can contain any motion, so it takes everything except the offset along an upright axis 1. Only
+    # an origin that already is a modified row goes to the table.
     row = _split_origin(origin, 0.0, arm_length, max_tilt, offset_first=False)
     if not standard and row.t1 == 0 and row.d1 == 0:
         return np.eye(4), row
@@ -226,11 +222,8 @@ def _base_transform(
 def _split_origin(
     origin: Array, previous_t2: float, arm_length: float, max_tilt: float, offset_first: bool
 ) -> _OriginParameters:
-    """Split an origin, shape (4, 4), into its seven parameters.
-
-    `previous_t2` is the rotation that the joint before the origin already has. For a row with β, the free
-    offset goes to d1 if `offset_first`, else to d2.
-    """
+    """Split an origin (4, 4) into its seven parameters, behind a joint with the rotation `previous_t2`."""
+    # For a row with β, the free offset goes to d1 if `offset_first`, else to d2.
     tilt = _tilt(origin)
     t1, d2 = _common_normal(origin) if tilt > QUARTER_TURN_TOL else (0.0, 0.0)
     offset = max(abs(origin[2, 3] - d2 * origin[2, 2]), abs(d2))
@@ -267,10 +260,7 @@ def _common_normal(origin: Array) -> tuple[float, float]:
 
 
 def _row_through_origin(origin: Array, arm_length: float, offset_first: bool) -> tuple[float, float]:
-    """Return t1 and d2 of a row with β that passes through one of the two origins.
-
-    With `offset_first` it is the next origin, and d2 is 0. Otherwise it is the first one, and d1 is 0.
-    """
+    """Return t1 and d2 of a row with β through the next origin (`offset_first`: d2 = 0) or the first one."""
     rotation, p = origin[:3, :3], origin[:3, 3]
     d2 = 0.0 if offset_first else float(p[2] / rotation[2, 2])
     x, y, _ = p - d2 * rotation[:, 2]

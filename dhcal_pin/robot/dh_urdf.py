@@ -170,11 +170,9 @@ def _inertial() -> list[str]:
 
 
 def _skeletons(table: DHTable) -> list[_Skeleton]:
-    """Compute line segments that lead from frame to frame along d and a.
-
-    In the standard convention, row i belongs to link i, d before a. In the modified convention, row i belongs
-    to link i-1, a before d.
-    """
+    """Compute line segments that lead from frame to frame along d and a."""
+    # In the standard convention, row i belongs to link i, d before a. In the modified convention, row i
+    # belongs to link i-1, a before d.
     row = table.rows(np.zeros((1, table.n_joints)))[0]
     start, zero = table.base[:3, 3], np.zeros(3)
     skeletons = []

@@ -73,112 +73,74 @@ class JointNames(Protocol):
 
 
 class CoefficientParts(NamedTuple):
-    """Vector of coefficients, or of their indices, in its parts.
+    """Vector of coefficients, or of their indices, in its parts."""
 
-    Attributes:
-        linear: Gains on the diagonal and couplings beside it, shape (n, n).
-        harmonics: Sine before cosine of each order, shape (K, 2, n).
-        joint_terms: One row per family of `JOINT_TERMS`, shape (f, n).
-        link_terms: One row per family of `LINK_TERMS`, shape (g, k+1).
-    """
-
-    linear: Array
-    harmonics: Array
-    joint_terms: Array
-    link_terms: Array
+    linear: Array  # Gains on the diagonal and couplings beside it, shape (n, n)
+    harmonics: Array  # Sine before cosine of each order, shape (K, 2, n)
+    joint_terms: Array  # One row per family of `JOINT_TERMS`, shape (f, n)
+    link_terms: Array  # One row per family of `LINK_TERMS`, shape (g, k+1)
 
 
 class Coefficient(NamedTuple):
-    """Coefficient of a family.
+    """Coefficient of a family."""
 
-    Attributes:
-        entry: Index in the vector of coefficients.
-        owner: Number of the joint that it moves, or of the link that it makes longer.
-        name: Name, after that of the joint or link.
-        unit: Unit.
-        formula: Its term as a formula; see `Term`.
-    """
-
-    entry: int
-    owner: int
-    name: str
-    unit: str
-    formula: str
+    entry: int  # Index in the vector of coefficients
+    owner: int  # Number of the joint that it moves, or of the link that it makes longer
+    name: str  # Name, after that of the joint or link
+    unit: str  # Unit
+    formula: str  # Its term as a formula; see `Term`
 
 
 @dataclass(frozen=True)
 class Term:
-    """Function of the conditions of a sample, and the coefficient that scales it.
+    """Function of the conditions of a sample, and the coefficient that scales it."""
 
-    Attributes:
-        coefficient: Name of the coefficient, after the name of its joint or link.
-        unit: Unit of the coefficient.
-        formula: The function of joint `{i}`, or that of all links, as an expression that means the same in
-            JavaScript, C and Python. It may use `sin`, `cos`, the positions `q` of all joints, their gravity
-            torques `torque`, the directions `approach`, `temperature` and `reference_temperature`. On the 3-D
-            page joints have no direction, and the links do not grow.
-        evaluate: Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link
-            term, whose value is the same for all links.
-        has_effect: Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
-        derivative: Derivative of the formula by the position of joint `{j}`; it may also use the derivatives
-            `torque_by_q` of the torques. It is "0" for a term that does not depend on q, as all link terms.
-    """
-
-    coefficient: str
-    unit: str
+    coefficient: str  # Name of the coefficient, after the name of its joint or link
+    unit: str  # Unit of the coefficient
+    # The function of joint `{i}`, or that of all links, as an expression that means the same in JavaScript, C
+    # and Python. It may use `sin`, `cos`, the positions `q` of all joints, their gravity torques `torque`,
+    # the directions `approach`, `temperature` and `reference_temperature`. On the 3-D page joints have no
+    # direction, and the links do not grow.
     formula: str
+    # Function of the conditions of m samples, shape (n, m) of a joint term and (m,) of a link term, whose
+    # value is the same for all links.
     evaluate: Callable[[Conditions, ArmProperties], Array]
+    # Joints, shape (n,), or links, shape (k+1,), on which the term has an effect.
     has_effect: Callable[[ArmProperties], Array]
+    # Derivative of the formula by the position of joint `{j}`; it may also use the derivatives `torque_by_q`
+    # of the torques. It is "0" for a term that does not depend on q, as all link terms.
     derivative: str = "0"
 
 
 @dataclass(frozen=True)
 class SelectionRule:
-    """When a calibration adds a family of joint errors by itself.
+    """When a calibration adds a family of joint errors by itself."""
 
-    Attributes:
-        stage: Families of the same stage are tried together, one stage after the other.
-        min_improvement: Smallest relative improvement of the cross-validated squared error.
-        is_universal: Whether every arm has such errors: where others are added, the family is added as well
-            and shrunk by its priors.
-    """
-
-    stage: int
-    min_improvement: float
+    stage: int  # Families of the same stage are tried together, one stage after the other
+    min_improvement: float  # Smallest relative improvement of the cross-validated squared error
+    # Whether every arm has such errors: where others are added, the family is added as well and shrunk by its
+    # priors.
     is_universal: bool = False
 
 
 @dataclass(frozen=True)
 class ErrorFamily:
-    """Family of joint errors that users select by one name.
+    """Family of joint errors that users select by one name."""
 
-    Attributes:
-        name: Name of the parameter set.
-        description: Physical cause, such as "gear ratio errors", for help and reports.
-        requirement: What a robot must have for the family to have parameters, for error messages.
-        rule: When the family is added; there is no family without a rule.
-        prior: Standard deviation of its coefficients expected before any measurement, in their unit.
-        sidecar_key: Key of its coefficients in sidecar files.
-        linear: Function that lists its linear coefficients from their indices; None for other families.
-        orders: Orders of its harmonics; empty for other families.
-        joint_term: Term of each joint; None for other families.
-        link_term: Term of the links; None for other families.
-        condition: Condition that must be known of the samples, one of `CONDITIONS`; empty for q alone.
-        low_cost_prior: Prior of a low-cost arm; None if it is the same.
-    """
-
-    name: str
-    description: str
-    requirement: str
-    rule: SelectionRule
-    prior: float
-    sidecar_key: str
+    name: str  #: Name of the parameter set
+    description: str  #: Physical cause, such as "gear ratio errors", for help and reports
+    requirement: str  #: What a robot must have for the family to have parameters, for error messages
+    rule: SelectionRule  #: When the family is added; there is no family without a rule
+    prior: float  #: Standard deviation of its coefficients expected before any measurement, in their unit
+    sidecar_key: str  #: Key of its coefficients in sidecar files
+    #: Function that lists its linear coefficients from their indices; None for other families.
     linear: Callable[[JointNames, Array], Iterator[Coefficient]] | None = None
-    orders: range = range(0)
-    joint_term: Term | None = None
-    link_term: Term | None = None
+    orders: range = range(0)  #: Orders of its harmonics; empty for other families
+    joint_term: Term | None = None  #: Term of each joint; None for other families
+    link_term: Term | None = None  #: Term of the links; None for other families
+    #: Condition that must be known of the samples, one of `CONDITIONS`; empty for q alone.
     condition: str = ""
-    low_cost_prior: float | None = None
+    low_cost_prior: float | None = None  #: Prior of a low-cost arm; None if it is the same
 
     @property
     def is_curve(self) -> bool:
@@ -255,9 +217,9 @@ def _temperature_rise(conditions: Conditions, arm: ArmProperties) -> Array:
     return conditions.temperature - arm.reference_temperature
 
 
-def _has_length(arm: ArmProperties) -> Array:
-    """Return whether each link has a length that can grow."""
-    return np.linalg.norm(arm.link_vectors, axis=1) > MIN_LINK_LENGTH
+def growing_links(link_vectors: Array) -> Array:
+    """Return which links (k+1, 3) have a length that can grow, (k+1,)."""
+    return np.linalg.norm(link_vectors, axis=1) > MIN_LINK_LENGTH
 
 
 GAIN, COMPLIANCE, COUPLING = "gain", "compliance", "coupling"
@@ -349,7 +311,11 @@ FAMILIES = {
             2e-5,
             "per_kelvin",
             link_term=Term(
-                "thermal", "1/K", "temperature - reference_temperature", _temperature_rise, _has_length
+                "thermal",
+                "1/K",
+                "temperature - reference_temperature",
+                _temperature_rise,
+                lambda arm: growing_links(arm.link_vectors),
             ),
             condition="temperature",
         ),

@@ -66,11 +66,8 @@ def tool_pose_and_jacobian(chain: Chain, q: Array) -> tuple[Array, Array]:
 
 
 def characteristic_length(chain: Chain) -> float:
-    """Return a length typical of the arm, by which rotations are compared with translations.
-
-    It is a third of the total length of links and prismatic strokes (at most 1 m each): a rotation of a joint
-    by one radian moves the tool by about that distance.
-    """
+    """Return a length by which a rotation of a joint by one radian typically moves the tool."""
+    # It is a third of the total length of links and prismatic strokes (at most 1 m each).
     links = np.concatenate([chain.origins[1:-1], (chain.origins[-1] @ chain.tool)[None]])
     strokes = np.minimum(chain.upper - chain.lower, 1.0)[chain.is_prismatic]
     return max(float(np.linalg.norm(links[:, :3, 3], axis=1).sum() + strokes.sum()) / 3, _MIN_LENGTH)
@@ -94,12 +91,9 @@ def solve_ik(
     samples: Array | None = None,
     min_damping: float = _MIN_DAMPING,
 ) -> tuple[Array, Array]:
-    """Minimize task errors within the joint limits, starting from joint positions (m, n).
-
-    `samples` are the numbers by which `task_error` identifies the rows of `start`, by default 0 to m-1.
-    `min_damping` is the damping λ_min near singularities [m²]. Norms of the task errors [m] are returned,
-    too.
-    """
+    """Minimize task errors within the joint limits from joint positions (m, n); return norms [m], too."""
+    # `samples` are the numbers by which `task_error` identifies the rows of `start`, by default 0 to m-1.
+    # `min_damping` is the damping λ_min near singularities [m²].
     samples = np.arange(len(start)) if samples is None else samples
     q = np.clip(chain.validated_q(start), chain.lower, chain.upper)
     errors, jacobians = _errors_and_jacobians(chain, task_error, q, samples)
@@ -185,10 +179,7 @@ def pose_task(targets: Array, length: float) -> TaskError:
 
 
 def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple[Array, Array]:
-    """Remove whole turns from joint positions to get them within the limits; return whether they are.
-
-    Revolute joints come within half a turn of `near`, if their limits allow it.
-    """
+    """Remove whole turns to get joint positions, near others, within the limits; return whether they are."""
     # A whole turn of an independent joint must be whole turns of its mimics.
     is_periodic = ~chain.is_prismatic & np.all(chain.mimic_matrix % 1 == 0, 0)
     wrapped = near + (q - near + np.pi) % (2 * np.pi) - np.pi
@@ -200,11 +191,7 @@ def wrap_into_limits(chain: Chain, q: Array, near: Array | float = 0.0) -> tuple
 def reach_within_limits(
     chain: Chain, task_error: TaskError, start: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Find joint positions that bring every task error as near to zero as the arm can, from several starts.
-
-    Further starts of samples that are not solved within the limits are random. Norms of the task errors [m]
-    are returned, too.
-    """
+    """Find joint positions with task errors as small as the arm allows, from several starts."""
     unlimited = without_rotary_limits(chain)
     out, least, within_limits = start.copy(), np.full(len(start), np.inf), np.zeros(len(start), bool)
     starts, remaining = start, np.arange(len(start))

@@ -84,10 +84,8 @@ class WorkspaceConstraints:
 
 
 def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
-    """Return the range of joint positions within the limits and within half a turn or half a metre each way.
-
-    The margins to the limits are an angle [rad] for revolute and a length [m] for prismatic joints.
-    """
+    """Return the range of joint positions within the limits and half a turn or half a metre."""
+    # The margins to the limits are an angle [rad] for revolute and a length [m] for prismatic joints.
     low, high = limits_with_margin(chain, angle, length)
     span = np.where(_is_prismatic(chain), _MAX_STROKE, _MAX_ANGLE)
     return (
@@ -200,11 +198,8 @@ def scale_joint_units(chain: Chain, q: Array) -> Array:
 
 
 def shortest_tour(q: Array, detours: Array | None = None) -> Array:
-    """Find an order (m,) of configurations (m, n) with little motion between successive ones, by 2-opt.
-
-    The search starts from the nearest-neighbour tour; the result is a local minimum. The units must be
-    comparable. `detours` (m, m) are added to the distances.
-    """
+    """Find an order (m,) of configurations (m, n) with short moves, plus detours (m, m), by 2-opt."""
+    # It starts from the nearest-neighbour tour. The units must be comparable.
     count = len(q)
     distances = np.zeros((count + 1, count + 1))
     # An additional point at distance 0 from all others turns the closed tour of 2-opt into an open one.

@@ -58,29 +58,19 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class GravityLoads:
-    """What joint errors need of a chain: gravity torques on its joints, and its link vectors.
+    """What joint errors need of a chain: gravity torques on its joints, and its link vectors."""
 
-    Attributes:
-        model: Pinocchio model of the whole robot.
-        moving_joints: Names of the k moving joints of the chain.
-        mimic_matrix: Matrix (k, n) from independent to moving joint positions.
-        mimic_offset: Constant part of the moving joint positions, shape (k,) [rad or m].
-        link_vectors: Vector from each joint to the next one, in the axes of the next one before its motion,
-            shape (k+1, 3) [m]. The first one begins at the base link. The last one ends at the tip and is in
-            the axes of the last joint.
-        reference_temperature: Temperature at which the links have the lengths of the model [°C].
-        tip: Name of the link that carries the payload.
-        payload: Payload that the model contains; None without.
-    """
-
-    model: pin.Model
-    moving_joints: tuple[str, ...]
-    mimic_matrix: Array
-    mimic_offset: Array
+    model: pin.Model  #: Pinocchio model of the whole robot
+    moving_joints: tuple[str, ...]  #: Names of the k moving joints of the chain
+    mimic_matrix: Array  #: Matrix (k, n) from independent to moving joint positions
+    mimic_offset: Array  #: Constant part of the moving joint positions, shape (k,) [rad or m]
+    #: Vector from each joint to the next one, in the axes of the next one before its motion, shape (k+1, 3)
+    #: [m]. The first one begins at the base link. The last one ends at the tip and is in the axes of the last
+    #: joint.
     link_vectors: Array
-    reference_temperature: float
-    tip: str
-    payload: Payload | None
+    reference_temperature: float  #: Temperature at which the links have the lengths of the model [°C]
+    tip: str  #: Name of the link that carries the payload
+    payload: Payload | None  #: Payload that the model contains; None without
     _cache: dict[bytes, Array] = field(default_factory=dict, repr=False)
 
     @property
@@ -112,10 +102,8 @@ class GravityLoads:
         return out
 
     def torques(self, q: Array, payload: Array | None = None) -> Array:
-        """Compute the generalised gravity torques; the z axis of the root link points up.
-
-        A payload (m,) [kg] replaces the mass of the payload in the model.
-        """
+        """Compute the generalised gravity torques; the z axis of the root link points up."""
+        # A payload (m,) [kg] replaces the mass of the payload in the model.
         torques = self._torques(self.model, b"", q)
         if payload is None:
             return torques
@@ -139,17 +127,12 @@ class GravityLoads:
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Transmission errors of a chain's independent joints.
+    """Transmission errors of a chain's independent joints."""
 
-    Attributes:
-        coefficients: All coefficients of the formula in the module docstring, shape (c,).
-        loads: Gravity torques on the joints.
-        min_order: Order up to which the harmonics are evaluated even if their coefficients are zero, so that
-            the derivatives by them are available.
-    """
-
-    coefficients: Array
-    loads: GravityLoads
+    coefficients: Array  #: All coefficients of the formula in the module docstring, shape (c,)
+    loads: GravityLoads  #: Gravity torques on the joints
+    #: Order up to which the harmonics are evaluated even if their coefficients are zero, so that the
+    #: derivatives by them are available.
     min_order: int = 0
 
     @classmethod
@@ -204,10 +187,8 @@ class Transmission:
         return int(np.flatnonzero(self.joint_terms.any(1)).max(initial=-1)) + 1
 
     def terms(self, conditions: Conditions) -> Array:
-        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms.
-
-        They do not depend on the coefficients. Each thread keeps those that it evaluated last.
-        """
+        """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms."""
+        # They do not depend on the coefficients. Each thread keeps those that it evaluated last.
         last = vars(_last_terms)
         is_same = last and last["loads"] is self.loads and last["order"] == self.order
         if not is_same or not last["conditions"].equals(conditions):
@@ -246,10 +227,8 @@ class Transmission:
         return np.tensordot(self.link_terms, terms[-len(LINK_TERMS) :, 0], (0, 0))
 
     def locate(self, entries: Array) -> tuple[Array, Array, Array]:
-        """Find the motion, the term and its joint of each of some coefficients, shape (e,) each.
-
-        Motions 0 to n-1 are those of the joints; those of the growth of links follow.
-        """
+        """Find the motion of each of some coefficients (e,), its term and the joint of the term."""
+        # Motions 0 to n-1 are those of the joints; those of the growth of links follow.
         n, n_links = len(self.linear), self.link_terms.shape[1]
         first_link_term = len(self.coefficients) - self.link_terms.size
         rows, sources = np.divmod(entries, n)
@@ -269,11 +248,9 @@ class Transmission:
         return self if order <= self.order else replace(self, min_order=order)
 
     def with_zeros_moved(self, summands: Array) -> Transmission:
-        """Return the same errors as functions of joint positions q' = q + d, but for the constant -A·d.
-
-        S·sin(k·q) + C·cos(k·q) becomes a sum of sine and cosine of k·q' with S' = S·cos(k·d) + C·sin(k·d) and
-        C' = C·cos(k·d) - S·sin(k·d). The summands d have shape (n,).
-        """
+        """Return the same errors as functions of joint positions q' = q + d, but for the constant -A·d."""
+        # S·sin(k·q) + C·cos(k·q) becomes a sum of sine and cosine of k·q' with S' = S·cos(k·d) + C·sin(k·d)
+        # and C' = C·cos(k·d) - S·sin(k·d).
         moved = replace(self, coefficients=self.coefficients.copy())
         (sine, cosine), n_orders = self.harmonics.swapaxes(0, 1), len(self.harmonics)
         phase = np.arange(1, n_orders + 1)[:, None] * summands
@@ -314,14 +291,9 @@ def harmonic_orders(entries: Array, n: int) -> Array:
 
 
 def fill_harmonics(q: Array, out: Array) -> None:
-    """Compute sines and cosines of the multiples of joint positions.
-
-    The orders 1 and 2 are evaluated directly, the others by adding twice the angle:
-
-        sin (k+2)q = sin kq·cos 2q + cos kq·sin 2q,    cos (k+2)q = cos kq·cos 2q - sin kq·sin 2q.
-
-    The rounding errors grow in proportion to k.
-    """
+    """Compute sines and cosines of the multiples of joint positions."""
+    # The orders above 2 follow from sin (k+2)q = sin kq·cos 2q + cos kq·sin 2q, and the same for the cosine.
+    # The rounding errors grow in proportion to k.
     for k, harmonic in enumerate(out[:2], 1):
         np.sin(k * q, out=harmonic[0])
         np.cos(k * q, out=harmonic[1])

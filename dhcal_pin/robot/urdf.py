@@ -174,10 +174,7 @@ def parse_urdf(data: bytes, source: str) -> Urdf:
 
 
 def scan_tags(data: bytes, source: str) -> tuple[UrdfTag, dict[str, UrdfTag], dict[str, UrdfTag]]:
-    """Find the tags of the robot, its links and its joints.
-
-    Errors of the XML and of names are raised as `FileFormatError` with the line.
-    """
+    """Find the tags of the robot, its links and its joints; a `FileFormatError` names the line."""
     robot: UrdfTag | None = None
     # Link or joint and which of both it is, and in a link its inertial, whose children are collected.
     parent: UrdfTag | None = None
@@ -246,10 +243,7 @@ def suggest_names(name: str, known: Iterable[str]) -> str:
 
 
 def xml_attribute(text: str) -> str:
-    """Write the value of an XML attribute, with quotes.
-
-    `xml.sax.saxutils.quoteattr` does the same but imports an HTTP client.
-    """
+    """Write an XML attribute with quotes, as `xml.sax.saxutils.quoteattr`, which imports an HTTP client."""
     return f'"{html.escape(text)}"'
 
 

@@ -21,7 +21,14 @@ import numpy as np
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..se3 import nearest_rotation, nearest_rpy, to_xyz_rpy
-from .formats.xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
+from .formats.xml_tags import (
+    Edit,
+    attribute_edit,
+    attribute_spans,
+    attribute_text,
+    edited,
+    number_text,
+)
 from .urdf import MAX_ORIGIN, Urdf, UrdfJoint, parse_urdf, scan_tags, xml_attribute
 
 # Maximum deviation of RᵀR from the identity, and of the last row of a pose from (0, 0, 0, 1).
@@ -35,10 +42,7 @@ _INDENT = re.compile(rb"(?:\r\n|\n|\r)[ \t]*\Z")
 
 
 def changed_origins(urdf: Urdf, origins: Mapping[str, Array]) -> Iterator[tuple[UrdfJoint, Array]]:
-    """List the joints whose new origins, which must be rigid, differ from those of the file.
-
-    An unknown joint raises an `UnknownNameError`.
-    """
+    """List the joints whose new origins, which must be rigid, differ from those of the file."""
     for name, value in origins.items():
         joint, origin = urdf.joint(name), np.asarray(value, float)
         where = f"{urdf.source}:{joint.line}: joint {name!r}: the new origin"
@@ -61,10 +65,7 @@ def changed_origins(urdf: Urdf, origins: Mapping[str, Array]) -> Iterator[tuple[
 
 
 def with_origins(urdf: Urdf, origins: Mapping[str, Array]) -> bytes:
-    """Return the bytes of a URDF with new joint origins.
-
-    Translation and rotation are each rewritten only if they differ from those of the file.
-    """
+    """Return the bytes of a URDF with new joint origins; only what differs is written again."""
     changed = changed_origins(urdf, origins)
     return edited(
         urdf.data, [edit for joint, origin in changed for edit in _origin_edits(urdf, joint, origin)]
@@ -80,11 +81,7 @@ def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
         axis = number_text(-urdf.joint(name).axis)
         if "axis" in joint.children:
             spans, end, quotes = attribute_spans(urdf.data, joint.children["axis"].start)
-            edits.append(
-                Edit(*spans[b"xyz"].value, axis)
-                if b"xyz" in spans
-                else Edit(end, end, attribute_text(b"xyz", axis, quotes or b'"'))
-            )
+            edits.append(attribute_edit(spans, end, b"xyz", axis, quotes or b'"'))
         else:
             start = urdf.joint(name).first_child
             edits.append(Edit(start, start, b'<axis xyz="' + axis + b'"/>'))
@@ -99,10 +96,7 @@ def with_turned_joints(urdf: Urdf, names: Sequence[str]) -> Urdf:
 
 
 def with_world(data: bytes, base: Array) -> bytes:
-    """Return the bytes of a URDF whose root is the link `world`, the measuring frame.
-
-    If the root is already called `world`, the origins of its joints take up the base.
-    """
+    """Return the bytes of a URDF whose root is the link `world`, the measuring frame."""
     urdf = parse_urdf(data, "the calibrated URDF")
     if urdf.root == "world":
         at_root = [joint for joint in urdf.joints if joint.parent == "world"]
@@ -149,12 +143,7 @@ def _origin_edits(urdf: Urdf, joint: UrdfJoint, origin: Array) -> list[Edit]:
         indent = _INDENT.search(urdf.data, joint.start, start)
         return [Edit(start, start, b"<origin" + attributes + b"/>" + (indent[0] if indent else b""))]
     spans, end, quote = attribute_spans(urdf.data, joint.origin_start)
-    return [
-        Edit(*spans[key].value, text)
-        if key in spans
-        else Edit(end, end, attribute_text(key, text, quote or joint_quote))
-        for key, text in texts.items()
-    ]
+    return [attribute_edit(spans, end, key, text, quote or joint_quote) for key, text in texts.items()]
 
 
 def _find_end_of_robot(data: bytes) -> int:

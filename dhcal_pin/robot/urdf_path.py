@@ -55,10 +55,7 @@ def build_model(urdf: Urdf) -> pin.Model:
 
 
 def default_tip(urdf: Urdf) -> str:
-    """Choose the leaf behind the most moving joints, and of these the one behind the most links.
-
-    `tool0` is preferred among the leaves behind the most moving joints.
-    """
+    """Choose the leaf behind the most moving joints: `tool0`, or that behind the most links."""
     paths = {leaf: urdf.path(leaf) for leaf in urdf.leaves()}
     depths = {leaf: (sum(j.type != "fixed" for j in path), len(path)) for leaf, path in paths.items()}
     deepest = max(depths.values())
@@ -161,10 +158,8 @@ def placements(
 def link_on_path(
     urdf: Urdf, root: str, moving: tuple[str, ...], n_reversed: int, link: str
 ) -> tuple[int, Array] | None:
-    """Return the body of a path that carries a link, and the pose (4, 4) of the link in its joint frame.
-
-    Body 0 carries the root, body j lies behind moving joint j. None if a joint off the path moves the link.
-    """
+    """Return the body of a path that carries a link (0: the root), and the pose of the link in its frame."""
+    # None if a joint off the path moves the link.
     model = build_model(urdf)
     frames = [model.frames[model.getFrameId(name, pin.FrameType.BODY)] for name in (root, link)]
     bodies = [(frames[0].parentJoint, se3.inverse(frames[0].placement.homogeneous))]
@@ -183,10 +178,8 @@ def link_on_path(
 def joint_placements(
     model: pin.Model, tip: str, moving: Sequence[str], is_reversed: Sequence[bool], origins: Array
 ) -> list[Array]:
-    """Compute the poses of joints in the moving joints before them from the transforms of a path.
-
-    At the turn of the path, the first joint that is not reversed takes up the whole change.
-    """
+    """Compute the poses of joints in the moving joints before them from the transforms of a path."""
+    # At the turn of the path, the first joint that is not reversed takes up the whole change.
     nominal = [model.jointPlacements[model.getJointId(name)].homogeneous for name in moving]
     out = []
     for i, is_up in enumerate(is_reversed):

@@ -35,24 +35,15 @@ Kind = Literal["base", "tool", "joint", "links", "robot", "lag", "scale"]
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Columns of the linear model that one cause uses.
+    """Columns of the linear model that one cause uses."""
 
-    Attributes:
-        kind: What changes.
-        of: Name of the joint, of the axis of a scale, or of what moved if not base or tool; else empty.
-        columns: Indices of the columns, (c,).
-        sizes: Change of each column that moves the tool by about 1 m, (c,).
-        index: Number of the joint or of the axis of a scale; 0 for other blocks.
-        is_constant: Whether it is the same for all samples.
-        origin: Point whose motion is stated, in the frame of base or tool, (3,) [m].
-    """
-
-    kind: Kind
-    of: str
-    columns: Array
-    sizes: Array
-    index: int = 0
-    is_constant: bool = False
+    kind: Kind  # What changes
+    of: str  # Name of the joint, of the axis of a scale, or of what moved if not base or tool; else empty
+    columns: Array  # Indices of the columns, (c,)
+    sizes: Array  # Change of each column that moves the tool by about 1 m, (c,)
+    index: int = 0  # Number of the joint or of the axis of a scale; 0 for other blocks
+    is_constant: bool = False  # Whether it is the same for all samples
+    # Point whose motion is stated, in the frame of base or tool, (3,) [m].
     origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
 
     @property
@@ -64,13 +55,9 @@ class Block:
 
 @dataclass(frozen=True)
 class Step:
-    """Step between two samples.
+    """Step between two samples."""
 
-    Attributes:
-        number: Number of the first sample after it.
-    """
-
-    number: int
+    number: int  # Number of the first sample after it
 
     def values(self, numbers: Array, times: Array) -> Array:
         """Return f at samples, (m, 1)."""
@@ -79,16 +66,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Drift:
-    """Drift from the first to the last sample.
+    """Drift from the first to the last sample."""
 
-    Attributes:
-        begin: Time of the first sample.
-        end: Time of the last sample.
-        time_constant: Time constant τ of an exponential in the same unit; infinite for a linear drift.
-    """
-
-    begin: float
-    end: float
+    begin: float  # Time of the first sample
+    end: float  # Time of the last sample
+    # Time constant τ of an exponential in the same unit; infinite for a linear drift.
     time_constant: float = np.inf
 
     def values(self, numbers: Array, times: Array) -> Array:
@@ -102,15 +84,10 @@ class Drift:
 
 @dataclass(frozen=True)
 class FreeDrift:
-    """Drift without a simple law, as a random walk.
+    """Drift without a simple law, as a random walk."""
 
-    Attributes:
-        begin: Time of the first sample.
-        end: Time of the last sample.
-    """
-
-    begin: float
-    end: float
+    begin: float  # Time of the first sample
+    end: float  # Time of the last sample
 
     def values(self, numbers: Array, times: Array) -> Array:
         """Return the functions f at samples, (m, F)."""
@@ -138,22 +115,15 @@ Shape = Change | Constant
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """Something that changed during a session.
+    """Something that changed during a session."""
 
-    Attributes:
-        block: What changed.
-        shape: How it changed over time.
-        values: Its coefficients, (F·c,): those of the first function of time, of the second one, and so on.
-        covariance: Their covariance, (F·c, F·c).
-        log_evidence: Logarithm of the ratio of the evidence with and without it.
-        effect: RMS of its effect on the residuals of the samples that it concerns, in standard deviations.
-    """
-
-    block: Block
-    shape: Shape
+    block: Block  # What changed
+    shape: Shape  # How it changed over time
+    # Its coefficients, (F·c,): those of the first function of time, of the second one, and so on.
     values: Array
-    covariance: Array
-    log_evidence: float = 0.0
+    covariance: Array  # Their covariance, (F·c, F·c)
+    log_evidence: float = 0.0  # Logarithm of the ratio of the evidence with and without it
+    # RMS of its effect on the residuals of the samples that it concerns, in standard deviations.
     effect: float = 0.0
 
     @property

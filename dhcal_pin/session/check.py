@@ -86,27 +86,16 @@ STEP_TOL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Something that may have changed, with what the measurements say of it.
+    """Something that may have changed, with what the measurements say of it."""
 
-    Attributes:
-        kind: "joint", "base", "tool", "robot" or "sample".
-        of: Name of the joint, or place of the sample; else empty.
-        share: Share of its evidence in that of all changes.
-        size: Size of the change, signed for a joint, in `unit`; 0 for a robot or a sample.
-        std: Standard deviation of the size.
-        unit: "m" or "rad".
-        revealed: Smallest displacement of the tool by this change that the check reveals [m].
-        imitators: Names of other hypotheses that have every effect of this one.
-    """
-
-    kind: str
-    of: str
-    share: float
-    size: float
-    std: float
-    unit: str
-    revealed: float
-    imitators: tuple[str, ...] = ()
+    kind: str  #: "joint", "base", "tool", "robot" or "sample"
+    of: str  #: Name of the joint, or place of the sample; else empty
+    share: float  #: Share of its evidence in that of all changes
+    size: float  #: Size of the change, signed for a joint, in `unit`; 0 for a robot or a sample
+    std: float  #: Standard deviation of the size
+    unit: str  #: "m" or "rad"
+    revealed: float  #: Smallest displacement of the tool by this change that the check reveals [m]
+    imitators: tuple[str, ...] = ()  #: Names of other hypotheses that have every effect of this one
 
     @property
     def name(self) -> str:
@@ -120,27 +109,17 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Recheck:
-    """Answer to the question whether a robot is still calibrated.
+    """Answer to the question whether a robot is still calibrated."""
 
-    Attributes:
-        verdict: "ok", "changed" or "cannot say".
-        reasons: Sentences on it.
-        changes: What changed; several if the measurements do not distinguish them. Empty unless `changed`.
-        hypotheses: All hypotheses, the most likely one first.
-        log_ratio: Logarithm of the ratio of the likelihoods with and without a change, less its limit.
-        samples: Number of samples.
-        residual_rms: RMS distance of the measured positions from those of the robot [m].
-        expected_rms: RMS distance that noise and uncertainty of the calibration explain [m]; NaN if the noise
-            is not known.
-    """
-
-    verdict: str
-    reasons: tuple[str, ...]
+    verdict: str  # "ok", "changed" or "cannot say"
+    reasons: tuple[str, ...]  # Sentences on it
+    # What changed; several if the measurements do not distinguish them. Empty unless `changed`.
     changes: tuple[Hypothesis, ...]
-    hypotheses: tuple[Hypothesis, ...]
-    log_ratio: float
-    samples: int
-    residual_rms: float
+    hypotheses: tuple[Hypothesis, ...]  # All hypotheses, the most likely one first
+    log_ratio: float  # Logarithm of the ratio of the likelihoods with and without a change, less its limit
+    samples: int  # Number of samples
+    residual_rms: float  # RMS distance of the measured positions from those of the robot [m]
+    # RMS distance that noise and uncertainty of the calibration explain [m]; NaN if the noise is not known.
     expected_rms: float
 
     @property
@@ -176,23 +155,9 @@ def recheck(
     noise: Noise | None = None,
     size: float = DEFAULT_SIZE,
 ) -> Recheck:
-    """Check whether a robot is still calibrated.
-
-    Args:
-        chain: Calibrated robot, with its base and tool.
-        data: Positions or poses of the tool, five to ten samples.
-        uncertainty: Uncertainty of the calibration; None for an exact one.
-        known: Values of instrument parameters [m or rad].
-        noise: Standard deviations of instrument and robot together [m, rad]; None for those of the
-            measurements, which are estimated if they state none.
-        size: Displacement of the tool that the check must be able to reveal [m].
-
-    Returns:
-        Verdict, what changed and by how much.
-
-    Raises:
-        InvalidArgumentError: The measurements are not positions or poses, or too many.
-    """
+    """Check whether a robot is still calibrated, by five to ten positions or poses of its tool."""
+    # The noise is that of instrument and robot together [m, rad]; without it, unstated noise of the
+    # measurements is estimated. The check must be able to reveal a displacement of the tool by `size` [m].
     if not can_have_session(data) or not measures_positions(data):
         kinds = ", ".join(dict.fromkeys(item.kind for item in data))
         raise InvalidArgumentError(
@@ -336,10 +301,8 @@ class _CheckModel:
         return [turned / np.sqrt(each)[:, None] for each in self.variances]
 
     def log_likelihoods(self, columns: Array, sets: Sequence[Array], nothing: Array) -> Array:
-        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d).
-
-        `nothing` has those without a change, (σ, d).
-        """
+        """Return the log likelihood of d scaled residuals for each noise and width, (σ, w, d)."""
+        # `nothing` has those without a change, (σ, d).
         square = WIDTHS[:, None] ** 2
         out = np.empty((len(sets), len(WIDTHS), sets[0].shape[1]))
         for i, (a, r) in enumerate(zip(self.scaled_sets(columns), sets, strict=True)):

@@ -13,8 +13,8 @@ from .._typing import Array
 from ..formatting import format_fixed, format_quantity, significant_decimals
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
+from ..robot.error_families import growing_links
 from .causes import Block, Cause, Drift, FreeDrift, Step
-from .linear_model import growing_links
 from .robot_changes import JointPaths, RobotChanges, apply_changes
 from .timeline import Place, Timeline
 
@@ -26,25 +26,15 @@ MAX_SCALE_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class Event:
-    """Sudden change between two samples.
+    """Sudden change between two samples."""
 
-    Attributes:
-        kind: "base", "tool", "joint" or "robot".
-        of: Name of the joint or parameter, or of what moved if not base or tool; else empty.
-        before: Place of the last sample before it.
-        after: Place of the first sample after it.
-        size: Size of the change, in `unit`.
-        std: Standard deviation of the size.
-        unit: "m" or "rad".
-    """
-
-    kind: str
-    of: str
-    before: Place
-    after: Place
-    size: float
-    std: float
-    unit: str
+    kind: str  # "base", "tool", "joint" or "robot"
+    of: str  # Name of the joint or parameter, or of what moved if not base or tool; else empty
+    before: Place  # Place of the last sample before it
+    after: Place  # Place of the first sample after it
+    size: float  # Size of the change, in `unit`
+    std: float  # Standard deviation of the size
+    unit: str  # "m" or "rad"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the event for the JSON document."""
@@ -95,27 +85,16 @@ class Event:
 
 @dataclass(frozen=True)
 class SlowChange:
-    """Drift during a session.
+    """Drift during a session."""
 
-    Attributes:
-        kind: "base", "tool", "links" or "joint".
-        of: Name of the joint, or of what moved; else the kind.
-        size: Largest difference from the end, in `unit`.
-        std: Standard deviation of the size.
-        unit: "m" or "rad".
-        shape: "linear", "exponential" or "free".
-        time_constant: Time constant of an exponential; else None.
-        time_unit: "row", "image" or "s".
-    """
-
-    kind: str
-    of: str
-    size: float
-    std: float
-    unit: str
-    shape: str
-    time_constant: float | None
-    time_unit: str
+    kind: str  # "base", "tool", "links" or "joint"
+    of: str  # Name of the joint, or of what moved; else the kind
+    size: float  # Largest difference from the end, in `unit`
+    std: float  # Standard deviation of the size
+    unit: str  # "m" or "rad"
+    shape: str  # "linear", "exponential" or "free"
+    time_constant: float | None  # Time constant of an exponential; else None
+    time_unit: str  # "row", "image" or "s"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the drift for the JSON document."""
@@ -147,19 +126,12 @@ class SlowChange:
 
 @dataclass(frozen=True)
 class Lag:
-    """Delay between joint values and measured values.
+    """Delay between joint values and measured values."""
 
-    Attributes:
-        value: Time by which the joint values are too early, in `unit`.
-        std: Standard deviation of the value.
-        unit: "row" or "s".
-        is_corrected: Whether the samples are fitted with the joint values of the right time.
-    """
-
-    value: float
-    std: float
-    unit: str
-    is_corrected: bool = True
+    value: float  # Time by which the joint values are too early, in `unit`
+    std: float  # Standard deviation of the value
+    unit: str  # "row" or "s"
+    is_corrected: bool = True  # Whether the samples are fitted with the joint values of the right time
 
     @property
     def finding(self) -> str:
@@ -178,19 +150,12 @@ class Lag:
 
 @dataclass(frozen=True)
 class Scale:
-    """Factor of measured lengths.
+    """Factor of measured lengths."""
 
-    Attributes:
-        factor: Measured over true length.
-        std: Standard deviation of the factor.
-        axis: "x", "y" or "z" of the measuring frame; empty for all.
-        files: Measurement files with this scale; empty for all.
-    """
-
-    factor: float
-    std: float
-    axis: str
-    files: tuple[str, ...] = ()
+    factor: float  # Measured over true length
+    std: float  # Standard deviation of the factor
+    axis: str  # "x", "y" or "z" of the measuring frame; empty for all
+    files: tuple[str, ...] = ()  # Measurement files with this scale; empty for all
 
     @property
     def finding(self) -> str:
@@ -220,29 +185,17 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What happened during a session.
+    """What happened during a session."""
 
-    Attributes:
-        timeline: Timeline of the samples.
-        chain: Robot with the base frame in which the base drifts.
-        is_ordered: Whether the samples are in the order of measurement.
-        changes: Changes of the robot during the session.
-        causes: What was found, in the order of its discovery.
-        events: Sudden changes, in the order of measurement.
-        drifts: Slow changes.
-        lag: Delay of the joint values; None if there is none.
-        scales: Wrong scales of the instrument.
-    """
-
-    timeline: Timeline
-    chain: Chain
-    is_ordered: bool
-    changes: RobotChanges = field(default_factory=RobotChanges)
-    causes: tuple[Cause, ...] = ()
-    events: tuple[Event, ...] = ()
-    drifts: tuple[SlowChange, ...] = ()
-    lag: Lag | None = None
-    scales: tuple[Scale, ...] = ()
+    timeline: Timeline  # Timeline of the samples
+    chain: Chain  # Robot with the base frame in which the base drifts
+    is_ordered: bool  # Whether the samples are in the order of measurement
+    changes: RobotChanges = field(default_factory=RobotChanges)  # Changes of the robot during the session
+    causes: tuple[Cause, ...] = ()  # What was found, in the order of its discovery
+    events: tuple[Event, ...] = ()  # Sudden changes, in the order of measurement
+    drifts: tuple[SlowChange, ...] = ()  # Slow changes
+    lag: Lag | None = None  # Delay of the joint values; None if there is none
+    scales: tuple[Scale, ...] = ()  # Wrong scales of the instrument
 
     def applied(
         self, data: tuple[Measurement, ...], holdout: tuple[Measurement, ...]
@@ -412,7 +365,7 @@ def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timel
     if len(values) == 1:
         motions = motions.sum(0, keepdims=True)
     else:
-        motions = motions[growing_links(chain)]
+        motions = motions[growing_links(chain.link_vectors)]
     moved = np.einsum("jcm,j->cm", motions, values)
     size = float(np.sqrt(np.mean(np.sum(moved**2, 0))))
     gradient = np.einsum("jcm,cm->j", motions, moved) / (moved.shape[1] * max(size, 1e-300))

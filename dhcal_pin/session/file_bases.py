@@ -26,10 +26,8 @@ MAX_ITERATIONS = 20
 
 
 def place_files(problem: Problem, timeline: Timeline) -> tuple[Problem, Motion] | None:
-    """Fit base and tool to each file by itself; None with one file, and if no base turned far.
-
-    The problem has the base and the tool of the last file, and the base moves where a file begins.
-    """
+    """Fit base and tool to each file by itself; None with one file, and if no base turned far."""
+    # The problem gets the base and the tool of the last file, and the base moves where a file begins.
     parts: dict[int, list[int]] = {}
     for i, numbers in enumerate(timeline.numbers[: timeline.n_fitted]):
         of_file = np.unique(np.searchsorted(timeline.file_starts, numbers, side="right"))

@@ -18,8 +18,7 @@ from .._typing import Array
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, instrument_values
-from ..robot.chain import Chain
-from ..robot.error_families import MIN_LINK_LENGTH
+from ..robot.error_families import growing_links
 from .causes import HELD_SIZE, Block
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
@@ -34,11 +33,6 @@ MIN_INFORMATION = 1e-12
 SCALE_AXES = ("", "x", "y", "z")
 
 
-def growing_links(chain: Chain) -> Array:
-    """Return which links have a length that can grow, (k+1,)."""
-    return np.linalg.norm(chain.link_vectors, axis=1) > MIN_LINK_LENGTH
-
-
 def measures_positions(data: Sequence[Measurement]) -> bool:
     """Return whether all samples are positions or poses, so that a scale of their axes can be wrong."""
     return all(len(item.positions()) == len(item.rows) for item in data)
@@ -46,29 +40,17 @@ def measures_positions(data: Sequence[Measurement]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Columns of the linear model.
+    """Columns of the linear model."""
 
-    Attributes:
-        problem: Problem whose errors contain all parameters of base and tool.
-        model: Columns of the unknowns of the calibration, (p,).
-        weights: Their prior weights, (p,).
-        blocks: Possible causes.
-        joints: Columns of the joint zeros, (n,).
-        links: Columns of the growth of each link, (k+1,).
-        scale: Column of a scale of all axes.
-        lag: Column of the lag.
-        n_columns: Number of columns, the residual included.
-    """
-
-    problem: Problem
-    model: Array
-    weights: Array
-    blocks: tuple[Block, ...]
-    joints: Array
-    links: Array
-    scale: int
-    lag: int
-    n_columns: int
+    problem: Problem  # Problem whose errors contain all parameters of base and tool
+    model: Array  # Columns of the unknowns of the calibration, (p,)
+    weights: Array  # Their prior weights, (p,)
+    blocks: tuple[Block, ...]  # Possible causes
+    joints: Array  # Columns of the joint zeros, (n,)
+    links: Array  # Columns of the growth of each link, (k+1,)
+    scale: int  # Column of a scale of all axes
+    lag: int  # Column of the lag
+    n_columns: int  # Number of columns, the residual included
 
     @classmethod
     def of(cls, problem: Problem) -> Layout:
@@ -89,7 +71,7 @@ class Layout:
         all_links = int(links[-1]) + 1
         scales = all_links + 1 + np.arange(len(SCALE_AXES))
         lag = int(scales[-1]) + 1
-        grows = growing_links(chain)
+        grows = growing_links(chain.link_vectors)
         # A robot without lengths only turns.
         size = float(np.linalg.norm(chain.link_vectors, axis=1).sum()) or 1.0
         of_frame = np.array([1.0] * 3 + [1 / size] * 3)
@@ -125,11 +107,9 @@ class Layout:
         )
 
     def restricted_to(self, rows: Array) -> Layout:
-        """Return the layout with the causes that the rows (m, k, c) can show.
-
-        Columns without an effect on the rows are held at their values. A change over time is looked for only
-        if the calibration also estimates a constant error of the same kind.
-        """
+        """Return the layout with the causes that the rows (m, k, c) can show."""
+        # Columns without an effect on the rows are held at their values. A change over time is looked for
+        # only if the calibration also estimates a constant error of the same kind.
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
         changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))

@@ -18,10 +18,7 @@ N_STEPS = 4
 
 
 def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
-    """Fit the changes of a session together with the unknowns x (p,) of a problem with the same samples.
-
-    Samples of large residuals have a bounded influence (Huber).
-    """
+    """Fit the changes of a session together with the unknowns x (p,) of a problem with its samples."""
     layout, timeline, chain = Layout.of(problem), session.timeline, session.chain
     fitted = replace(timeline, data=(*problem.data, *timeline.data[timeline.n_fitted :]))
     numbers, times = timeline.fitted_numbers, timeline.fitted_times

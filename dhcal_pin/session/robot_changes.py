@@ -29,16 +29,11 @@ from .timeline import Timeline
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion of base or tool over time; the identity at the end.
+    """Motion of base or tool over time; the identity at the end."""
 
-    Attributes:
-        steps: Numbers of the first samples of all segments but the first, ascending.
-        poses: Motion of each segment, (S, 4, 4) [m].
-        drifts: Drifts with the twists of their functions of time, (F, 6).
-    """
-
-    steps: tuple[int, ...] = ()
-    poses: Array = field(default_factory=lambda: np.eye(4)[None])
+    steps: tuple[int, ...] = ()  # Numbers of the first samples of all segments but the first, ascending
+    poses: Array = field(default_factory=lambda: np.eye(4)[None])  # Motion of each segment, (S, 4, 4) [m]
+    # Drifts with the twists of their functions of time, (F, 6).
     drifts: tuple[tuple[Drift | FreeDrift, Array], ...] = ()
 
     @property
@@ -64,21 +59,15 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class RobotChanges:
-    """Changes of a robot during a session.
+    """Changes of a robot during a session."""
 
-    Attributes:
-        base: Motion of the base.
-        tool: Motion of the tool.
-        zeros: Changes of joint zeros: number of the joint, functions of time, and amplitudes (F,) [rad or m].
-        growth: Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
-        lag: Time by which the joint values are too early, in the unit of the timeline.
-    """
-
-    base: Motion = field(default_factory=Motion)
-    tool: Motion = field(default_factory=Motion)
+    base: Motion = field(default_factory=Motion)  # Motion of the base
+    tool: Motion = field(default_factory=Motion)  # Motion of the tool
+    # Changes of joint zeros: number of the joint, functions of time, and amplitudes (F,) [rad or m].
     zeros: tuple[tuple[int, Change, Array], ...] = ()
+    # Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
     growth: tuple[tuple[Change, Array], ...] = ()
-    lag: float = 0.0
+    lag: float = 0.0  # Time by which the joint values are too early, in the unit of the timeline
 
     @property
     def without_lag(self) -> RobotChanges:
@@ -121,10 +110,7 @@ class RobotChanges:
     def conditions(
         self, conditions: Conditions, chain: Chain, numbers: Array, times: Array, later: Array | None
     ) -> Conditions:
-        """Return the conditions of m samples with the changes, by their numbers and times (m,).
-
-        The base drifts in that of the chain. `later` are the joint positions by the lag later, (m, n).
-        """
+        """Return the conditions of samples with changes; `later` are their q after the lag, (m, n)."""
         values: dict[str, Any] = {}
         if not self.base.is_identity:
             drift = se3.exp6(self.base.twists(numbers, times))
@@ -175,10 +161,7 @@ class JointPaths:
 def apply_changes(
     changes: RobotChanges, chain: Chain, timeline: Timeline, paths: JointPaths | None
 ) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
-    """Return fitted and held-out measurements with the changes as conditions of their samples.
-
-    A lag needs the paths of the joints.
-    """
+    """Return fitted and held-out measurements with the changes as conditions; a lag needs the paths."""
     out = []
     for item, numbers, times in zip(timeline.data, timeline.numbers, timeline.times, strict=True):
         later = paths.evaluate(numbers, times, changes.lag)[0] if paths and changes.lag else None
@@ -190,11 +173,7 @@ def apply_changes(
 def update(
     changes: RobotChanges, causes: Sequence[Cause], steps: Sequence[Array], base: Array, links: Array
 ) -> RobotChanges:
-    """Return the changes after increments (F·c,) of the coefficients of each cause.
-
-    `base` is the pose of the base (4, 4) at the end [m], `links` are the columns of the growth of each link
-    in the linear model, (k+1,).
-    """
+    """Return the changes after increments (F·c,) of the coefficients of each cause, at a base (4, 4) [m]."""
     motions = {"base": changes.base, "tool": changes.tool}
     zeros: list[tuple[int, Change, Array]] = []
     growth: list[tuple[Change, Array]] = []

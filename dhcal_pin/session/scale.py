@@ -96,11 +96,7 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
 
 
 def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what moves the estimates of the parameters `arm`.
-
-    That are the covariance of the noise, the change by a scale of 1, and the covariances by errors of the
-    lengths and of the angles of all joint origins, of the base and of the tool.
-    """
+    """Return the covariances of estimates `arm` by noise, lengths and angles, and their change by a scale."""
     names = [parameter.name for parameter in problem.errors.parameters]
     chain = problem.errors.chain
     # A calibration without base or tool carries their errors into the arm.

@@ -101,27 +101,16 @@ MIN_SIDE = 3
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Fit of the linear model with weights of bounded influence.
+    """Fit of the linear model with weights of bounded influence."""
 
-    Attributes:
-        rows: Rows divided by the noise, with the residual after the fit as last column, (N, k, c).
-        columns: The same columns of the unknowns and causes of the fit, (N, k, p).
-        step: Step of the unknowns and causes, (p,).
-        covariance: Covariance of them with the weights of the samples, (p, p).
-        test_covariance: Covariance of them with equal weights, (p, p).
-        score: Remaining derivative of the cost with equal weights and bounded residuals, (p,).
-        weights: Weights of the samples, (N,).
-        noise: Noise of each row in whitened units, (N, k).
-    """
-
-    rows: Array
-    columns: Array
-    step: Array
-    covariance: Array
-    test_covariance: Array
-    score: Array
-    weights: Array
-    noise: Array
+    rows: Array  # Rows divided by the noise, with the residual after the fit as last column, (N, k, c)
+    columns: Array  # The same columns of the unknowns and causes of the fit, (N, k, p)
+    step: Array  # Step of the unknowns and causes, (p,)
+    covariance: Array  # Covariance of them with the weights of the samples, (p, p)
+    test_covariance: Array  # Covariance of them with equal weights, (p, p)
+    score: Array  # Remaining derivative of the cost with equal weights and bounded residuals, (p,)
+    weights: Array  # Weights of the samples, (N,)
+    noise: Array  # Noise of each row in whitened units, (N, k)
 
 
 class _Search:
@@ -198,16 +187,22 @@ class _Search:
         parts = [cause.columns_of(rows, self.numbers, self.times) for cause in causes]
         return np.concatenate([rows[..., :0], *parts], -1)
 
+    def _prior(self, causes: Sequence[Cause]) -> Array:
+        """Return the weights of the priors of the unknowns and of causes, (p,)."""
+        # A prior of one metre decides what the measurements do not show, such as turns of a point.
+        return np.concatenate([self.layout.weights, *(1 / cause.sizes for cause in causes)])
+
+    def _columns_without(self, cause: Cause, rows: Array, causes: Sequence[Cause]) -> Array:
+        """Return the columns of the unknowns and of causes, and the residual as if one were left out."""
+        residual = self._undone(rows, cause)[..., -1:]
+        return np.concatenate([rows[..., self.layout.model], self._cause_columns(rows, causes), residual], -1)
+
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
         """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
         layout = self.layout
         columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
-        residual = rows[..., -1]
-        sizes = np.concatenate([np.ones(0), *(cause.sizes for cause in causes)])
-        held = np.concatenate([np.zeros(0), *(cause.values for cause in causes)])
-        # A prior of one metre decides what the measurements do not show, such as turns of a point.
-        prior = np.concatenate([layout.weights, 1 / sizes])
-        value = np.concatenate([self.x, held])
+        residual, prior = rows[..., -1], self._prior(causes)
+        value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
         labels = [self.groups == label for label in range(self.groups.max() + 1)]
         products = [part.T @ part for part in (columns[chosen] for chosen in labels)]
@@ -465,11 +460,8 @@ class _Search:
             ]
             if isinstance(old, FreeDrift):
                 tried.append(cause)
-            columns = [rows[..., self.layout.model], self._cause_columns(rows, [*others, *tried])]
-            stack = np.concatenate([*columns, self._undone(rows, cause)[..., -1:]], -1)
-            products = _information(stack, scaled)
-            sizes = np.concatenate([np.ones(0), *(1 / c.sizes for c in (*others, *tried))])
-            prior = np.concatenate([self.layout.weights, sizes])
+            products = _information(self._columns_without(cause, rows, [*others, *tried]), scaled)
+            prior = self._prior([*others, *tried])
             ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
             # Each coefficient costs the logarithm of the number of rows; a linear drift is the simplest one.
             costs = [
@@ -543,21 +535,14 @@ class _Search:
     def _judge(self, rows: Array, full: LinearFit, i: int) -> Cause:
         """Return a cause with the evidence for it, given all others."""
         cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
-        undone = self._undone(rows, cause)
-        without = self.solve(undone, others)
+        without = self.solve(self._undone(rows, cause), others)
         # The same noise and weights for both.
         scaled = np.sqrt(full.weights)[:, None] / full.noise
-        columns = [
-            rows[..., self.layout.model],
-            self._cause_columns(rows, [*others, cause]),
-            undone[..., -1:],
-        ]
-        stack = np.concatenate(columns, -1) * scaled[..., None]
-        sizes = [1 / c.sizes for c in (*others, cause)]
-        prior = np.concatenate([self.layout.weights, *sizes])
+        stack = self._columns_without(cause, rows, [*others, cause]) * scaled[..., None]
+        prior = self._prior([*others, cause])
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
-        inside, predicted = _predicted_gain(stack, len(prior) - len(sizes[-1]), prior, length)
+        inside, predicted = _predicted_gain(stack, len(prior) - len(cause.values), prior, length)
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
@@ -574,10 +559,7 @@ class _Search:
         return float(np.mean(is_outlier[side]))
 
     def _log_evidence(self, cause: Cause, i: int, full: LinearFit, without: LinearFit) -> float:
-        """Return the logarithm of the ratio of the evidences with and without a cause.
-
-        A sample counts no more than an outlier does.
-        """
+        """Return the logarithm of the ratio of the evidences with and without a cause."""
         limit = np.sum(self.groups >= 0, 1) + MAX_SAMPLE_COST
         costs = [
             float(np.sum(np.minimum(np.sum((fit.rows[..., -1] * fit.noise / full.noise) ** 2, 1), limit)))
@@ -595,10 +577,8 @@ class _Search:
 
     # ------------------------------------------------------------------------------------------- after it
     def with_lag_alone(self) -> _Search | None:
-        """Return a search with a lag as the only cause; None if there is no lag.
-
-        The last samples of a path are near each other, so that a step imitates small errors of the lag there.
-        """
+        """Return a search with a lag as the only cause; None if there is no lag."""
+        # The last samples of a path are near each other: a step imitates small errors of the lag there.
         lag = [cause for cause in self.causes if cause.block.kind == "lag"]
         if not lag:
             return None
@@ -728,10 +708,8 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
 
 
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
-    """Find what happened during a session, from an approximate solution x (p,) with base and tool.
-
-    Held-out measurements only count for the timeline. Without an order only files may differ.
-    """
+    """Find what happened during a session, from an approximate solution x (p,) with base and tool."""
+    # Held-out measurements only count for the timeline. Without an order only files may differ.
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(timeline, chain, is_ordered)
     n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
@@ -759,6 +737,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     other_robot = search.other_robot()
     search.place_steps()
     causes = tuple(search.causes)
+    constants = [
+        (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
+        for cause in causes
+        if cause.block.is_constant
+    ]
     return Session(
         timeline,
         search.chain,
@@ -766,21 +749,15 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search.changes,
         causes,
         (other_robot,) if other_robot else (),
-        lag=next((_lag(cause, timeline) for cause in causes if cause.block.kind == "lag"), None),
-        scales=tuple(scale for scale in _scales(causes) if abs(scale.factor - 1) <= MAX_SCALE_CHANGE),
+        lag=next(
+            (Lag(value, std, timeline.unit) for kind, value, std, _ in constants if kind == "lag"), None
+        ),
+        scales=tuple(
+            Scale(1 + value, std, axis)
+            for kind, value, std, axis in constants
+            if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
+        ),
     ).described()
-
-
-def _lag(cause: Cause, timeline: Timeline) -> Lag:
-    """Describe a lag."""
-    return Lag(float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), timeline.unit)
-
-
-def _scales(causes: Sequence[Cause]) -> Iterator[Scale]:
-    """Describe the scales of single axes."""
-    for cause in causes:
-        if cause.block.kind == "scale":
-            yield Scale(1 + float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:

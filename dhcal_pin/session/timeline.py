@@ -26,23 +26,16 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """Order of the samples of a session of N samples.
+    """Order of the samples of a session of N samples."""
 
-    Attributes:
-        data: Fitted measurements, then held-out ones.
-        n_fitted: Number of fitted measurements.
-        numbers: Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
-        times: Time of each sample, one array per measurement: in seconds if known, else its number.
-        unit: "s", "row" or "image", the unit of the times.
-        file_starts: Numbers of the first samples of all files but the first.
-    """
-
-    data: tuple[Measurement, ...]
-    n_fitted: int
+    data: tuple[Measurement, ...]  # Fitted measurements, then held-out ones
+    n_fitted: int  # Number of fitted measurements
+    # Number of each sample in the order of measurement, from 0 to N-1, one array per measurement.
     numbers: tuple[Array, ...]
+    # Time of each sample, one array per measurement: in seconds if known, else its number.
     times: tuple[Array, ...]
-    unit: str
-    file_starts: tuple[int, ...]
+    unit: str  # "s", "row" or "image", the unit of the times
+    file_starts: tuple[int, ...]  # Numbers of the first samples of all files but the first
 
     @property
     def fitted_numbers(self) -> Array:
@@ -55,10 +48,8 @@ class Timeline:
         return np.concatenate(self.times[: self.n_fitted])
 
     def thinned(self, count: int) -> Timeline:
-        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones.
-
-        Of consecutive samples at one configuration, the first counts: they share the error of the model.
-        """
+        """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""
+        # Of consecutive samples at one configuration, the first counts: they share the error of the model.
         numbers = self.fitted_numbers
         order = np.argsort(numbers, kind="stable")
         q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]

@@ -31,7 +31,6 @@ from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.calibration.cameras.stages import ImageError
 from dhcal_pin.calibration.cameras.target_points import judged_boards
 from dhcal_pin.cameras import Board, Camera
-from dhcal_pin.estimation.priors import PriorGroups
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
@@ -84,7 +83,7 @@ def test_few_images_of_a_wrong_arm_are_a_cause_for_caution(arm, count):
 
 def test_six_images_that_the_arm_explains_are_judged_at_a_temperature_of_2_2():
     """The temperature is 1 + N/5, whatever the number of corners of an image."""
-    gated = apply_gate(placement_fit(0.0, 6, 0), PriorGroups.none(), 40, INDUSTRIAL)
+    gated = apply_gate(placement_fit(0.0, 6, 0), (), 40, INDUSTRIAL)
     assert gated.gate.is_complete
     assert not gated.gate.is_open
     assert gated.with_arm.problem.temperature == pytest.approx(1 + 6 / 5)

@@ -21,7 +21,7 @@ from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.estimation.folds import NoisyRows
 from dhcal_pin.estimation.initialization import align
-from dhcal_pin.estimation.priors import PriorGroups
+from dhcal_pin.estimation.priors import group_default_priors
 from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import CameraCorners
@@ -101,18 +101,19 @@ def test_configurations_of_an_arm_with_play_do_not_count_in_full(plain):
 def test_prior_widths_of_the_gate_have_the_greatest_evidence(plain, temperature):
     problem, system, x = plain.problem.at_temperature(1.0), plain.solution.system, plain.x
     errors = problem.errors
-    groups = PriorGroups.from_expected(errors, 1 / errors.priors, np.ones(len(errors.parameters), bool))
+    groups = group_default_priors(errors, 1 / errors.priors, np.ones(len(errors.parameters), bool))
     found = _with_evidence(Fit(plain.data, problem, plain.solution, plain.weights), groups, temperature, 1)
     rows, best = system.scaled(temperature**-0.5), found.problem.prior_weights
 
     def log_evidence(weights):
         """Logarithm of the density of the residuals of the linear model."""
         root = np.abs(np.diag(rows.with_priors(weights, x).r))
-        return np.sum(np.log(weights[groups.members])) - np.sum(np.log(root)) - rows.solve(weights, x)[1] / 2
+        return np.sum(np.log(weights[arm])) - np.sum(np.log(root)) - rows.solve(weights, x)[1] / 2
 
-    for group, factor in product(range(len(groups.expected_weights)), (0.8, 1.25)):
+    arm = [i for group in groups for i in group.members]
+    for group, factor in product(groups, (0.8, 1.25)):
         weights = best.copy()
-        weights[groups.members[groups.group_index == group]] *= factor
+        weights[group.members] *= factor
         assert log_evidence(weights) < log_evidence(best)
 
 

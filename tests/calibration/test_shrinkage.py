@@ -69,8 +69,8 @@ def factor_by_definition(problem, solution, groups) -> float:
     log_weights, means, stds = [], [], []
     for combination in itertools.product(widths, repeat=len(groups)):
         std = 1 / problem.weights
-        for width, (members, weight) in zip(combination, groups, strict=True):
-            std[members] = width / weight
+        for width, group in zip(combination, groups, strict=True):
+            std[group.members] = width / group.expected_weight
         covariance = r @ np.diag(std**2) @ r.T + np.eye(len(r))
         evidence = multivariate_normal.logpdf(measured, np.zeros(len(r)), covariance)
         # ln w has the standard deviation 1.5, and the grid is even in it.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dhcal_pin.estimation import Problem, levenberg_marquardt, select_parameters
-from dhcal_pin.estimation.priors import PriorGroups, prior_weights, update_prior_scales
+from dhcal_pin.estimation.priors import group_default_priors, prior_weights, update_prior_scales
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import Noise, Pose
 
@@ -19,7 +21,7 @@ def solved(nominal, error_scale: float):
     data = Pose.simulate(truth, rng.uniform(-3, 3, (100, 6)), Noise(1e-7, 1e-7), rng)
     weights = prior_weights(errors, "default")
     problem = Problem(errors, (data,), weights)
-    groups = PriorGroups.from_expected(errors, weights, np.full(len(weights), True))
+    groups = group_default_priors(errors, weights, np.full(len(weights), True))
     return problem, levenberg_marquardt(problem, np.zeros(len(weights)), 100), groups
 
 
@@ -42,31 +44,21 @@ def test_priors_widen_to_the_errors_that_precise_data_show(sim_6dof, scale):
     """With data that determine everything, the width of a group is the RMS of its errors."""
     problem, solution, groups = solved(sim_6dof, scale)
     weights = update_prior_scales(problem, solution, groups)
-    for members, expected in groups.groups():
-        rms = np.sqrt(np.mean(solution.x[members] ** 2))
-        assert rms > 1 / expected
-        np.testing.assert_allclose(1 / weights[members], rms, rtol=0.06)
+    for group in groups:
+        rms = np.sqrt(np.mean(solution.x[group.members] ** 2))
+        assert rms > 1 / group.expected_weight
+        np.testing.assert_allclose(1 / weights[group.members], rms, rtol=0.06)
 
 
-def test_joined_groups_keep_their_own_widths_and_limits(sim_6dof):
+def test_groups_have_their_own_widths_and_limits(sim_6dof):
     problem, solution, groups = solved(sim_6dof, 10.0)
-    first, second = (np.flatnonzero(groups.group_index == i) for i in (0, 1))
-    parts = [
-        PriorGroups(
-            groups.members[chosen],
-            np.zeros(len(chosen), int),
-            groups.expected_weights[i : i + 1],
-            limit * groups.expected_weights[i : i + 1],
-            groups.max_weights[i : i + 1],
-            groups.expectation_counts[i : i + 1],
-        )
-        for i, (chosen, limit) in enumerate([(first, 0.0), (second, 1.0)])
-    ]
+    first, second = groups[:2]
     alone = update_prior_scales(problem, solution, groups)
-    together = update_prior_scales(problem, solution, parts[0].joined(parts[1]))
-    np.testing.assert_array_equal(together[groups.members[first]], alone[groups.members[first]])
+    limited = replace(second, min_weight=second.expected_weight)
+    together = update_prior_scales(problem, solution, (first, limited))
+    np.testing.assert_array_equal(together[first.members], alone[first.members])
     # The errors are ten times the expected ones, but the second group must not become wider.
-    np.testing.assert_array_equal(together[groups.members[second]], groups.expected_weights[1])
+    np.testing.assert_array_equal(together[second.members], second.expected_weight)
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e-13, 1e7, np.nan, np.inf])

@@ -30,7 +30,7 @@ from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.initialization import make_problem
 from ...estimation.parameters import select_parameters
-from ...estimation.priors import PriorGroups
+from ...estimation.priors import group_default_priors
 from ...estimation.robust import KEPT
 from ...estimation.solver import minimize
 from ...exceptions import DhcalError
@@ -123,7 +123,7 @@ def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
     fit = _first_fit(hand_eye, causes, start)
     errors = fit.problem.errors
     has_default = np.ones(len(errors.parameters), bool)
-    groups = PriorGroups.from_expected(errors, fit.problem.weights, has_default)
+    groups = group_default_priors(errors, fit.problem.weights, has_default)
     return reweight(fit, (KEPT,), groups, _MAX_ITERATIONS, None)
 
 

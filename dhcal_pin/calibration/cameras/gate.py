@@ -34,7 +34,7 @@ import numpy as np
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.folds import factor_partition
-from ...estimation.priors import PriorGroups, effective_parameters
+from ...estimation.priors import PriorGroups, determined_fractions, effective_parameters
 from ...estimation.problem import Problem
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
@@ -123,9 +123,7 @@ class GatedFit:
     nominal: Fit  # Fit of independent corners with the nominal arm
     with_arm: Fit  # Fit with the arm estimated
     gate: Gate  # Whether the arm is estimated in the final fit
-    displaced: Fit | None = (
-        None  # Fit with the arm estimated and a displacement of each image, if it was tried
-    )
+    displaced: Fit | None = None  # Fit with the arm estimated and a displacement of each image, if any
 
 
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
@@ -185,7 +183,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
 
 
 def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, Gate]:
-    """Estimate the displacement of images anew, fit with it, and judge the arm again if the gate is closed."""
+    """Estimate the displacement of images anew, fit with it, and judge the arm again if it was kept."""
     fit, jitter = fit_with_jitter(fit, max_iterations)
     n_configurations = gate.n_configurations if jitter.is_significant else 0
     opened_at = temperature(n_configurations, OPEN_SAMPLES)
@@ -292,19 +290,17 @@ def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) 
 def _with_evidence(fit: Fit, groups: PriorGroups, temperature: float, max_iterations: int) -> Fit:
     """Fit with the prior widths of greatest evidence at a temperature, however narrow."""
     expected = fit.problem.weights.copy()
-    expected[groups.members] = groups.expected_weights[groups.group_index]
+    for group in groups:
+        expected[group.members] = group.expected_weight
     weights = expected.copy()
     system, x = fit.solution.system, fit.solution.x
     rows = system.scaled(1 / np.sqrt(temperature))
-    members, group_index = groups.members, groups.group_index
-    for _ in range(_N_EVIDENCE_ROUNDS if len(members) else 0):
-        values = (x + rows.solve(weights, x)[0])[members]
-        root = rows.sqrt_covariance(weights)[0][members]
-        determined = np.fmax(1 - np.einsum("ij,ij->i", root, root) * weights[members] ** 2, 0.0)
-        squares = np.bincount(group_index, (values * expected[members]) ** 2)
-        count = np.fmax(np.bincount(group_index, determined), 1e-9)
-        widths = np.clip(np.sqrt(squares / count), MIN_WIDTH, MAX_WIDTH)
-        weights[members] = expected[members] / widths[group_index]
+    for _ in range(_N_EVIDENCE_ROUNDS if groups else 0):
+        sizes = (x + rows.solve(weights, x)[0]) * expected
+        determined = determined_fractions(rows, weights)
+        for members in (group.members for group in groups):
+            width = np.sqrt(np.sum(sizes[members] ** 2) / max(np.sum(determined[members]), 1e-9))
+            weights[members] = expected[members] / np.clip(width, MIN_WIDTH, MAX_WIDTH)
     return _solve(fit, fit.problem.with_prior_weights(weights), temperature, max_iterations)
 
 

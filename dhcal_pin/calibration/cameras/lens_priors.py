@@ -11,9 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from ...estimation.priors import PriorGroups
+from ...estimation.priors import PriorGroup, PriorGroups
 from ...estimation.problem import Problem
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners
@@ -39,15 +37,10 @@ def lens_prior_groups(problem: Problem) -> PriorGroups:
         camera = parameter.name.rpartition(".")[0]
         if (camera, parameter.unit) in stated:
             groups.setdefault((camera, parameter.unit), []).append(i)
-    members = list(groups.values())
-    weights = np.array([1 / problem.instrument_parameters[each[0] - n_errors].prior for each in members])
-    return PriorGroups(
-        np.array([i for each in members for i in each], int),
-        np.repeat(np.arange(len(members)), [len(each) for each in members]),
-        weights,
-        weights,
-        weights / MIN_LENS_WIDTH,
-        np.zeros(len(members)),
+    weights = [1 / problem.instrument_parameters[each[0] - n_errors].prior for each in groups.values()]
+    return tuple(
+        PriorGroup(members, weight, weight, weight / MIN_LENS_WIDTH, 0.0)
+        for members, weight in zip(groups.values(), weights, strict=True)
     )
 
 

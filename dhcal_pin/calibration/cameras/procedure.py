@@ -78,7 +78,7 @@ class ImageFitting:
 
     def reweight(self, fit: Fit) -> Fit:
         """Estimate noise, weights and widths of priors, those of lenses included."""
-        groups = self.groups.joined(lens_prior_groups(fit.problem))
+        groups = (*self.groups, *lens_prior_groups(fit.problem))
         fit = reweight(fit, self.stages, groups, self.max_iterations, self.progress)
         images = [(item, w) for item, w in zip(fit.data, fit.weights, strict=True) if has_images([item])]
         if not any((weights > 0.5).any() for _, weights in images):

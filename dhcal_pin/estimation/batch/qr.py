@@ -78,12 +78,10 @@ class TriangularSystemBatch:
         return TriangularSystemBatch(append_diagonal(self.rows, diagonal, np.zeros(diagonal.shape)))
 
     def solve(self, min_singular_value: Array | float = 0.0) -> Array:
-        """Compute the minimum-norm least-squares solutions R⁺·z.
-
-        Singular values below RANK_RTOL times the largest count as zero. Only matrices that may have such
-        singular values are decomposed; for the others a solution of a few random right-hand sides bounds the
-        condition number.
-        """
+        """Compute the minimum-norm least-squares solutions R⁺·z."""
+        # Singular values below RANK_RTOL times the largest count as zero. Only matrices that may have such
+        # singular values are decomposed: a solution of a few random right-hand sides bounds the condition
+        # numbers.
         p = self.z.shape[1]
         size, out = self._norms, np.empty(self.z.shape)
         # The smallest diagonal element of a triangular matrix bounds its smallest singular value from above.

@@ -209,19 +209,12 @@ def _padded(item: Measurement, count: int) -> Measurement:
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """Result of `solve_batch`.
+    """Result of `solve_batch`."""
 
-    Attributes:
-        batch: Problems that were solved.
-        x: Solutions of shape (b, p) [m and rad].
-        iterations: Number of iterations of each problem, shape (b,).
-        converged: Whether the last step was negligible, shape (b,).
-    """
-
-    batch: BatchProblem
-    x: Array
-    iterations: Array
-    converged: Array
+    batch: BatchProblem  #: Problems that were solved
+    x: Array  #: Solutions of shape (b, p) [m and rad]
+    iterations: Array  #: Number of iterations of each problem, shape (b,)
+    converged: Array  #: Whether the last step was negligible, shape (b,)
 
     @cached_property
     def systems(self) -> TriangularSystemBatch:
@@ -246,10 +239,7 @@ class BatchResult:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariances of x by the stated standard deviations of the data, shape (b, p, p).
-
-        The diagonal is infinite where neither data nor priors determine a parameter.
-        """
+        """Covariances of x by the stated standard deviations, (b, p, p); infinite if not determined."""
         b, p = self.x.shape
         priors = np.tile(np.diag(self.batch.weights), (b, 1, 1))
         _, s, vt = np.linalg.svd(np.linalg.qr(np.concatenate([self.systems.r, priors], 1), mode="r"))
@@ -306,12 +296,10 @@ def _levenberg_marquardt(batch: BatchProblem, x: Array, max_iterations: int) -> 
 
 
 def _lockstep(batch: BatchProblem, x: Array, max_iterations: int) -> tuple[Array, Array, Array]:
-    """Run Levenberg-Marquardt on all problems in lockstep, without extrapolated steps.
-
-    In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
-    the others retry with more damping. State that outlives a pass has one element per problem of the batch;
-    quantities of one pass have one element per active problem.
-    """
+    """Run Levenberg-Marquardt on all problems in lockstep, without extrapolated steps."""
+    # In each pass every active problem tries one step. Problems whose step was accepted are linearized again;
+    # the others retry with more damping. State that outlives a pass has one element per problem of the batch;
+    # quantities of one pass have one element per active problem.
     b, p, active_batch, active = len(batch), len(batch.weights), batch, np.arange(len(batch))
     x, iterations, converged = x.copy(), np.zeros(b, int), np.zeros(b, bool)
     systems, scale = batch.linearize_and_factor(x, batch.weights, small_angle=False), np.zeros((b, p))

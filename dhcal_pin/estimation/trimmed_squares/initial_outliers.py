@@ -96,10 +96,7 @@ def _thin_groups(item: Measurement) -> Array:
 
 
 def _initialize_instruments(chain: Chain, item: Measurement, is_drawn: Array) -> Measurement:
-    """Initialize the instrument of drawn samples (m,) from the subset whose start most of them agree with.
-
-    What a measurement knows without the robot, such as the lens of a camera, is that of all samples.
-    """
+    """Initialize the instrument of samples (m,) from the subset whose start most of them agree with."""
     best = item.initialized_from(chain, is_drawn, is_drawn)
     if not best.instrument_parameters or not len(best.rows):
         return best

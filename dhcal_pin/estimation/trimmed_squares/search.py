@@ -220,11 +220,7 @@ def _noise_class_name(index: int, item: Measurement, group: str, n_rows: int, u:
 def search_majorities(
     rows: LinearizedRows, groups: Array, n_determined: int, n_best: int = N_BEST
 ) -> list[tuple[Array, Array]]:
-    """Search fits of least trimmed squares; return the n_best best ones in their order.
-
-    The groups are labels of the samples' configurations. A fit consists of whether each sample is in the
-    majority that agrees best, and the noise scales of the classes.
-    """
+    """Search fits of least trimmed squares; return the n_best, each a mask of samples and noise scales."""
     weights = _random_subsets(rows, groups, n_determined)
     scales = np.ones((len(weights), len(rows.is_estimated)))
     objective = np.zeros(len(weights))
@@ -257,12 +253,10 @@ def _concentrate(rows: LinearizedRows, weights: Array, scales: Array) -> tuple[A
 
 
 def _random_subsets(rows: LinearizedRows, groups: Array, n_determined: int) -> Array:
-    """Draw the subsets that the search starts from.
-
-    Every second subset consists of whole configurations, every other pair is half as large as needed to
-    determine all unknowns: fewer samples are more often all good, and the priors supply what is missing. Each
-    stratum has its smallest number of samples. The first subset contains all samples.
-    """
+    """Draw the subsets that the search starts from, the first of all samples."""
+    # Every second subset consists of whole configurations, every other pair is half as large as needed to
+    # determine all unknowns: fewer samples are more often all good, and the priors supply what is missing.
+    # Each stratum has its smallest number of samples.
     u, m = len(rows.prior_right), rows.n_samples
     work = len(rows.counts) * u * u
     n_starts = int(np.clip(MAX_MULTIPLICATIONS / work, MIN_STARTS, MAX_STARTS))

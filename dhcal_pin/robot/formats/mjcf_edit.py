@@ -20,7 +20,7 @@ from ...messages import quote
 from ..urdf import UrdfJoint
 from ..urdf_edit import changed_origins
 from .mjcf import ORIENTATIONS, Mjcf
-from .xml_tags import Edit, attribute_spans, attribute_text, edited, number_text
+from .xml_tags import Edit, attribute_edit, attribute_spans, attribute_text, edited, number_text
 
 
 def require_writable(mjcf: Mjcf, joints: Iterable[str]) -> None:
@@ -50,12 +50,7 @@ def _pose_edits(mjcf: Mjcf, joint: UrdfJoint, origin: Array) -> list[Edit]:
     quotes = quotes or b'"'
     edits = []
     if not (has_same_position and (has_same_rotation or not place.after[:3, 3].any())):
-        position = number_text(pose[:3, 3])
-        edits.append(
-            Edit(*spans[b"pos"].value, position)
-            if b"pos" in spans
-            else Edit(end, end, attribute_text(b"pos", position, quotes))
-        )
+        edits.append(attribute_edit(spans, end, b"pos", number_text(pose[:3, 3]), quotes))
     if not has_same_rotation:
         quat = pin.Quaternion(se3.nearest_rotation(pose[:3, :3]))
         # The scalar part is first in MJCF. A quaternion and its negative are the same rotation.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 from xml.parsers import expat
@@ -80,11 +80,7 @@ def scan(
     root: str,
     on_start: Callable[[int, str, XmlTag], None],
 ) -> None:
-    """Call a function for each start tag with its depth, from 1, and the name of its element.
-
-    Errors of the XML are raised as `FileFormatError` with the line; `kind` and `root` name the format and its
-    outermost element in messages.
-    """
+    """Call a function for each start tag, with its depth from 1 and its element; errors name the line."""
     if len(data) > _MAX_BYTES:
         raise FileFormatError(
             f"{source}: the file is larger than {_MAX_BYTES >> 20} MiB, which no {kind} is; check the path"
@@ -144,10 +140,7 @@ def scan(
 
 
 def parse_numbers(tag: XmlTag, key: str, count: int) -> list[float]:
-    """Parse the finite numbers of an attribute.
-
-    A missing attribute and a wrong number raise a `FileFormatError` with the line.
-    """
+    """Parse the finite numbers of an attribute; a `FileFormatError` with the line if it has none."""
     if key not in tag.attributes:
         raise tag.error(f"{key} is missing; expected {'a number' if count == 1 else f'{count} numbers'}")
     # Expat replaces white space by spaces, except for character references such as &#9;, which do not
@@ -163,11 +156,8 @@ def parse_numbers(tag: XmlTag, key: str, count: int) -> list[float]:
 
 
 def attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, AttributeSpan], int, bytes]:
-    """Find the attributes of the tag at a byte offset, where they end, and the quotes of the last one.
-
-    Expat reports the offset of a tag, but values only after normalization. The tag is known to be
-    well-formed.
-    """
+    """Find the attributes of the well-formed tag at a byte offset, their end, and the last quotes."""
+    # Expat reports the offset of a tag, but values only after normalization.
     element = _ELEMENT.match(data, start)
     assert element is not None, "expat found a tag at this offset"
     spans, end, last_quote = {}, element.end(), b""
@@ -180,6 +170,15 @@ def attribute_spans(data: bytes, start: int) -> tuple[dict[bytes, AttributeSpan]
 def attribute_text(name: bytes, value: bytes, quotes: bytes) -> bytes:
     """Write an attribute with the space before it."""
     return b" " + name + b"=" + quotes + value + quotes
+
+
+def attribute_edit(
+    spans: Mapping[bytes, AttributeSpan], end: int, key: bytes, text: bytes, quotes: bytes
+) -> Edit:
+    """Return the edit that gives a tag an attribute: another value, or a new one behind the others."""
+    if key in spans:
+        return Edit(*spans[key].value, text)
+    return Edit(end, end, attribute_text(key, text, quotes))
 
 
 def number_text(values: Iterable[float]) -> bytes:
