@@ -14,14 +14,13 @@ from typing import Any, NamedTuple, NoReturn
 
 from ..exceptions import DhcalError
 from ..messages import message_line
-from .options import CommandParser, HelpFormatter, add_verbosity_options
+from .options import VERBOSITY_OPTIONS, CommandParser, HelpFormatter, add_options
 
 
 class Command(NamedTuple):
     """One command of `dhcal`."""
 
-    # Word on the command line, and module of `cli.commands` with `EXAMPLE`, `add_arguments(parser)` and
-    # `run(args) -> int`.
+    # Word on the command line, and module of `cli.commands` with `EXAMPLE`, `ARGUMENTS` and `run`.
     name: str
     help: str  # One line for `dhcal --help`
 
@@ -77,8 +76,7 @@ class _LazyCommandParser(CommandParser):
         self._has_arguments = True
         module = import_module(f".commands.{self._module}", __package__)
         self.epilog = f"example:\n  {module.EXAMPLE}"
-        module.add_arguments(self)
-        add_verbosity_options(self)
+        add_options(self, {**module.ARGUMENTS, **VERBOSITY_OPTIONS})
         self.set_defaults(run=module.run)
 
 

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
 from ... import detection, io
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, RIG
+from ..options import JSON, Options
 
 EXAMPLE = "dhcal board rig.toml --paper a4 -o board.pdf"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal board`."""
-    parser.add_argument("rig", metavar=RIG["metavar"], help="rig file with the board")
-    parser.add_argument(
-        "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
-    )
-    parser.add_argument(
-        "--paper",
-        metavar="SIZE",
-        choices=("a4", "letter"),
-        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig "
+ARGUMENTS: Options = {
+    "rig RIG.toml": "rig file with the board",
+    "--board NAME": "board of the rig file; only needed if it has several",
+    "--paper SIZE": {
+        "choices": ("a4", "letter"),
+        "help": "sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig "
         "file, corrects the scale of the printer (default: a page of the size of the board)",
-    )
-    parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
-    parser.add_argument("--json", **JSON)
+    },
+    "-o --output board.pdf": {"required": True, "help": "page to write"},
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

@@ -4,44 +4,37 @@ from __future__ import annotations
 
 import atexit
 import gc
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
 from ...exceptions import InvalidArgumentError
-from ..job import BUNDLE_ENDING, DOUBTFUL, Job, add_job_arguments, is_manifest
-from ..options import add_execution_options
+from ..job import BUNDLE_ENDING, DOUBTFUL, Job, is_manifest, job_options
+from ..options import Options, execution_options
 
 # Exit status of a refused calibration.
 REFUSED = 3
 
 EXAMPLE = "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal calibrate`."""
-    add_job_arguments(parser)
-    parser.add_argument(
-        "--from",
-        dest="source",
-        metavar=f"NAME{BUNDLE_ENDING}",
-        help="repeat the calibration of a bundle; a ROBOT and options that are named replace its own, and "
-        "DATA is added to its measurements",
-    )
-    add_execution_options(parser, "processes (default: 1; with a manifest, one per processor)", jobs=None)
-    parser.add_argument(
-        "--progress",
-        choices=("status", "lines"),
-        default="status",
-        help="status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` on "
-        "stderr for each step, for programs that run this command",
-    )
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help="exit status 4 for the verdict caution, and 3 for a refused robot with --force; the files are "
-        "written",
-    )
+ARGUMENTS: Options = {
+    **job_options(),
+    "--from": {
+        "dest": "source",
+        "metavar": f"NAME{BUNDLE_ENDING}",
+        "help": "repeat the calibration of a bundle; a ROBOT and options that are named replace its own, "
+        "and DATA is added to its measurements",
+    },
+    **execution_options("processes (default: 1; with a manifest, one per processor)", jobs=None),
+    "--progress": {
+        "choices": ("status", "lines"),
+        "default": "status",
+        "help": "status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` "
+        "on stderr for each step, for programs that run this command",
+    },
+    "--strict": "exit status 4 for the verdict caution, and 3 for a refused robot with --force; the files "
+    "are written",
+}
 
 
 def run(args: Namespace) -> int:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from dataclasses import asdict
 
 from ... import paper
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal check arm.dh.toml"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal check`."""
-    parser.add_argument("robot", **ROBOT)
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "robot": ROBOT,
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

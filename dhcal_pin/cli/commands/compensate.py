@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ... import io, robot
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_motion_options, add_urdf_options, read_robot_or_table
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, motion_options, read_robot_or_table
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -26,39 +26,26 @@ _COMPUTED_DIGITS = 15
 # Numbers that differ from a multiple of this angle by less than the tolerance are design values [rad].
 _DESIGN_ANGLE, _DESIGN_TOL = math.pi / 12, 1e-6
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal compensate`."""
-    parser.add_argument(
-        "nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help="robot model of the controller"
-    )
-    parser.add_argument(
-        "calibrated", metavar="CALIBRATED.urdf", type=ROBOT["type"], help="the same robot, calibrated"
-    )
-    parser.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="corrected.csv",
-        required=True,
-        help="joint values and corrected targets to write, one row per target",
-    )
-    add_urdf_options(parser)
-    parser.add_argument(
-        "--frame",
-        choices=FRAMES,
-        default=BASE,
-        help="frame of the targets: base (base link of the robot, default) or measuring (measuring frame of "
-        "the calibration)",
-    )
-    parser.add_argument(
-        "--tcp",
-        metavar="FRAME|FILE",
-        help="tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m and "
-        "rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
-    )
-    add_motion_options(parser, "rad")
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "nominal NOMINAL.urdf": {"type": ROBOT["type"], "help": "robot model of the controller"},
+    "calibrated CALIBRATED.urdf": {"type": ROBOT["type"], "help": "the same robot, calibrated"},
+    "targets targets.csv": "positions or poses of the tool",
+    "-o --output corrected.csv": {
+        "required": True,
+        "help": "joint values and corrected targets to write, one row per target",
+    },
+    **URDF_OPTIONS,
+    "--frame": {
+        "choices": FRAMES,
+        "default": BASE,
+        "help": "frame of the targets: base (base link of the robot, default) or measuring (measuring frame "
+        "of the calibration)",
+    },
+    "--tcp FRAME|FILE": "tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m "
+    "and rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
+    **motion_options("rad"),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

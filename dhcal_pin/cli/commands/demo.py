@@ -7,13 +7,13 @@ and a summary in Markdown are written into a folder.
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import io, paper, report, visualization
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, add_open_option
+from ..options import JSON, Options, open_option
 from ..screens.screen import Block, Screen
 
 if TYPE_CHECKING:
@@ -22,18 +22,15 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal demo -o demo"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal demo`."""
-    parser.add_argument(
-        *("-o", "--output", "--out"),
-        dest="out",
-        default="demo",
-        metavar="DIR",
-        help="folder for the results (default: %(default)s)",
-    )
-    add_open_option(parser, "the report")
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "-o --output --out DIR": {
+        "dest": "out",
+        "default": "demo",
+        "help": "folder for the results (default: %(default)s)",
+    },
+    **open_option("open the report in the browser"),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
 from ... import diagnostics, io, report
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 from ..output_table import Output
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
 
-
 OUTPUTS = {"json": Output(), "report": Output("the report of a difference", (".html",), (".htm",))}
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal diff`."""
-    text = "{} robot: a calibrated robot with its sidecar, or the nominal one"
-    parser.add_argument("first", metavar="A", type=ROBOT["type"], help=text.format("one"))
-    parser.add_argument("second", metavar="B", type=ROBOT["type"], help=text.format("the other"))
-    add_urdf_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="report with maps and both robots in 3-D (.html)")
-    parser.add_argument("--json", **JSON)
+_HELP = "{} robot: a calibrated robot with its sidecar, or the nominal one"
+ARGUMENTS: Options = {
+    "first A": {"type": ROBOT["type"], "help": _HELP.format("one")},
+    "second B": {"type": ROBOT["type"], "help": _HELP.format("the other")},
+    **URDF_OPTIONS,
+    "--report F.html": "report with maps and both robots in 3-D (.html)",
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

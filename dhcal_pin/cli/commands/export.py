@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal export ur10_calibrated.urdf --tip tool0 -o model.h"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal export`."""
-    parser.add_argument("robot", **ROBOT)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="FILE",
-        required=True,
-        help="file to write: NAME.h, a C99 header whose functions begin with the name of the file, or "
+ARGUMENTS: Options = {
+    "robot": ROBOT,
+    "-o --output FILE": {
+        "required": True,
+        "help": "file to write: NAME.h, a C99 header whose functions begin with the name of the file, or "
         "NAME.py, a Python module that needs NumPy only",
-    )
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+    },
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

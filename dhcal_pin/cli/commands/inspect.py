@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from dataclasses import asdict
 
 from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
-from ..options import DATA, JSON, RIG, ROBOT, add_table_options, add_urdf_options, read_one_robot
+from ..options import DATA, JSON, RIG, ROBOT, TABLE_OPTIONS, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 # Why some options need the robot.
@@ -18,22 +18,16 @@ _ROBOT_REASONS = {
     "servos": "whose joints the servos move",
 }
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal inspect`."""
-    parser.add_argument("data", **DATA)
-    parser.add_argument(
-        "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
-    )
-    add_table_options(parser)
-    parser.add_argument("--rig", **RIG)
-    parser.add_argument(
-        "--skip-bad-rows",
-        action="store_true",
-        help="as in other commands: rows that lack a number or a name are always skipped here, and listed",
-    )
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "data": DATA,
+    "--robot": {**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"},
+    **TABLE_OPTIONS,
+    "--rig": RIG,
+    "--skip-bad-rows": "as in other commands: rows that lack a number or a name are always skipped here, "
+    "and listed",
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

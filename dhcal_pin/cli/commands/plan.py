@@ -7,7 +7,7 @@ from argparse import Namespace
 from ... import planning, report
 from ...exceptions import InvalidArgumentError
 from ..options import read_one_robot
-from ..plan_options import add_arguments as add_arguments
+from ..plan_options import ARGUMENTS as ARGUMENTS
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import Any
 
 from ... import io, report, session
@@ -13,8 +13,9 @@ from ..options import (
     JSON,
     ROBOT,
     SKIP_BAD_ROWS,
-    add_table_options,
-    add_urdf_options,
+    TABLE_OPTIONS,
+    URDF_OPTIONS,
+    Options,
     read_data,
     read_one_robot,
 )
@@ -25,41 +26,29 @@ EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur
 # Exit status of each verdict.
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
-
 OUTPUTS = {
     "json": Output(),
     "history": Output("a history", (".jsonl",)),
     "plot": Output("a plot of the history", (".html",), (".htm",)),
 }
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal recheck`."""
-    parser.add_argument("robot", **{**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"})
-    parser.add_argument("data", **DATA)
-    add_urdf_options(parser)
-    add_table_options(parser)
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--sigma",
-        metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis of instrument and robot repeatability (default: the columns sigma "
-        "of DATA, else estimated from the measurements)",
-    )
-    parser.add_argument(
-        "--size",
-        metavar="LENGTH",
-        default="1mm",
-        help="smallest motion of the tool that the check must reveal; if it cannot, the answer is `cannot "
-        "say` (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--history", metavar="FILE.jsonl", help="add the check to this file, one JSON line each"
-    )
-    parser.add_argument(
-        "--plot", metavar="H.html", help="page with the checks of --history over time (.html)"
-    )
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "robot": {**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"},
+    "data": DATA,
+    **URDF_OPTIONS,
+    **TABLE_OPTIONS,
+    "--skip-bad-rows": SKIP_BAD_ROWS,
+    "--sigma LENGTH[,ANGLE]": "standard deviation per axis of instrument and robot repeatability (default: "
+    "the columns sigma of DATA, else estimated from the measurements)",
+    "--size LENGTH": {
+        "default": "1mm",
+        "help": "smallest motion of the tool that the check must reveal; if it cannot, the answer is "
+        "`cannot say` (default: %(default)s)",
+    },
+    "--history FILE.jsonl": "add the check to this file, one JSON line each",
+    "--plot H.html": "page with the checks of --history over time (.html)",
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from ... import estimation, io, robot
@@ -14,7 +14,8 @@ from ..options import (
     NON_NEGATIVE_INTEGER,
     POSITIVE_INTEGER,
     ROBOT,
-    add_urdf_options,
+    URDF_OPTIONS,
+    Options,
     read_robot_or_table,
 )
 
@@ -23,59 +24,42 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal simulate`."""
-    parser.add_argument("robot", metavar="ROBOT", type=ROBOT["type"], help=f"nominal {ROBOT['help']}")
-    parser.add_argument(
-        *("-n", "--count", "-m", "--samples"),
-        dest="samples",
-        type=POSITIVE_INTEGER,
-        required=True,
-        metavar="N",
-        help="number of samples",
-    )
-    parser.add_argument(
-        *("--sigma", "--noise"),
-        dest="noise",
-        default="0mm",
-        metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind camera "
-        "in pixels, such as 0.2px",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="T.urdf",
-        type=ROBOT["type"],
-        help="robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
+ARGUMENTS: Options = {
+    "robot ROBOT": {"type": ROBOT["type"], "help": f"nominal {ROBOT['help']}"},
+    "-n --count -m --samples N": {
+        "dest": "samples",
+        "type": POSITIVE_INTEGER,
+        "required": True,
+        "help": "number of samples",
+    },
+    "--sigma --noise LENGTH[,ANGLE]": {
+        "dest": "noise",
+        "default": "0mm",
+        "help": "standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind "
+        "camera in pixels, such as 0.2px",
+    },
+    "-o --output data.csv": {"required": True, "help": "measurement CSV file to write"},
+    "--truth T.urdf": {
+        "type": ROBOT["type"],
+        "help": "robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
         "directions of approach or temperatures, are drawn and written",
-    )
-    parser.add_argument(
-        "--errors",
-        metavar="LENGTH,ANGLE",
-        help="robot with random errors: standard deviations of the position and orientation of every joint "
-        "origin, such as 1mm,0.3deg; drawn with the seed",
-    )
-    parser.add_argument(
-        "--kind",
-        metavar="KIND",
-        default="pose",
-        help="kind of measurement (default: %(default)s): {kinds}; "
-        "camera: six points on the tip in two cameras of 4096 x 4096 px that stand still, in which 1 mm at "
-        "the robot is 1 px; their rig file NAME.rig.toml is written beside NAME.csv",
-    )
-    add_urdf_options(parser)
-    parser.add_argument(
-        "--seed",
-        metavar="N",
-        type=NON_NEGATIVE_INTEGER,
-        default=0,
-        help="random seed of joint values and noise (default: %(default)s)",
-    )
-    parser.add_argument("--json", **JSON)
+    },
+    "--errors LENGTH,ANGLE": "robot with random errors: standard deviations of the position and orientation "
+    "of every joint origin, such as 1mm,0.3deg; drawn with the seed",
+    "--kind KIND": {
+        "default": "pose",
+        "help": "kind of measurement (default: %(default)s): {kinds}; camera: six points on the tip in two "
+        "cameras of 4096 x 4096 px that stand still, in which 1 mm at the robot is 1 px; their rig file "
+        "NAME.rig.toml is written beside NAME.csv",
+    },
+    **URDF_OPTIONS,
+    "--seed N": {
+        "type": NON_NEGATIVE_INTEGER,
+        "default": 0,
+        "help": "random seed of joint values and noise (default: %(default)s)",
+    },
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

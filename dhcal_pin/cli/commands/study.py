@@ -7,27 +7,21 @@ interruption the same command resumes with the next block.
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 
 from ... import io, studies
-from ..options import JSON, add_execution_options
+from ..options import JSON, Options, execution_options
 
 EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal study`."""
-    parser.add_argument(
-        "study",
-        metavar="STUDY.toml",
-        help="grid of settings, or the name of a study that is part of the package: {shipped_studies}",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="results.csv", required=True, help="table to write, one row per setting"
-    )
-    add_execution_options(parser, "processes on this computer (default: %(default)s)", jobs=1)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "study STUDY.toml": "grid of settings, or the name of a study that is part of the package: "
+    "{shipped_studies}",
+    "-o --output results.csv": {"required": True, "help": "table to write, one row per setting"},
+    **execution_options("processes on this computer (default: %(default)s)", jobs=1),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,8 +15,9 @@ from ..options import (
     RIG,
     ROBOT,
     SKIP_BAD_ROWS,
-    add_table_options,
-    add_urdf_options,
+    TABLE_OPTIONS,
+    URDF_OPTIONS,
+    Options,
     read_data,
     read_one_robot,
 )
@@ -32,46 +33,31 @@ EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal u
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
 FRAMES_TOL = 1e-9
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal validate`."""
-    parser.add_argument("robot", **ROBOT)
-    parser.add_argument("data", **DATA)
-    add_urdf_options(parser)
-    add_table_options(parser)
-    parser.add_argument(
-        "--rig",
-        **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
-    )
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--sidecar",
-        metavar="S.toml",
-        help="file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
-    )
-    parser.add_argument(
-        "--nominal",
-        metavar="ROBOT",
-        type=ROBOT["type"],
-        help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
+ARGUMENTS: Options = {
+    "robot": ROBOT,
+    "data": DATA,
+    **URDF_OPTIONS,
+    **TABLE_OPTIONS,
+    "--rig": {
+        **RIG,
+        "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)",
+    },
+    "--skip-bad-rows": SKIP_BAD_ROWS,
+    "--sidecar S.toml": "file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
+    "--nominal ROBOT": {
+        "type": ROBOT["type"],
+        "help": "robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
-    )
-    parser.add_argument("--fit-frames", **FIT_FRAMES)
-    parser.add_argument(
-        "--map",
-        metavar="MAP",
-        help="write the predicted position uncertainty and the measured errors over the workspace (.csv or "
-        ".html)",
-    )
-    parser.add_argument(
-        "--iso9283",
-        action="store_true",
-        help="compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
-        "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` "
-        "writes it (default: rows with equal joint values are one point)",
-    )
-    parser.add_argument("--report", metavar="R.html", help="write a report (.html)")
-    parser.add_argument("--json", **JSON)
+    },
+    "--fit-frames": FIT_FRAMES,
+    "--map MAP": "write the predicted position uncertainty and the measured errors over the workspace (.csv "
+    "or .html)",
+    "--iso9283": "compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
+    "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` writes "
+    "it (default: rows with equal joint values are one point)",
+    "--report R.html": "write a report (.html)",
+    "--json": JSON,
+}
 
 
 class Given(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -15,12 +15,12 @@ from ..options import (
     FIT_FRAMES,
     JSON,
     POSITIVE_INTEGER,
-    RIG,
     ROBOT,
     SKIP_BAD_ROWS,
-    add_open_option,
-    add_table_options,
-    add_urdf_options,
+    TABLE_OPTIONS,
+    URDF_OPTIONS,
+    Options,
+    open_option,
     read_data,
     read_mounted_rig,
     read_robot_or_table,
@@ -34,49 +34,35 @@ OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal view`."""
-    parser.add_argument("nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help=ROBOT["help"])
-    parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
-    parser.add_argument(
-        "--data", **{**DATA, "help": f"{DATA['help']}; their poses are drawn and played"}, default=[]
-    )
-    add_table_options(parser)
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--rig",
-        metavar=RIG["metavar"],
-        help="cameras and boards to draw, with their poses (default: those of the calibrated robot, "
-        "which play image coordinates, too); needed for image coordinates of a robot that is not calibrated",
-    )
-    parser.add_argument(
-        "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"
-    )
-    add_open_option(parser, "the page", default=None)
-    parser.add_argument(
-        "--magnification",
-        metavar="S",
-        type=float,
-        default=1.0,
-        help="initial magnification of the errors, 1 to 500 (default: 1)",
-    )
-    parser.add_argument(
-        "--simplify",
-        metavar="N",
-        type=POSITIVE_INTEGER,
-        nargs="?",
-        default=60_000,
-        const=15_000,
-        help="maximum number of mesh triangles; fewer give a smaller page (default: "
-        "%(default)s; %(const)s without N)",
-    )
-    parser.add_argument(
-        "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
-    )
-    parser.add_argument("--fit-frames", **FIT_FRAMES)
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "nominal NOMINAL.urdf": {"type": ROBOT["type"], "help": ROBOT["help"]},
+    "calibrated CALIBRATED.urdf": {"nargs": "?", "help": "the same robot, calibrated"},
+    "--data": {**DATA, "help": f"{DATA['help']}; their poses are drawn and played", "default": []},
+    **TABLE_OPTIONS,
+    "--skip-bad-rows": SKIP_BAD_ROWS,
+    "--rig RIG.toml": "cameras and boards to draw, with their poses (default: those of the calibrated "
+    "robot, which play image coordinates, too); needed for image coordinates of a robot that is not "
+    "calibrated",
+    "--html FILE": "page to write (default: a temporary file, opened in the browser)",
+    **open_option("open the page in the browser"),
+    "--magnification S": {
+        "type": float,
+        "default": 1.0,
+        "help": "initial magnification of the errors, 1 to 500 (default: 1)",
+    },
+    "--simplify N": {
+        "type": POSITIVE_INTEGER,
+        "nargs": "?",
+        "default": 60_000,
+        "const": 15_000,
+        "help": "maximum number of mesh triangles; fewer give a smaller page (default: %(default)s; "
+        "%(const)s without N)",
+    },
+    "--live": "serve a moving scene on this computer until Ctrl-C, no page",
+    "--fit-frames": FIT_FRAMES,
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
