@@ -33,6 +33,7 @@ import pinocchio as pin
 
 from .. import se3
 from .._typing import Array, PathLike
+from ..calibration.presentation.workspace import uncertainty_cells
 from ..calibration.result import Result
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
@@ -46,7 +47,6 @@ from ..subsampling import evenly_spaced_indices
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .rig_lines import rig_lines
-from .uncertainty_cells import uncertainty_cells
 
 # Largest number of measured points and of configurations to play; more would make the page slow.
 MAX_POINTS = 2000
