@@ -106,10 +106,7 @@ async def serve(show_address: Callable[[str], object], *, port: int = 0, limit: 
 
 @contextmanager
 def _server_folder() -> Iterator[Path]:
-    """Create the locked folder of this server, and remove those of servers that were killed.
-
-    The system releases the lock of a process that is killed.
-    """
+    """Create the locked folder of this server; remove those of killed servers, which hold no lock."""
     for other in Path(gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         with suppress(OSError):
             state = other.lstat()

@@ -400,10 +400,7 @@ def read_tool(path: PathLike) -> Array:
 
 
 def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str) -> None:
-    """Require that the sidecar was written with this URDF, or with one that has the same joints.
-
-    Only the joints from the root to the tip count: a changed mesh or another gripper does not matter.
-    """
+    """Require that the sidecar was written with a URDF of the same joints from the root to the tip."""
     actual = hashlib.sha256(urdf.data).hexdigest()
     if manifest["urdf_sha256"] != actual and manifest["joints_sha256"] != _joints_digest(urdf, tip):
         raise FileFormatError(

@@ -45,19 +45,12 @@ CHUNK_SIZE = 2000
 
 @dataclass(frozen=True, eq=False)
 class WorkspacePrediction:
-    """Predicted accuracy in single configurations.
+    """Predicted accuracy in single configurations."""
 
-    Attributes:
-        points: Tool points in the base frame of s configurations all over the joint ranges, (s, 3) [m].
-        std: Predicted standard deviations of their positions, (s,) [m]; infinite if not determined.
-        measured: Tool points of the measured samples in the base frame, (m, 3) [m].
-        measured_std: Predicted standard deviations of their positions, (m,) [m].
-    """
-
-    points: Array
-    std: Array
-    measured: Array
-    measured_std: Array
+    points: Array  # Tool points in the base frame of s configurations all over the joint ranges, (s, 3) [m]
+    std: Array  # Predicted standard deviations of their positions, (s,) [m]; infinite if not determined
+    measured: Array  # Tool points of the measured samples in the base frame, (m, 3) [m]
+    measured_std: Array  # Predicted standard deviations of their positions, (m,) [m]
 
 
 def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
@@ -74,28 +67,20 @@ def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> Workspac
 
 @dataclass(frozen=True, eq=False)
 class WorkspaceMap:
-    """Predicted and measured accuracy by cells of the workspace.
+    """Predicted and measured accuracy by cells of the workspace."""
 
-    Attributes:
-        centre: Centres of the c cells that the tool reaches, in the measuring frame, (c, 3) [m].
-        size: Side of the cells [m].
-        std: Predicted RMS distance between tool and model over the configurations that reach the cell, (c,)
-            [m]; infinite if it is not determined.
-        worst: Largest predicted distance of these configurations, (c,) [m].
-        count: Number of configurations, (c,).
-        readings: Number of measured positions, (c,).
-        measured: RMS distance between measured and modelled positions, (c,) [m]; NaN without measurements.
-        expected: Predicted RMS distance in the measured configurations, without the noise of the instrument,
-            (c,) [m]; NaN without measurements.
-    """
-
-    centre: Array
-    size: float
+    centre: Array  # Centres of the c cells that the tool reaches, in the measuring frame, (c, 3) [m]
+    size: float  # Side of the cells [m]
+    # Predicted RMS distance between tool and model over the configurations that reach the cell, (c,) [m];
+    # infinite if it is not determined.
     std: Array
-    worst: Array
-    count: Array
-    readings: Array
+    worst: Array  # Largest predicted distance of these configurations, (c,) [m]
+    count: Array  # Number of configurations, (c,)
+    readings: Array  # Number of measured positions, (c,)
+    # RMS distance between measured and modelled positions, (c,) [m]; NaN without measurements.
     measured: Array
+    # Predicted RMS distance in the measured configurations, without the noise of the instrument, (c,) [m];
+    # NaN without measurements.
     expected: Array
 
 

@@ -265,10 +265,7 @@ def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str
 def _mounted_rig(
     args: Namespace, sidecar: str | None, chain: robot.Chain, servos: io.ServoFile | None
 ) -> tuple[MountedRig | None, list[str]]:
-    """Return the cameras and boards of the images, with the estimates of a calibration.
-
-    Without a rig file, they are those of the sidecar. Other measurements than images need none.
-    """
+    """Return the cameras and boards of images, of the sidecar without a rig file, and which are estimates."""
     from ...io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
     from ...measurements.mounting import mount_rig
 
