@@ -181,23 +181,8 @@ class ResultPlots:
             import pandas as pd  # lazy import: an optional package
         except ModuleNotFoundError:
             raise InvalidArgumentError("to_dataframe: pandas is not installed; pip install pandas") from None
-        rows = [
-            {
-                "name": e.name,
-                "unit": e.unit,
-                "nominal": e.nominal,
-                "value": e.value,
-                "change": e.change,
-                "std": e.std,
-                "prior": e.prior,
-                "observability": e.observability,
-                "fixed": e.fixed,
-                "category": e.category,
-                "frame": e.frame,
-                "direction": e.direction,
-            }
-            for e in self._result.estimates
-        ]
+        names = "name unit nominal value change std prior observability fixed category frame direction".split()
+        rows = [{name: getattr(e, name) for name in names} for e in self._result.estimates]
         return pd.DataFrame(rows).set_index("name")
 
     def summary(self) -> str:
