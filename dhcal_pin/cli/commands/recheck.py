@@ -8,17 +8,7 @@ from typing import Any
 
 from ... import io, report, session
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    JSON,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    TABLE_OPTIONS,
-    URDF_OPTIONS,
-    Options,
-    read_data,
-    read_one_robot,
-)
+from .. import options
 from ..output_table import Makers, Output
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
@@ -32,12 +22,12 @@ OUTPUTS = {
     "plot": Output("a plot of the history", (".html",), (".htm",)),
 }
 
-ARGUMENTS: Options = {
-    "robot": {**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"},
-    "data": DATA,
-    **URDF_OPTIONS,
-    **TABLE_OPTIONS,
-    "--skip-bad-rows": SKIP_BAD_ROWS,
+ARGUMENTS: options.Options = {
+    "robot": {**options.ROBOT, "help": f"calibrated {options.ROBOT['help']}, with its sidecar"},
+    "data": options.DATA,
+    **options.URDF_OPTIONS,
+    **options.TABLE_OPTIONS,
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
     "--sigma LENGTH[,ANGLE]": "standard deviation per axis of instrument and robot repeatability (default: "
     "the columns sigma of DATA, else estimated from the measurements)",
     "--size LENGTH": {
@@ -47,7 +37,7 @@ ARGUMENTS: Options = {
     },
     "--history FILE.jsonl": "add the check to this file, one JSON line each",
     "--plot H.html": "page with the checks of --history over time (.html)",
-    "--json": JSON,
+    "--json": options.JSON,
 }
 
 
@@ -70,7 +60,7 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")
     noise = Noise(*parse_noise(args.sigma, "--sigma")) if args.sigma else None
     size = parse_noise(args.size, "--size")[0]
-    chain = read_one_robot(args.robot, args)
+    chain = options.read_one_robot(args.robot, args)
     if sidecar is None:
         raise InvalidArgumentError(
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
@@ -80,7 +70,7 @@ def run(args: Namespace) -> int:
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
             raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
-    files = read_data(args, chain, servos)
+    files = options.read_data(args, chain, servos)
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
     data, known = [file.data for file in files], io.read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}

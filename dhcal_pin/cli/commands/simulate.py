@@ -9,26 +9,18 @@ from typing import TYPE_CHECKING
 
 from ... import estimation, io, robot
 from ...exceptions import InvalidArgumentError, UnknownNameError
-from ..options import (
-    JSON,
-    NON_NEGATIVE_INTEGER,
-    POSITIVE_INTEGER,
-    ROBOT,
-    URDF_OPTIONS,
-    Options,
-    read_robot_or_table,
-)
+from .. import options
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
-ARGUMENTS: Options = {
-    "robot ROBOT": {"type": ROBOT["type"], "help": f"nominal {ROBOT['help']}"},
+ARGUMENTS: options.Options = {
+    "robot ROBOT": {"type": options.ROBOT["type"], "help": f"nominal {options.ROBOT['help']}"},
     "-n --count -m --samples N": {
         "dest": "samples",
-        "type": POSITIVE_INTEGER,
+        "type": options.POSITIVE_INTEGER,
         "required": True,
         "help": "number of samples",
     },
@@ -40,7 +32,7 @@ ARGUMENTS: Options = {
     },
     "-o --output data.csv": {"required": True, "help": "measurement CSV file to write"},
     "--truth T.urdf": {
-        "type": ROBOT["type"],
+        "type": options.ROBOT["type"],
         "help": "robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
         "directions of approach or temperatures, are drawn and written",
     },
@@ -52,13 +44,13 @@ ARGUMENTS: Options = {
         "cameras of 4096 x 4096 px that stand still, in which 1 mm at the robot is 1 px; their rig file "
         "NAME.rig.toml is written beside NAME.csv",
     },
-    **URDF_OPTIONS,
+    **options.URDF_OPTIONS,
     "--seed N": {
-        "type": NON_NEGATIVE_INTEGER,
+        "type": options.NON_NEGATIVE_INTEGER,
         "default": 0,
         "help": "random seed of joint values and noise (default: %(default)s)",
     },
-    "--json": JSON,
+    "--json": options.JSON,
 }
 
 
@@ -83,7 +75,7 @@ def run(args: Namespace) -> int:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
     nominal = truth = io.read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
-        truth = read_robot_or_table(args.truth, args)
+        truth = options.read_robot_or_table(args.truth, args)
         if truth.joint_names != nominal.joint_names:
             raise InvalidArgumentError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "

@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    FIT_FRAMES,
-    JSON,
-    RIG,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    TABLE_OPTIONS,
-    URDF_OPTIONS,
-    Options,
-    read_data,
-    read_one_robot,
-)
+from .. import options
 from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
@@ -33,30 +21,30 @@ EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal u
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
 FRAMES_TOL = 1e-9
 
-ARGUMENTS: Options = {
-    "robot": ROBOT,
-    "data": DATA,
-    **URDF_OPTIONS,
-    **TABLE_OPTIONS,
+ARGUMENTS: options.Options = {
+    "robot": options.ROBOT,
+    "data": options.DATA,
+    **options.URDF_OPTIONS,
+    **options.TABLE_OPTIONS,
     "--rig": {
-        **RIG,
-        "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)",
+        **options.RIG,
+        "help": f"{options.RIG['help']} (default: those of the sidecar, as a calibration estimated them)",
     },
-    "--skip-bad-rows": SKIP_BAD_ROWS,
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
     "--sidecar S.toml": "file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
     "--nominal ROBOT": {
-        "type": ROBOT["type"],
+        "type": options.ROBOT["type"],
         "help": "robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
     },
-    "--fit-frames": FIT_FRAMES,
+    "--fit-frames": options.FIT_FRAMES,
     "--map MAP": "write the predicted position uncertainty and the measured errors over the workspace (.csv "
     "or .html)",
     "--iso9283": "compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
     "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` writes "
     "it (default: rows with equal joint values are one point)",
     "--report R.html": "write a report (.html)",
-    "--json": JSON,
+    "--json": options.JSON,
 }
 
 
@@ -171,11 +159,11 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
     from ...measurements.position import require_common_reference_target  # lazy import: loads Pinocchio
 
-    chain = read_one_robot(args.robot, args, sidecar)
+    chain = options.read_one_robot(args.robot, args, sidecar)
     servos = io.read_servos(args.servos) if args.servos else None
     rig, estimated = _mounted_rig(args, sidecar, chain, servos)
     predictor = _predictor(chain, sidecar, args) if args.map else None
-    files = read_data(args, chain, servos, rig)
+    files = options.read_data(args, chain, servos, rig)
     instrument = io.read_instrument(sidecar) if sidecar else {}
     require_common_reference_target({file.source: file.data for file in files}, instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
@@ -304,7 +292,7 @@ def _nominal_accuracy(
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
     import numpy as np  # lazy import, as the following
 
-    nominal = read_one_robot(args.nominal, args)
+    nominal = options.read_one_robot(args.nominal, args)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "

@@ -10,21 +10,7 @@ from typing import TYPE_CHECKING
 
 from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    FIT_FRAMES,
-    JSON,
-    POSITIVE_INTEGER,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    TABLE_OPTIONS,
-    URDF_OPTIONS,
-    Options,
-    open_option,
-    read_data,
-    read_mounted_rig,
-    read_robot_or_table,
-)
+from .. import options
 from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
@@ -34,24 +20,28 @@ OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
-ARGUMENTS: Options = {
-    "nominal NOMINAL.urdf": {"type": ROBOT["type"], "help": ROBOT["help"]},
+ARGUMENTS: options.Options = {
+    "nominal NOMINAL.urdf": {"type": options.ROBOT["type"], "help": options.ROBOT["help"]},
     "calibrated CALIBRATED.urdf": {"nargs": "?", "help": "the same robot, calibrated"},
-    "--data": {**DATA, "help": f"{DATA['help']}; their poses are drawn and played", "default": []},
-    **TABLE_OPTIONS,
-    "--skip-bad-rows": SKIP_BAD_ROWS,
+    "--data": {
+        **options.DATA,
+        "help": f"{options.DATA['help']}; their poses are drawn and played",
+        "default": [],
+    },
+    **options.TABLE_OPTIONS,
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
     "--rig RIG.toml": "cameras and boards to draw, with their poses (default: those of the calibrated "
     "robot, which play image coordinates, too); needed for image coordinates of a robot that is not "
     "calibrated",
     "--html FILE": "page to write (default: a temporary file, opened in the browser)",
-    **open_option("open the page in the browser"),
+    **options.open_option("open the page in the browser"),
     "--magnification S": {
         "type": float,
         "default": 1.0,
         "help": "initial magnification of the errors, 1 to 500 (default: 1)",
     },
     "--simplify N": {
-        "type": POSITIVE_INTEGER,
+        "type": options.POSITIVE_INTEGER,
         "nargs": "?",
         "default": 60_000,
         "const": 15_000,
@@ -59,9 +49,9 @@ ARGUMENTS: Options = {
         "%(const)s without N)",
     },
     "--live": "serve a moving scene on this computer until Ctrl-C, no page",
-    "--fit-frames": FIT_FRAMES,
-    **URDF_OPTIONS,
-    "--json": JSON,
+    "--fit-frames": options.FIT_FRAMES,
+    **options.URDF_OPTIONS,
+    "--json": options.JSON,
 }
 
 
@@ -86,11 +76,11 @@ def run(args: Namespace) -> int:
     require_writable_outputs([page, args.json], inputs)
     require_workbook(args.sheet, inputs)
     require_endings(chosen_files(vars(args), OUTPUTS))
-    chains = [read_robot_or_table(path, args) for path in robots]
+    chains = [options.read_robot_or_table(path, args) for path in robots]
     sidecar = io.existing_sidecar(robots[-1])
-    rig = read_mounted_rig(args.rig, sidecar, chains[-1])
+    rig = options.read_mounted_rig(args.rig, sidecar, chains[-1])
     servos = io.read_servos(args.servos) if args.servos else None
-    files = read_data(args, chains[0], servos, rig)
+    files = options.read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
     known = io.read_instrument(sidecar) if sidecar else {}
     predictor = io.read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
