@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import SUPPRESS, Namespace
 
+from .. import screens
 from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, Options, open_option
 
 EXAMPLE = "dhcal app"
@@ -30,12 +31,11 @@ def run(args: Namespace) -> int:
     import asyncio  # lazy import, as the following: slow to load
 
     from ...app import serve
-    from ..screens import console
 
     def show_address(url: str) -> None:
-        console.print_lines(url, "end with Ctrl-C")
+        screens.print_lines(url, "end with Ctrl-C")
         if args.open is not False:
-            console.open_url(url)
+            screens.open_url(url)
 
     asyncio.run(serve(show_address, port=args.port, limit=args.max_size * _MEGABYTE))
     return 0

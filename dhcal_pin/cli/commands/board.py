@@ -6,6 +6,7 @@ from argparse import Namespace
 
 from ... import detection, io
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import JSON, Options
 
 EXAMPLE = "dhcal board rig.toml --paper a4 -o board.pdf"
@@ -25,9 +26,7 @@ ARGUMENTS: Options = {
 
 def run(args: Namespace) -> int:
     """Draw a board."""
-    from ..outputs import require_writable_outputs, write_with_json  # lazy import, as the following
-    from ..screens import console
-    from ..screens.result_screens import files_screen
+    from ..outputs import require_writable_outputs, write_with_json  # lazy import: loads Pinocchio
 
     require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
@@ -42,6 +41,6 @@ def run(args: Namespace) -> int:
             "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length "
             f"to [board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a plate."
         )
-    console.show(files_screen([args.output]), args.verbosity)
-    console.print_lines(advice)
+    screens.show(screens.files_screen([args.output]), args.verbosity)
+    screens.print_lines(advice)
     return 0

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..job import BUNDLE_ENDING, DOUBTFUL, Job, is_manifest, job_options
 from ..options import Options, execution_options
 
@@ -73,12 +74,11 @@ def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
     from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from ..bundled_job import job_source, run_any_job
-    from ..screens import console
     from ..screens.calibration_screen import calibration_screen
 
     shown = {
-        "status": console.show_progress("reading the files"),
-        "lines": nullcontext(console.print_progress),
+        "status": screens.show_progress("reading the files"),
+        "lines": nullcontext(screens.print_progress),
     }
     with (
         job_source(args) as (job, folder),
@@ -86,7 +86,7 @@ def _calibrate_robot(args: Namespace) -> int:
         shown[args.progress] as progress,
     ):
         outcome = run_any_job(job, folder, progress, executor)
-    console.show(calibration_screen(outcome, job), args.verbosity)
+    screens.show(calibration_screen(outcome, job), args.verbosity)
     verdict = outcome.fit.verdict
     if verdict.is_refused and (args.strict or not job.force):
         return REFUSED

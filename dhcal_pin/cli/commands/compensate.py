@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from ... import io, robot
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import JSON, ROBOT, URDF_OPTIONS, Options, motion_options, read_robot_or_table
 
 if TYPE_CHECKING:
@@ -54,8 +55,6 @@ def run(args: Namespace) -> int:
     from ...programs import program_text, require_program_ending
     from ..output_table import numbered
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import compensation_screen
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
@@ -65,7 +64,7 @@ def run(args: Namespace) -> int:
         require_program_ending(path)
     nominal, calibrated = read_robots(args)
     targets = io.read_targets(args.targets, calibrated)
-    with console.progress_bar("compensating", len(targets.values)) as progress:
+    with screens.progress_bar("compensating", len(targets.values)) as progress:
         result = compensate(nominal, calibrated, targets.values, targets.near, progress, targets.conditions)
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
     for path in args.export:
@@ -82,7 +81,7 @@ def run(args: Namespace) -> int:
         status=list(result.status),
         warnings=[f"{args.nominal}: {warning}"] if warning else [],
     )
-    screen = compensation_screen(
+    screen = screens.compensation_screen(
         f"targets: {_tool_text(args, calibrated)} in {frame}",
         result,
         calibrated,
@@ -91,7 +90,7 @@ def run(args: Namespace) -> int:
         _frame_hint(args, result),
         contents,
     )
-    console.show(screen, args.verbosity)
+    screens.show(screen, args.verbosity)
     return 0
 
 

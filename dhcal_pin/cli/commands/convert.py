@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from ... import io
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
@@ -44,15 +45,13 @@ def run(args: Namespace) -> int:
     """Convert a robot file to the format that the ending of the output selects, or a recording."""
     from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     others = [path for path in (args.robot, args.template) if path]
     inputs = [args.input, *others]
     require_writable_outputs([args.output, args.json], inputs)
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=list(notes))
-    console.show(files_screen([args.output], notes), args.verbosity)
+    screens.show(screens.files_screen([args.output], notes), args.verbosity)
     return 0
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import io, paper, report, visualization
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import JSON, Options, open_option
 from ..screens.screen import Block, Screen
 
@@ -39,7 +40,6 @@ def run(args: Namespace) -> int:
     from ...formatting import Table
     from ...paper import simulations
     from ..outputs import require_writable_outputs
-    from ..screens import console
 
     require_writable_outputs([args.json], [])
     folder = args.out
@@ -71,11 +71,11 @@ def run(args: Namespace) -> int:
         Block(excluded, "yellow", noun="excluded row of Table 5", rank=0, n_kept=0, has_space=True),
         Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
     ]
-    console.show(
+    screens.show(
         Screen(blocks, lambda: [block for section in details for block in section.blocks()]), args.verbosity
     )
     if args.open:
-        console.open_page(document["files"]["report"])
+        screens.open_page(document["files"]["report"])
     return 0
 
 

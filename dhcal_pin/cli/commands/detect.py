@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ... import detection, io
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import JSON, POSITIVE_INTEGER, RIG, Options
 
 if TYPE_CHECKING:
@@ -78,8 +79,6 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     """Find the corners in images and write them."""
     from ...io.measurement_files.columns import IN_ORDER  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
@@ -97,7 +96,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
         place = {name: number for number, name in enumerate(read.joints)}
         paths.sort(key=lambda path: place[os.path.basename(path)])
         comments.append(IN_ORDER)
-    with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
+    with screens.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detection.detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = detection.corner_columns(rig, camera, detections, joints)
     used = {image.path for each in detections for image in each.used}
@@ -133,7 +132,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     named = {"output": args.output} | ({"overlay": args.overlay} if args.overlay else {})
     write_with_json(contents, args.json, named, inputs, boards=boards, notes=notes)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
-    console.show(detection_screen(detections, notes, written), args.verbosity)
+    screens.show(screens.detection_screen(detections, notes, written), args.verbosity)
     return 0
 
 

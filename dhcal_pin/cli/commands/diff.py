@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 
 from ... import diagnostics, io, report
+from .. import screens
 from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 from ..output_table import Output
 
@@ -27,8 +28,6 @@ def run(args: Namespace) -> int:
     """Compare two robots, write the difference and show it."""
     from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import difference_screen
 
     robots = [args.first, args.second]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -40,7 +39,7 @@ def run(args: Namespace) -> int:
         outputs, {"report": lambda path: report.difference_page(names, difference, digests)}
     )
     write_outputs(contents, args.json, document)
-    console.show(difference_screen(difference, contents), args.verbosity)
+    screens.show(screens.difference_screen(difference, contents), args.verbosity)
     return 0
 
 

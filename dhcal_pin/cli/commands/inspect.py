@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import DATA, JSON, RIG, ROBOT, TABLE_OPTIONS, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
@@ -36,8 +37,6 @@ def run(args: Namespace) -> int:
         return _inspect_bundle(args)
     from ...measurements.mounting import mount_rig  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import inspection_screen
 
     for option, reason in _ROBOT_REASONS.items():
         if getattr(args, option) and not args.robot:
@@ -66,15 +65,13 @@ def run(args: Namespace) -> int:
     about = ""
     if chain is not None:
         about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
-    console.show(inspection_screen(about, inspections), args.verbosity)
+    screens.show(screens.inspection_screen(about, inspections), args.verbosity)
     return 0
 
 
 def _inspect_bundle(args: Namespace) -> int:
     """Show what a bundle holds."""
-    from ..outputs import require_writable_outputs, write_outputs  # lazy import, as the following
-    from ..screens import console
-    from ..screens.result_screens import bundle_screen
+    from ..outputs import require_writable_outputs, write_outputs  # lazy import: loads Pinocchio
 
     if len(args.data) > 1 or args.robot or args.columns or args.rig:
         raise InvalidArgumentError(f"{args.data[0]}: a bundle is inspected alone; leave out other files")
@@ -97,5 +94,5 @@ def _inspect_bundle(args: Namespace) -> int:
         "sha256": bundle.digests,
     }
     write_outputs({}, args.json, document)
-    console.show(bundle_screen(document, bundle.result), args.verbosity)
+    screens.show(screens.bundle_screen(document, bundle.result), args.verbosity)
     return 0

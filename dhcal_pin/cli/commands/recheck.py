@@ -8,7 +8,7 @@ from typing import Any
 
 from ... import io, report, session
 from ...exceptions import InvalidArgumentError
-from .. import options
+from .. import options, screens
 from ..output_table import Makers, Output
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
@@ -49,8 +49,6 @@ def run(args: Namespace) -> int:
     from ...units import parse_noise
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import recheck_screen
 
     sidecar = io.existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
@@ -93,5 +91,5 @@ def run(args: Namespace) -> int:
     contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(recheck_screen(result, notes, contents), args.verbosity)
+    screens.show(screens.recheck_screen(result, notes, contents), args.verbosity)
     return STATUS[result.verdict]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ... import estimation, io, robot
 from ...exceptions import InvalidArgumentError, UnknownNameError
-from .. import options
+from .. import options, screens
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
@@ -61,8 +61,6 @@ def run(args: Namespace) -> int:
     from ...measurements import KINDS, Noise
     from ...units import parse_noise
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -98,13 +96,13 @@ def run(args: Namespace) -> int:
     facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
-    console.show(files_screen(contents), args.verbosity)
+    screens.show(screens.files_screen(contents), args.verbosity)
     return 0
 
 
 def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
     """Return joint positions with random values of the conditions that the robot depends on."""
-    import numpy as np  # lazy import, as the following: they are slow to load
+    import numpy as np  # lazy import: slow to load
 
     rng = np.random.default_rng([seed, 2])
     needed = {family.condition for family in truth.error_families}
@@ -123,7 +121,7 @@ def _length_of_pixels(noise: str) -> str:
 
 def _with_random_errors(nominal: robot.Chain, length: float, angle: float, seed: int) -> robot.Chain:
     """Move every joint origin by normally distributed errors, with standard deviations in m and rad."""
-    import numpy as np  # lazy import, as the following: they are slow to load
+    import numpy as np  # lazy import: slow to load
 
     errors = estimation.select_parameters(nominal, "placement")
     std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])

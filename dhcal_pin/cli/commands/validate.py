@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
-from .. import options
+from .. import options, screens
 from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
@@ -92,8 +92,6 @@ def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
     from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or io.existing_sidecar(args.robot)
     nominal = [args.nominal] if args.nominal else []
@@ -150,8 +148,8 @@ def run(args: Namespace) -> int:
     title = f"{args.robot}: accuracy on {document['samples']} samples"
     shown = {name: path for name, path in files.items() if name != "json"}
     tables = characteristics.tables() if characteristics else []
-    screen = validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
-    console.show(screen, args.verbosity)
+    screen = screens.validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
+    screens.show(screen, args.verbosity)
     return 0
 
 
@@ -218,12 +216,11 @@ def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
     from ...calibration.evaluation import compute_errors, find_inliers, take_errors  # lazy import
     from ...calibration.summary import statistic
     from ...measurements.groups import ERROR_GROUPS
-    from ..screens.screen import list_first
 
     errors = compute_errors(judged.chain, data, judged.known)
     masks = find_inliers(errors)
     rows = [(item.source, item.rows[~mask].tolist()) for item, mask in zip(data, masks, strict=True)]
-    texts = [f"{source}: {list_first(lines)}" for source, lines in rows if lines]
+    texts = [f"{source}: {screens.list_first(lines)}" for source, lines in rows if lines]
     if not texts:
         return []
     group, rest = next(iter(calibration.Accuracy.from_errors(take_errors(errors, masks)).groups.items()))
@@ -290,7 +287,7 @@ def _nominal_accuracy(
     chain: robot.Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
 ) -> tuple[calibration.Accuracy, tuple[robot.Chain, Mapping[str, float]], list[str]]:
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
-    import numpy as np  # lazy import, as the following
+    import numpy as np  # lazy import: slow to load
 
     nominal = options.read_one_robot(args.nominal, args)
     if nominal.joint_names != chain.joint_names:

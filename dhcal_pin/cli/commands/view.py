@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
-from .. import options
+from .. import options, screens
 from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
@@ -59,8 +59,6 @@ def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
     from ...visualization import scene  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     if args.live and (args.html or args.open or args.json):
         raise InvalidArgumentError("--live writes no page; omit --html, --open and --json")
@@ -106,9 +104,9 @@ def run(args: Namespace) -> int:
     findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(files_screen([page], notes, warnings), args.verbosity)
+    screens.show(screens.files_screen([page], notes, warnings), args.verbosity)
     if args.open if args.open is not None else not args.html:
-        console.open_page(page)
+        screens.open_page(page)
     return 0
 
 
@@ -117,13 +115,12 @@ def _serve_live(chains: Sequence[robot.Chain], data: Sequence[Measurement], args
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ...visualization import live
-    from ..screens import console
 
     q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
     with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:
-        console.print_lines(server.url, "end with Ctrl-C")
+        screens.print_lines(server.url, "end with Ctrl-C")
         if args.open is not False:
-            console.open_url(server.url)
+            screens.open_url(server.url)
         try:
             while True:
                 server.play(q)
