@@ -202,12 +202,12 @@ def _accuracy_on_all(
 
 def _document(done: report.Validation, judged: Judged) -> dict[str, Any]:
     """Create the part of the JSON document that a calibration has, too."""
+    models = (judged.before, list(judged.accuracies.values())[-1], judged.alone)
+    before, after, alone = map(report.main_statistics, models)
     if judged.fit:
         document = report.result_to_dict(judged.fit, {}, done.inputs, is_calibration=False)
     else:
-        document = report.validation_to_dict(done.chain, done.data, done.inputs, done.known)
-    before, alone = report.main_statistics(judged.before), report.main_statistics(judged.alone)
-    after = report.main_statistics(list(judged.accuracies.values())[-1])
+        document = report.validation_to_dict(done.data, done.inputs, before, after)
     return document | {"before": before, "after": after, "urdf_alone": {"before": before, "after": alone}}
 
 
