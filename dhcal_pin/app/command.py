@@ -150,16 +150,12 @@ def _read_json(folder: Path) -> Any:
 
 
 class _Run:
-    """One run of `dhcal` in a folder.
-
-    Attributes:
-        status: Exit status; None before the end.
-    """
+    """One run of `dhcal` in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._last_line = ""
-        self.status: int | None = None
+        self.status: int | None = None  # Exit status; None before the end
 
     async def lines(self, *words: str) -> AsyncGenerator[str, None]:
         """Run a command and yield the lines that it prints on stderr; stop it if the caller stops."""

@@ -106,10 +106,7 @@ async def serve(show_address: Callable[[str], object], *, port: int = 0, limit: 
 
 @contextmanager
 def _server_folder() -> Iterator[Path]:
-    """Create the locked folder of this server, and remove those of servers that were killed.
-
-    The system releases the lock of a process that is killed.
-    """
+    """Create the locked folder of this server; remove those of killed servers, which hold no lock."""
     for other in Path(gettempdir()).glob(f"{_FOLDER_PREFIX}*"):
         with suppress(OSError):
             state = other.lstat()
@@ -132,11 +129,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 class Job:
-    """Run of an operation: its messages, and the requests that follow it.
-
-    Attributes:
-        task: The run.
-    """
+    """Run of an operation: its messages, and the requests that follow it."""
 
     def __init__(self, messages: AsyncGenerator[dict[str, Any], None], patience: float) -> None:
         """Start a run; it is stopped when nothing has followed it for `patience` seconds."""
@@ -184,18 +177,12 @@ class Job:
 
 
 class _Service:
-    """What the requests share.
-
-    Attributes:
-        folder: Folder in which each calculation has a folder of its own.
-        limit: Largest size of all files of a request [bytes].
-        jobs: Jobs that run, and calibrations that have ended, by their names.
-    """
+    """What the requests share."""
 
     def __init__(self, folder: Path, limit: int) -> None:
-        self.folder = folder
-        self.limit = limit
-        self.jobs: dict[str, Job] = {}
+        self.folder = folder  # Folder in which each calculation has a folder of its own
+        self.limit = limit  # Largest size of all files of a request [bytes]
+        self.jobs: dict[str, Job] = {}  # Jobs that run, and calibrations that have ended, by their names
 
     def start(self, operation: Operation, content_type: str, body: bytearray) -> str:
         """Start an operation on the files of a form, and return the name of its job."""

@@ -14,7 +14,7 @@ A job contains text and numbers only, so it can be sent to another process.
 from __future__ import annotations
 
 import shlex
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
@@ -254,15 +254,17 @@ def given_options(args: Namespace) -> dict[str, Any]:
     }
 
 
-def add_job_arguments(parser: ArgumentParser) -> None:
+def job_options() -> options.Options:
     """Declare the options of a job; those that are not named are absent from the arguments."""
+    table: dict[str, Any] = {}
     for option in fields(Job):
         keywords = {key: v for key, v in option.metadata.items() if key not in ("flags", "output")}
         if option.default is False:
             keywords["action"] = "store_true"
         elif option.default == ():
             keywords["action"] = "append"
-        parser.add_argument(*option_flags(option), **{**keywords, "default": None})
+        table[" ".join(option_flags(option))] = {**keywords, "default": None}
+    return table
 
 
 def is_manifest(path: str) -> bool:

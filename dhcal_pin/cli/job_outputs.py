@@ -25,18 +25,14 @@ SERVO_ENDING = ".servos.toml"
 
 
 class RobotOutput(NamedTuple):
-    """Format of the calibrated robot.
+    """Format of the calibrated robot."""
 
-    Attributes:
-        help: What the file is, for the help of --output.
-        files: Function that makes the files of the robot by path, from the value of --output and all options
-            of the job by name, with the corrected servos as `servo_file`.
-        require: Function that refuses what the format cannot hold before the calibration, from the nominal
-            robot, the value of --output and all options of the job by name.
-    """
-
-    help: str
+    help: str  # What the file is, for the help of --output
+    # Function that makes the files of the robot by path, from the value of --output and all options of the
+    # job by name, with the corrected servos as `servo_file`.
     files: Callable[[Result, str, Mapping[str, Any]], dict[PathLike, str | bytes]]
+    # Function that refuses what the format cannot hold before the calibration, from the nominal robot, the
+    # value of --output and all options of the job by name.
     require: Callable[[Chain, str, Mapping[str, Any]], None] = lambda chain, output, options: None
 
 

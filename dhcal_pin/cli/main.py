@@ -10,43 +10,34 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from types import FrameType
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 from ..exceptions import DhcalError
 from ..messages import message_line
-from .options import CommandParser, HelpFormatter, add_verbosity_options
+from .options import VERBOSITY_OPTIONS, CommandParser, HelpFormatter, add_options
 
-
-class Command(NamedTuple):
-    """One command of `dhcal`."""
-
-    # Word on the command line, and module of `cli.commands` with `EXAMPLE`, `add_arguments(parser)` and
-    # `run(args) -> int`.
-    name: str
-    help: str  # One line for `dhcal --help`
-
-
-COMMANDS = (
-    Command("demo", "reproduce the experiment and the simulations of the paper"),
-    Command("calibrate", "estimate the errors of a robot and write the corrected URDF"),
-    Command("inspect", "say what measurement files contain, without a fit"),
-    Command("validate", "compute the accuracy of a robot model on measurements"),
-    Command("diff", "compare two calibrations of one robot"),
-    Command("recheck", "check with a few poses whether a robot is still calibrated"),
-    Command("convert", "convert a robot file to another format, or a bag of ROS to measurements"),
-    Command("view", "show the nominal and the calibrated robot on one offline web page"),
-    Command("check", "compare the Jacobian with the paper, Pinocchio and finite differences"),
-    Command("plan", "choose the poses to measure and predict the resulting accuracy"),
-    Command("simulate", "simulate measurements of a robot with known errors"),
-    Command("compensate", "compute joint values and targets that correct the errors"),
-    Command("export", "write the calibrated model as C or Python code for other programs"),
-    Command("detect", "find the corners of boards in images and write their image coordinates"),
-    Command("board", "draw a board to print, at its true scale"),
-    Command("app", "serve a page on this computer that calibrates a robot from dropped files"),
-    Command("doctor", "say what is installed and whether it works"),
-    Command("completion", "print a completion script for bash, zsh or fish"),
-    Command("study", "simulate calibrations over a grid of settings"),
-)
+# Commands with their help. A word on the command line is the name of a module of `cli.commands`.
+COMMANDS = {
+    "demo": "reproduce the experiment and the simulations of the paper",
+    "calibrate": "estimate the errors of a robot and write the corrected URDF",
+    "inspect": "say what measurement files contain, without a fit",
+    "validate": "compute the accuracy of a robot model on measurements",
+    "diff": "compare two calibrations of one robot",
+    "recheck": "check with a few poses whether a robot is still calibrated",
+    "convert": "convert a robot file to another format, or a bag of ROS to measurements",
+    "view": "show the nominal and the calibrated robot on one offline web page",
+    "check": "compare the Jacobian with the paper, Pinocchio and finite differences",
+    "plan": "choose the poses to measure and predict the resulting accuracy",
+    "simulate": "simulate measurements of a robot with known errors",
+    "compensate": "compute joint values and targets that correct the errors",
+    "export": "write the calibrated model as C or Python code for other programs",
+    "detect": "find the corners of boards in images and write their image coordinates",
+    "board": "draw a board to print, at its true scale",
+    "app": "serve a page on this computer that calibrates a robot from dropped files",
+    "doctor": "say what is installed and whether it works",
+    "completion": "print a completion script for bash, zsh or fish",
+    "study": "simulate calibrations over a grid of settings",
+}
 
 
 class _LazyCommandParser(CommandParser):
@@ -77,8 +68,7 @@ class _LazyCommandParser(CommandParser):
         self._has_arguments = True
         module = import_module(f".commands.{self._module}", __package__)
         self.epilog = f"example:\n  {module.EXAMPLE}"
-        module.add_arguments(self)
-        add_verbosity_options(self)
+        add_options(self, {**module.ARGUMENTS, **VERBOSITY_OPTIONS})
         self.set_defaults(run=module.run)
 
 
@@ -104,28 +94,24 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", dest="command", metavar="COMMAND", required=True, parser_class=_LazyCommandParser
     )
-    for command in COMMANDS:
-        commands.add_parser(
-            command.name, help=command.help, **_parser_options(command), formatter_class=HelpFormatter
-        )
+    for name, text in COMMANDS.items():
+        commands.add_parser(name, help=text, **_parser_options(name))
     return parser
 
 
 def command_parsers() -> dict[str, argparse.ArgumentParser]:
     """Build the complete parsers of all commands, for their documentation."""
-    out: dict[str, argparse.ArgumentParser] = {}
-    for command in COMMANDS:
-        parser = _LazyCommandParser(
-            prog=f"dhcal {command.name}", **_parser_options(command), formatter_class=HelpFormatter
-        )
+    out = {}
+    for name in COMMANDS:
+        parser = out[name] = _LazyCommandParser(prog=f"dhcal {name}", **_parser_options(name))
         parser.declare_arguments()
-        out[command.name] = parser
     return out
 
 
-def _parser_options(command: Command) -> dict[str, Any]:
+def _parser_options(name: str) -> dict[str, Any]:
     """Return the arguments of the parser of a command."""
-    return {"module": command.name, "description": f"{command.help[0].upper()}{command.help[1:]}."}
+    description = f"{COMMANDS[name][0].upper()}{COMMANDS[name][1:]}."
+    return {"module": name, "description": description, "formatter_class": HelpFormatter}
 
 
 class _NotedInterrupt:

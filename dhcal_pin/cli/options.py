@@ -1,8 +1,8 @@
 """Parser classes, shared options and help texts of the commands.
 
-Shared options are dictionaries of keyword arguments of `argparse.ArgumentParser.add_argument`:
+Shared options are rows of the tables `ARGUMENTS` of commands:
 
-    parser.add_argument("--tip", **TIP)
+    ARGUMENTS = {"--tip": TIP}
 
 Help texts may contain placeholders such as `{losses}`. When the help is printed they are replaced by names
 and descriptions from the modules that define them. A new loss or measurement kind therefore appears without
@@ -102,6 +102,34 @@ def robot_path(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+# --- tables of options -----------------------------------------------------------------------------
+
+
+class Exclusive(NamedTuple):
+    """Options of which a command line may name one."""
+
+    options: Options
+
+
+# Arguments of a command in the order of its help. A key is the usage, such as `-o --output FILE`. A value has
+# keywords of `ArgumentParser.add_argument`, or the help only; without a placeholder this is that of a switch.
+Options = Mapping[str, "str | Mapping[str, Any] | Exclusive"]
+
+
+def add_options(parser: argparse._ActionsContainer, table: Options) -> None:
+    """Declare the arguments of a table."""
+    for usage, content in table.items():
+        if isinstance(content, Exclusive):
+            add_options(parser.add_mutually_exclusive_group(), content.options)
+            continue
+        words = usage.split()
+        has_placeholder = len(words) > 1 and not words[-1].startswith("-")
+        placeholder = {"metavar": words.pop()} if has_placeholder else {}
+        if isinstance(content, str):
+            content = {"help": content} if has_placeholder else {"help": content, "action": "store_true"}
+        parser.add_argument(*words, **placeholder, **content)
+
+
 # --- shared options --------------------------------------------------------------------------------
 
 ROBOT: dict[str, Any] = {
@@ -182,18 +210,61 @@ SCHEDULER: dict[str, Any] = {
 }
 
 
-def add_urdf_options(parser: argparse.ArgumentParser) -> None:
-    """Add --tip, --root and --package-dir, the options of every command that reads a URDF."""
-    parser.add_argument("--tip", **TIP)
-    parser.add_argument("--root", **ROOT)
-    parser.add_argument("--package-dir", action="append", default=[], **PACKAGE_DIR)
+# Options of every command that reads a URDF.
+URDF_OPTIONS: Options = {
+    "--tip": TIP,
+    "--root": ROOT,
+    "--package-dir": {"action": "append", "default": [], **PACKAGE_DIR},
+}
+# How tables of measurements are read.
+TABLE_OPTIONS: Options = {"--columns": COLUMNS, "--sheet": SHEET, "--servos": SERVOS}
+# Options of all commands.
+_VERBOSITY: dict[str, Any] = {"dest": "verbosity", "action": "store_const", "default": "normal"}
+VERBOSITY_OPTIONS: Options = {
+    "--quiet|--verbose": Exclusive(
+        {
+            "--quiet": {
+                **_VERBOSITY,
+                "const": "quiet",
+                "help": "show the verdict or the final result only",
+            },
+            "--verbose": {
+                **_VERBOSITY,
+                "const": "verbose",
+                "help": "show all tables, notes and warnings (default: one screen)",
+            },
+        }
+    )
+}
 
 
-def add_table_options(parser: argparse.ArgumentParser) -> None:
-    """Add --columns, --sheet and --servos, which say how tables of measurements are read."""
-    parser.add_argument("--columns", **COLUMNS)
-    parser.add_argument("--sheet", **SHEET)
-    parser.add_argument("--servos", **SERVOS)
+def open_option(text: str) -> Options:
+    """Declare --open and --no-open of a command that can show a page; the default is None."""
+    return {"--open": {"action": argparse.BooleanOptionalAction, "help": text}}
+
+
+def motion_options(joint_units: str) -> Options:
+    """Declare the options of a command that writes joint positions."""
+    return {
+        "--joint-units": {
+            "choices": ("deg", "rad"),
+            "default": joint_units,
+            "help": "units of the joint positions: deg (degrees and millimetres) or rad (radians and "
+            "metres) (default: %(default)s)",
+        },
+        "--export FILE": {
+            "action": "append",
+            "default": [],
+            "help": "program for a controller: .script (URScript), .trajectory.csv (joint trajectory in s "
+            "and rad) or .robodk.csv (joint positions and tool poses in deg and mm); may be repeated",
+        },
+    }
+
+
+def execution_options(jobs_help: str, jobs: int | None) -> Options:
+    """Declare --jobs and --scheduler, which exclude each other."""
+    table = {"--jobs N": {"type": POSITIVE_INTEGER, "default": jobs, "help": jobs_help}}
+    return {"--jobs|--scheduler": Exclusive({**table, "--scheduler": SCHEDULER})}
 
 
 def read_one_robot(path: str, args: argparse.Namespace, sidecar: str | None = None) -> Chain:
@@ -241,55 +312,6 @@ def read_data(
         )
         for path in args.data or []
     ]
-
-
-def add_open_option(parser: argparse.ArgumentParser, what: str, default: bool | None = False) -> None:
-    """Add --open and --no-open, the options of commands that can show a page."""
-    parser.add_argument(
-        "--open",
-        action=argparse.BooleanOptionalAction,
-        help=f"open {what} in the browser" + " (default)" * bool(default),
-    )
-    # argparse would add a default of its own to the help.
-    parser.set_defaults(open=default)
-
-
-def add_verbosity_options(parser: argparse.ArgumentParser) -> None:
-    """Add --quiet and --verbose, which exclude each other."""
-    group = parser.add_mutually_exclusive_group()
-    for name, text in (
-        ("quiet", "show the verdict or the final result only"),
-        ("verbose", "show all tables, notes and warnings (default: one screen)"),
-    ):
-        group.add_argument(
-            f"--{name}", dest="verbosity", action="store_const", const=name, default="normal", help=text
-        )
-
-
-def add_motion_options(parser: argparse.ArgumentParser, joint_units: str) -> None:
-    """Add --joint-units and --export, the options of commands that write joint positions."""
-    parser.add_argument(
-        "--joint-units",
-        choices=("deg", "rad"),
-        default=joint_units,
-        help="units of the joint positions: deg (degrees and millimetres) or rad (radians and metres) "
-        "(default: %(default)s)",
-    )
-    parser.add_argument(
-        "--export",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help="program for a controller: .script (URScript), .trajectory.csv (joint trajectory in s and rad) "
-        "or .robodk.csv (joint positions and tool poses in deg and mm); may be repeated",
-    )
-
-
-def add_execution_options(parser: argparse.ArgumentParser, jobs_help: str, jobs: int | None) -> None:
-    """Add --jobs and --scheduler, which exclude each other."""
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--jobs", metavar="N", type=POSITIVE_INTEGER, default=jobs, help=jobs_help)
-    group.add_argument("--scheduler", **SCHEDULER)
 
 
 # --- help texts from the domain --------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -211,21 +211,13 @@ def read_task(path: PathLike, chain: Chain) -> Array:
 
 def _parse_pixels(text: str, option: str, expected: str = "pixels above zero, such as 60px") -> float:
     """Parse a positive number of pixels."""
-    pixels = _parse_numbers(text, "#", PIXELS)
-    if pixels is None or pixels[0] <= 0:
-        raise InvalidArgumentError(f"{option} {text}: expected {expected}")
-    return float(pixels[0])
+    return _parse_numbers(text, option, "#", PIXELS, f"expected {expected}", lambda x: x[0] > 0)[0]
 
 
 def _parse_distances(text: str) -> tuple[float, float]:
     """Parse the smallest and the largest distance of a board [m]."""
-    distances = _parse_numbers(text, "#:#", LENGTHS)
-    if distances is None:
-        raise InvalidArgumentError(
-            f"--distance {text}: expected the smallest and the largest distance with a unit, such as "
-            "300:900mm"
-        )
-    low, high = distances.tolist()
+    problem = "expected the smallest and the largest distance with a unit, such as 300:900mm"
+    low, high = _parse_numbers(text, "--distance", "#:#", LENGTHS, problem)
     if not 0 <= low < high:
         raise InvalidArgumentError(
             f"--distance {text}: the first distance must be at least 0 and less than the second"
@@ -235,13 +227,9 @@ def _parse_distances(text: str) -> tuple[float, float]:
 
 def _parse_angle(text: str, option: str, largest: float, what: str = "angle") -> float:
     """Parse an angle above zero and at most some degrees [rad]."""
-    angles = _parse_numbers(text, "#", {unit: ANGLES[unit] for unit in ("rad", "deg")})
-    angle = 0.0 if angles is None else float(angles[0])
-    if not 0 < angle <= np.deg2rad(largest):
-        raise InvalidArgumentError(
-            f"{option} {text}: invalid {what}; expected at most {largest:g}deg, such as 30deg"
-        )
-    return angle
+    units = {unit: ANGLES[unit] for unit in ("rad", "deg")}
+    problem = f"invalid {what}; expected at most {largest:g}deg, such as 30deg"
+    return _parse_numbers(text, option, "#", units, problem, lambda x: 0 < x[0] <= np.deg2rad(largest))[0]
 
 
 def _floor(text: str | None, root: str | None) -> float | None:
@@ -255,10 +243,7 @@ def _floor(text: str | None, root: str | None) -> float | None:
 
 def parse_length(text: str, option: str, expected: str) -> float:
     """Parse a length with its unit [m]."""
-    lengths = _parse_numbers(text, "#", LENGTHS)
-    if lengths is None:
-        raise InvalidArgumentError(f"{option} {text}: expected {expected}")
-    return float(lengths[0])
+    return _parse_numbers(text, option, "#", LENGTHS, f"expected {expected}")[0]
 
 
 def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
@@ -273,23 +258,25 @@ def _parse_box(text: str, option: str, expected: str = "corners") -> Array:
 
 def _parse_points(text: str, option: str, example: str, count: int, expected: str = "x,y,z") -> Array:
     """Parse points, shape (count, 3) [m], from coordinates with one unit at the end."""
-    points = _parse_numbers(text, ":".join(["#,#,#"] * count), LENGTHS)
-    if points is None:
-        raise InvalidArgumentError(
-            f"{option} {text}: invalid coordinates; expected {expected} with a unit at the end, such as "
-            f"{example}"
-        )
-    return points.reshape(count, 3)
+    form = ":".join(["#,#,#"] * count)
+    problem = f"invalid coordinates; expected {expected} with a unit at the end, such as {example}"
+    return np.reshape(_parse_numbers(text, option, form, LENGTHS, problem), (count, 3))
 
 
-def _parse_numbers(text: str, form: str, units: Mapping[str, float]) -> Array | None:
-    """Parse numbers with one unit at the end, in SI units; None if the text has another form.
-
-    The form has # in place of each number, such as #:# for 300:900mm.
-    """
+def _parse_numbers(
+    text: str,
+    option: str,
+    form: str,
+    units: Mapping[str, float],
+    problem: str,
+    accepts: Callable[[list[float]], bool] = lambda values: True,
+) -> list[float]:
+    """Parse numbers with one unit at the end, in SI units; the form is #:# for a text such as 300:900mm."""
     numbers = rf"\s*({_NUMBER})\s*".join(form.split("#"))
     match = re.fullmatch(rf"{numbers}([a-zµμ]+)\s*", text)
-    if not match or match.groups()[-1] not in units:
-        return None
-    *values, unit = match.groups()
-    return np.array(values, float) / units[unit]
+    if match and match.groups()[-1] in units:
+        *values, unit = match.groups()
+        found = [float(value) / units[unit] for value in values]
+        if accepts(found):
+            return found
+    raise InvalidArgumentError(f"{option} {text}: {problem}")

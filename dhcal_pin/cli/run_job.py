@@ -148,10 +148,7 @@ def run_job(
     executor: TaskExecutor,
     shown: Mapping[str, str] | None = None,
 ) -> CalibrationOutcome:
-    """Calibrate one robot and write its outputs, in this process or another; no messages are shown.
-
-    `shown` has the paths of outputs as they are listed, where these differ from those that are written.
-    """
+    """Calibrate one robot and write its outputs, which are listed with the paths `shown`; print nothing."""
     servos = io.read_servos(job.servos) if job.servos else None
     inputs = checked_inputs(job)
     chain = read_robot(job.robot, job.tip, package_dirs=job.package_dir, root=job.root)
@@ -472,10 +469,7 @@ def _write_job(
 
 
 def _content_makers(job: Job, fit: Result, written: Result, source: Provenance) -> Makers:
-    """Return the functions that make the output files beside those of the robot; modules load on first use.
-
-    `written` is the result for the joint values of the files, with corrected zeros of servos.
-    """
+    """Return the functions that make the other output files; `written` has corrected zeros of servos."""
 
     @cache
     def reports() -> dict[PathLike, str | bytes]:

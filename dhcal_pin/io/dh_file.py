@@ -301,11 +301,7 @@ def _toml_text(convention: str, poses: Mapping[str, Array], keys: list[str], row
 
 
 def convert_to_dh(robot: RobotSource, path: PathLike) -> ConvertedRobot:
-    """Convert a robot to a DH file.
-
-    A table that already has the requested convention is written as it is. Another table is extracted from the
-    chain.
-    """
+    """Convert a robot to a DH file; its own table stays as it is if it has the requested convention."""
     if robot.table is not None and robot.convention in (None, robot.table.convention):
         return ConvertedRobot(dh_text(robot.table, path))
     extraction = extract_dh_table(robot.chain, robot.convention or "standard")

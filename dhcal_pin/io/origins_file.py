@@ -30,10 +30,7 @@ MIN_MOVE = 1e-8
 
 
 def without_negligible_moves(chain: Chain, min_move: float = MIN_MOVE) -> Chain:
-    """Return a chain whose joint origins are exactly nominal where they moved less than rounding errors.
-
-    Translation and rotation of each origin are compared separately with the URDF.
-    """
+    """Return a chain with exactly nominal translations and rotations of origins that hardly moved."""
     nominal = chain.nominal().origins
     origins = chain.origins.copy()
     change = se3.inverse(nominal) @ origins
@@ -82,10 +79,7 @@ def _fixed_part(chain: Chain, link: str) -> tuple[Array, UrdfJoint | None]:
 
 
 def _changed_origin(joint: UrdfJoint, parent: Array, new: Array, old: Array) -> Array:
-    """Compute the origin of a joint so that its pose in the moving joint before it becomes `new` (4, 4) [m].
-
-    A translation or rotation that is unchanged is exactly that of the file.
-    """
+    """Compute the origin that gives a joint the pose `new` (4, 4) [m]; an unchanged part stays exactly."""
     origin = se3.inverse(parent) @ new
     if np.array_equal(new[:3, 3], old[:3, 3]):
         origin[:3, 3] = joint.origin[:3, 3]

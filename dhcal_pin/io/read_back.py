@@ -50,19 +50,13 @@ _KINEMATIC = {
 
 
 class Reader(NamedTuple):
-    """Program that reads robot files.
+    """Program that reads robot files."""
 
-    Attributes:
-        name: Name in messages.
-        module: Python package that must be installed.
-        reads: Classes of the robots that it reads.
-        poses: Function that computes the poses (m, 4, 4) of the tip of a chain in its first link from joint
-            positions (m, n), with nothing but the file.
-    """
-
-    name: str
-    module: str
-    reads: tuple[type[Urdf], ...]
+    name: str  # Name in messages
+    module: str  # Python package that must be installed
+    reads: tuple[type[Urdf], ...]  # Classes of the robots that it reads
+    # Function that computes the poses (m, 4, 4) of the tip of a chain in its first link from joint positions
+    # (m, n), with nothing but the file.
     poses: Callable[[Chain, Array], Array]
 
 
@@ -176,10 +170,7 @@ READERS = (
 
 
 def require_agreement(written: Chain, nominal: Chain, path: PathLike) -> None:
-    """Require that the programs that read a robot compute the same tip of the written one as the chain.
-
-    Both chains have identity base and tool and ideal joints.
-    """
+    """Require that programs compute the tip of a written chain with ideal joints and no base or tool."""
     for reader in READERS:
         if type(written.urdf) not in reader.reads or not find_spec(reader.module):
             continue

@@ -324,7 +324,6 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
             f"{table.where}: tip = {quote(tip)}: no such link; {suggest_names(tip, chain.urdf.links)}"
         )
     frames = {key: toml.pose_of(read[key]) for key in ("base", "tool") if read[key] is not None}
-    joints = table.table("joint") if "joint" in table else None
     links = {name: table.table(name) for name in LINK_TERMS if name in table}
     if read["manifest"] is not None:
         _check_manifest(read["manifest"], table.path, chain.urdf, tip)
@@ -345,21 +344,16 @@ def with_sidecar(chain: Chain, path: PathLike) -> Chain:
         chain = chain.with_payload(Payload(payload["mass_kg"], tuple(payload["centre_m"])))
     if THERMAL in links:
         chain = replace(chain, reference_temperature=_REFERENCE.read(links[THERMAL], "reference_degc"))
-    if joints is not None or links:
-        chain = chain.with_transmission(_read_transmission(chain, joints, links))
+    if "joint" in table or links:
+        chain = chain.with_transmission(_read_transmission(chain, table.table("joint"), links))
     additions = {name: toml.pose_of(pose) for name, pose in read["link"].items()}
-    return _with_additions(chain, additions, table.where) if additions else chain
-
-
-def _with_additions(chain: Chain, additions: Mapping[str, Array], where: str) -> Chain:
-    """Return the complete model of a chain as its URDF describes it, from the table [link]."""
-    links = [joint.child for joint in chain.urdf.joints]
-    if unknown := [name for name in additions if name not in links]:
+    known = [joint.child for joint in chain.urdf.joints]
+    if unknown := [name for name in additions if name not in known]:
         raise UnknownNameError(
-            f"{where}: [link] has {quote(unknown[0])}, no link with a joint before it; "
-            f"{suggest_names(unknown[0], links)}"
+            f"{table.where}: [link] has {quote(unknown[0])}, no link with a joint before it; "
+            f"{suggest_names(unknown[0], known)}"
         )
-    return chain.with_added_origins(additions)
+    return chain.with_added_origins(additions) if additions else chain
 
 
 class Fitted(NamedTuple):
@@ -400,10 +394,7 @@ def read_tool(path: PathLike) -> Array:
 
 
 def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str) -> None:
-    """Require that the sidecar was written with this URDF, or with one that has the same joints.
-
-    Only the joints from the root to the tip count: a changed mesh or another gripper does not matter.
-    """
+    """Require that the sidecar was written with a URDF of the same joints from the root to the tip."""
     actual = hashlib.sha256(urdf.data).hexdigest()
     if manifest["urdf_sha256"] != actual and manifest["joints_sha256"] != _joints_digest(urdf, tip):
         raise FileFormatError(
@@ -431,36 +422,22 @@ def _joints_digest(urdf: Urdf, tip: str) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def _read_transmission(
-    chain: Chain, joints: TomlTable | None, links: Mapping[str, TomlTable]
-) -> Transmission:
+def _read_transmission(chain: Chain, joints: TomlTable, links: Mapping[str, TomlTable]) -> Transmission:
     """Read the tables [joint.NAME] and those of links; joints and links not on the chain are ignored."""
     coefficients = np.zeros(n_coefficients(*chain.mimic_matrix.shape))
-    if joints is not None:
-        _read_joints(chain, joints, coefficients)
-    _read_links(chain, links, coefficients)
-    return Transmission(coefficients, chain.loads)
-
-
-def _read_joints(chain: Chain, table: TomlTable, coefficients: Array) -> None:
-    """Read the tables of all joints into the coefficients of a transmission, shape (c,)."""
-    for name in table.keys():
-        joint = table.table(name)
+    for name in joints.keys():
+        joint = joints.table(name)
         if name in chain.joint_names:
             _read_joint(chain, chain.joint_names.index(name), joint, coefficients)
         elif name not in _joints_off_path(chain):
             raise UnknownNameError(
-                f"{table.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
+                f"{joints.where}: unknown joint {name!r}; choose from {', '.join(chain.joint_names)}"
             )
-
-
-def _read_links(chain: Chain, tables: Mapping[str, TomlTable], coefficients: Array) -> None:
-    """Read the tables of links, by family, into the coefficients of a transmission, shape (c,)."""
     *_, link_terms = split_coefficients(coefficients, chain.n_joints)
     for row, family in zip(link_terms, LINK_TERMS, strict=True):
-        if family not in tables:
+        if family not in links:
             continue
-        key, table = FAMILIES[family].sidecar_key, tables[family]
+        key, table = FAMILIES[family].sidecar_key, links[family]
         for name, value in table.values(_LINK_KEYS[family])[key].items():
             if name in chain.link_names:
                 row[chain.link_names.index(name)] = value
@@ -469,6 +446,7 @@ def _read_links(chain: Chain, tables: Mapping[str, TomlTable], coefficients: Arr
                     f"{table.table(key).where}: unknown link {name!r}; choose from "
                     f"{', '.join(chain.link_names)}"
                 )
+    return Transmission(coefficients, chain.loads)
 
 
 def _joints_off_path(chain: Chain) -> set[str]:
@@ -712,7 +690,7 @@ def sidecar_text(
     """Return the text of the sidecar of a calibrated robot."""
     tables = {
         "link": {name: toml.pose_content(pose) for name, pose in additions.items()},
-        "payload": _payload_content(chain.payload),
+        "payload": (load := chain.payload) and {"mass_kg": load.mass, "centre_m": list(load.centre)},
         "joint": _transmission_content(chain),
         **_link_content(chain),
         "instrument": {name: float(value) for name, value in findings.instrument.items()},
@@ -725,10 +703,10 @@ def sidecar_text(
     if not (required or tables or has_frames):
         return None
     header = _HEADER + "".join(text for key, text in _TABLE_HEADERS.items() if key in tables)
-    frames = {"base": toml.pose_content(chain.base), "tool": toml.pose_content(tool)}
     content = {
         "tip": chain.tip,
-        **frames,
+        "base": toml.pose_content(chain.base),
+        "tool": toml.pose_content(tool),
         "manifest": _manifest_content(urdf, chain.tip, findings.fitted),
         **tables,
     }
@@ -751,10 +729,6 @@ def _toml_text(content: dict[str, Any]) -> str:
     text = tomli_w.dumps(with_numbers(content), multiline_strings=True)
     # Texts in single quotes have no escapes, which makes them faster to read.
     return _TEXT_NUMBER.sub(lambda match: f"'''\n{inserted[int(match[1])]}'''", text)
-
-
-def _payload_content(payload: Payload | None) -> dict[str, Any]:
-    return {} if payload is None else {"mass_kg": payload.mass, "centre_m": list(payload.centre)}
 
 
 def _transmission_content(chain: Chain) -> dict[str, Any]:
@@ -806,9 +780,9 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
     found = compact(uncertainty)
     if found is None:
         columns: dict[str, Any] = {
-            "sqrt_covariance": _encode_rows(uncertainty.sqrt_covariance),
-            "unbounded_directions": _encode_rows(uncertainty.unbounded_directions),
-            **({"frame_part": _encode_rows(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
+            "sqrt_covariance": _encode(uncertainty.sqrt_covariance),
+            "unbounded_directions": _encode(uncertainty.unbounded_directions),
+            **({"frame_part": _encode(uncertainty.frame_part)} if uncertainty.has_free_frames else {}),
         }
     else:
         columns = {"information": _information_content(found)}
@@ -863,13 +837,8 @@ def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, 
         "spread": region.spread.tolist(),
         "radius": region.radius,
         "reach": region.reach,
-        "centres": _encode(np.ascontiguousarray(region.configurations.T, "<f4").tobytes()),
+        "centres": _encode(region.configurations.T, "<f4"),
     }
-
-
-def _encode_rows(rows: Array) -> str:
-    """Encode an array of doubles as lines of base64 text."""
-    return _encode(np.ascontiguousarray(rows, "<f8").tobytes())
 
 
 def _compressed_text(rows: Array, number: str) -> str:
@@ -886,8 +855,9 @@ def _compressed_text(rows: Array, number: str) -> str:
     return _lines(base64.b85encode(lzma.compress(planes, check=lzma.CHECK_CRC32)).decode())
 
 
-def _encode(data: bytes) -> str:
-    """Encode bytes as lines of base64 text."""
+def _encode(data: bytes | Array, number: str = "<f8") -> str:
+    """Encode bytes, or the numbers of an array, as lines of base64 text."""
+    data = data if isinstance(data, bytes) else np.ascontiguousarray(data, number).tobytes()
     return _lines(base64.b64encode(data).decode())
 
 

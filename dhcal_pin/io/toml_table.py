@@ -35,15 +35,10 @@ _MAX_POSE_VALUE = 1e4
 
 
 class TomlTable:
-    """Table of a TOML file, with checked access to its keys.
-
-    Attributes:
-        path: Path of the file.
-        name: Name of the table in messages, such as `[base]`; empty for the top level.
-    """
+    """Table of a TOML file, with checked access to its keys."""
 
     def __init__(self, path: PathLike, raw: object, name: str = ""):
-        """Wrap a table."""
+        """Wrap a table with a name for messages, such as `[base]`; that of the top level is empty."""
         self.path, self.name = os.fspath(path), name
         if not isinstance(raw, dict):
             raise FileFormatError(

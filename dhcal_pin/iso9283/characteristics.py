@@ -177,24 +177,9 @@ def pose_characteristics(
     points: Sequence[Sequence[tuple[str, int]] | None],
     known: Mapping[str, float] | None = None,
 ) -> PoseCharacteristics:
-    """Compute the characteristics of ISO 9283 from measured positions or poses.
-
-    The commanded poses are those of the chain at the joint positions of the samples.
-
-    Args:
-        chain: Robot with the base and tool that the measuring frame requires.
-        data: Measurements of kind position or pose, in the order of measurement.
-        points: Point and number of the cycle of each sample, m per measurement, such as ("P1", 12). If one is
-            None, points are recognized by equal joint positions.
-        known: Values of instrument parameters [m or rad].
-
-    Returns:
-        Points with their cycles.
-
-    Raises:
-        InvalidArgumentError: The measurements are of another kind, a point has one cycle only, or the joint
-            positions of a point differ.
-    """
+    """Compute the characteristics of ISO 9283 from points and cycles such as ("P1", 12) of the samples."""
+    # The commanded poses are those of the chain at the joint positions of the samples. Without points, equal
+    # joint positions are one.
     attained = np.concatenate([_positions(item) for item in data])
     errors = compute_errors(chain, data, known or {})
     q = np.concatenate([item.q for item in data])

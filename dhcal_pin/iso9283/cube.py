@@ -70,22 +70,7 @@ def find_iso_cube(
     candidates: int,
     seed: int,
 ) -> IsoCube:
-    """Find a cube of the first side that fits into the workspace, and the joint positions at its points.
-
-    Args:
-        chain: Robot with base and tool.
-        sides: Sides to try [m].
-        space: Constraints of the tool and of the robot.
-        margin: Margins to the joint limits: `rotation` [rad], `position` [m].
-        candidates: Number of random configurations whose tool poses are tried as centre and orientation.
-        seed: Seed of these configurations.
-
-    Returns:
-        Cube with its points.
-
-    Raises:
-        InvalidArgumentError: No cube fits.
-    """
+    """Find a cube of the first side [m] that fits into the workspace; tool poses of candidates are tried."""
     rng = np.random.default_rng(seed)
     sampler = ConfigurationSampler.from_chain(chain, space, margin.rotation, margin.position)
     low, high = limits_with_margin(chain, margin.rotation, margin.position)
@@ -120,10 +105,7 @@ def _contains_first_axis(chain: Chain, centres: Array, side: float) -> Array:
 def _reachable(
     chain: Chain, starts: Array, side: float, sampler: ConfigurationSampler, is_turning: bool
 ) -> list[Array]:
-    """Return the joint positions (5, n) at the points of each cube within reach, the best cube first.
-
-    The orientation of the tool is that at the start, or any if it is turning.
-    """
+    """Return the joint positions (5, n) at the points of cubes within reach, best first; tools may turn."""
     centres, length = chain.poses(starts), characteristic_length(chain)
     is_inside = ~_contains_first_axis(chain, centres[:, :3, 3], side)
     q = np.zeros((len(starts), len(POINTS), chain.n_joints))

@@ -280,10 +280,7 @@ def workspace_figures(context: ReportContext) -> list[FigureGroup]:
 
 
 def workspace_maps(workspace: WorkspacePrediction, points: Array, errors: Array) -> list[FigureGroup]:
-    """Draw maps of the predicted standard deviation of the tool position beside maps of measured errors.
-
-    All maps have the same colours, evenly spaced from zero.
-    """
+    """Draw maps of predicted standard deviations and of measured errors, with the same colours."""
     finite = workspace.std[np.isfinite(workspace.std)]
     if not finite.size:
         return []

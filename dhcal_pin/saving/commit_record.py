@@ -84,10 +84,7 @@ def remove_stale(folder: str) -> None:
 
 
 def complete(folder: str) -> None:
-    """Complete the commit whose record lies in a folder, or discard a record that was not committed.
-
-    Completing it again after an interruption has the same result.
-    """
+    """Complete the commit whose record lies in a folder, or discard a record that was not committed."""
     record = CommitRecord.read(folder)
     if record is None:
         return

@@ -27,12 +27,7 @@ Block = list[list[float]]
 
 
 class StudyJournal:
-    """Open journal.
-
-    Attributes:
-        path: Path of the file.
-        blocks: Results of the finished blocks, in order.
-    """
+    """Open journal: path of the file, and results of the finished blocks, in order."""
 
     def __init__(self, path: str, descriptor: int, blocks: list[Block]):
         self.path, self.blocks, self._descriptor = path, blocks, descriptor

@@ -33,6 +33,7 @@ import pinocchio as pin
 
 from .. import se3
 from .._typing import Array, PathLike
+from ..calibration.presentation.workspace import uncertainty_cells
 from ..calibration.result import Result
 from ..estimation.uncertainty import Predictor
 from ..exceptions import InvalidArgumentError
@@ -46,7 +47,6 @@ from ..subsampling import evenly_spaced_indices
 from .measured_samples import SETS, drawn_samples, measured_samples, sets_of
 from .meshes import obstacle_shapes, rows, visuals_of
 from .rig_lines import rig_lines
-from .uncertainty_cells import uncertainty_cells
 
 # Largest number of measured points and of configurations to play; more would make the page slow.
 MAX_POINTS = 2000
@@ -68,17 +68,11 @@ PAGE = Path(__file__).with_name("viewer.html")
 
 @dataclass(frozen=True, eq=False)
 class Preview:
-    """Poses that the arm will visit, and what stands around it.
+    """Poses that the arm will visit, and what stands around it."""
 
-    Attributes:
-        q: Joint positions on the way, shape (m, n) [rad or m]; moves between them are straight.
-        stops: Rows of `q` at which the arm stops.
-        workspace: Floor and obstacles.
-    """
-
-    q: Array
-    stops: Sequence[int]
-    workspace: WorkspaceConstraints
+    q: Array  # Joint positions on the way, shape (m, n) [rad or m]; moves between them are straight
+    stops: Sequence[int]  # Rows of `q` at which the arm stops
+    workspace: WorkspaceConstraints  # Floor and obstacles
 
 
 def scene_html(
@@ -221,16 +215,11 @@ def reach(chain: Chain) -> float:
 
 @dataclass(frozen=True)
 class Scene:
-    """Page that notebooks show inline.
-
-    Attributes:
-        html: Text of the page.
-        height: Height of the frame in the notebook [px].
-    """
+    """Page that notebooks show inline."""
 
     # Notebooks save the repr as well, so it must be short.
-    html: str = field(repr=False)
-    height: int
+    html: str = field(repr=False)  # Text of the page
+    height: int  # Height of the frame in the notebook [px]
 
     def _repr_html_(self) -> str:
         source = self.html.replace("&", "&amp;").replace('"', "&quot;")
@@ -400,10 +389,7 @@ def _sliders(chain: Chain, configurations: Array) -> list[dict[str, Any]]:
 
 
 def _ellipsoids(model: Predictor, configurations: Array) -> list[dict[str, Any]]:
-    """Return the ellipsoids of one standard deviation of the calibrated tool position.
-
-    Configurations with an undetermined direction of the tool position have none.
-    """
+    """Return ellipsoids of one standard deviation of the tool position where it is determined."""
     configurations = configurations[evenly_spaced_indices(len(configurations), MAX_ELLIPSOIDS)]
     covariance = model.relative.predict(configurations).covariance[:, :3, :3]
     is_finite = np.isfinite(covariance).all((1, 2))

@@ -77,9 +77,7 @@ def write_pages(app: Sphinx) -> None:
     folder.mkdir(exist_ok=True, parents=True)
     for name, parser in command_parsers().items():
         (folder / f"{name}.rst").write_text("\n".join(_page(name, parser)) + "\n", encoding="utf-8")
-    table = [
-        f"   * - :doc:`dhcal {command.name} <{command.name}>`\n     - {command.help}" for command in COMMANDS
-    ]
+    table = [f"   * - :doc:`dhcal {name} <{name}>`\n     - {text}" for name, text in COMMANDS.items()]
     lines = [
         "Command line",
         "============",
@@ -91,7 +89,7 @@ def write_pages(app: Sphinx) -> None:
         "",
         _EXIT_STATUS,
     ]
-    lines += [".. toctree::", "   :hidden:", "", *(f"   {command.name}" for command in COMMANDS)]
+    lines += [".. toctree::", "   :hidden:", "", *(f"   {name}" for name in COMMANDS)]
     (folder / "index.rst").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -10,7 +10,7 @@ import pytest
 from command_line import KEYS, assert_same_poses, json_of, parse_json, tool_positions
 from robots import URDF
 
-from dhcal_pin.cli.screens import console
+from dhcal_pin.cli import screens
 from dhcal_pin.paper import simulations
 
 
@@ -18,7 +18,7 @@ def test_files_and_figures_of_the_demo(run, robot_folder, monkeypatch):
     simulation_rows = simulations.simulation_rows
     monkeypatch.setattr(simulations, "simulation_rows", lambda: simulation_rows(seeds=2))
     opened = []
-    monkeypatch.setattr(console, "open_page", opened.append)
+    monkeypatch.setattr(screens, "open_page", opened.append)
     assert json_of(run("demo", "--out", "shown", "--json", "-", "--open"))["outliers"] == [7, 8]
     # The report explains itself and contains the scene.
     assert opened == [os.path.join("shown", "report.html")]

@@ -15,7 +15,7 @@ from dhcal_pin.calibration import model_selection
 from dhcal_pin.cli import main
 from dhcal_pin.robot import sampling
 
-COMMANDS = tuple(command.name for command in main.COMMANDS)
+COMMANDS = tuple(main.COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -18,8 +18,7 @@ from command_line import CALIBRATE, positions_csv
 from robots import URDF
 from study_runs import SMALL_STUDY
 
-from dhcal_pin.cli import main, outputs, run_job
-from dhcal_pin.cli.screens import console
+from dhcal_pin.cli import main, outputs, run_job, screens
 from dhcal_pin.saving import transaction
 from dhcal_pin.studies import open_journal, read_study
 
@@ -114,7 +113,7 @@ def test_interrupt_while_the_files_are_saved(run, robot_folder, monkeypatch):
 
 
 def test_interrupt_after_the_files_are_saved(run, robot_folder, monkeypatch):
-    monkeypatch.setattr(console, "show", interrupt)
+    monkeypatch.setattr(screens, "show", interrupt)
     status, _, err = run(*CALIBRATE)
     assert (status, "these files are written: out.urdf" in err) == (130, True)
     # The next command of the process starts anew.
@@ -279,7 +278,7 @@ def test_interrupt_of_a_study(run, study, monkeypatch):
         patched.setattr(outputs, "write_outputs", interrupt)
         status, _, err = run(*STUDY)
     assert (status, "s.csv.part contains 4 of 4 blocks; run the same command to resume" in err) == (130, True)
-    monkeypatch.setattr(console, "show", interrupt)
+    monkeypatch.setattr(screens, "show", interrupt)
     status, _, err = run(*STUDY)
     assert (status, err.splitlines()[-1]) == (
         130,

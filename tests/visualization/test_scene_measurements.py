@@ -15,6 +15,7 @@ from pages import AXE, Window, window_of
 from robots import paper
 
 from dhcal_pin import se3
+from dhcal_pin.calibration.presentation.workspace import uncertainty_cells
 from dhcal_pin.calibration.procedure import calibrate
 from dhcal_pin.calibration.result import Result
 from dhcal_pin.measurements.base import Noise
@@ -22,7 +23,6 @@ from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.visualization.measured_samples import drawn_samples, measured_samples
 from dhcal_pin.visualization.scene import scene_html
-from dhcal_pin.visualization.uncertainty_cells import uncertainty_cells
 
 N_FITTED, N_HELD_OUT, WRONG = 150, 40, (3, 70)
 # Instances of a mesh with a size, as (number, place).

@@ -1,7 +1,7 @@
 """Presentation of results: plots, joint correction curves and predicted accuracy.
 
-`ResultPlots` has the methods of `Result` that draw or tabulate it. What they draw is computed in `curves` and
-`workspace`, and drawn in `fit_plots` with the functions of `dhcal_pin.plots`.
+`fit_plots` has the methods of `Result` that draw or tabulate it. What they draw is computed in `curves` and
+`workspace`, and drawn with the functions of `dhcal_pin.plots`.
 """
 
 import lazy_loader

@@ -29,19 +29,12 @@ CURVE_VALUES = np.deg2rad(np.arange(-180.0, 181.0))
 
 @dataclass(frozen=True, eq=False)
 class JointCurve:
-    """Correction curve of a joint.
+    """Correction curve of a joint."""
 
-    Attributes:
-        coverage: Joint values that were measured.
-        values: Joint values within the joint limits, in steps of a degree, shape (v,) [rad].
-        correction: Angle to add to each joint value before it is commanded, shape (v,) [rad].
-        std: Standard deviation of the correction, shape (v,) [rad]; infinite if it is not determined.
-    """
-
-    coverage: JointCoverage
-    values: Array
-    correction: Array
-    std: Array
+    coverage: JointCoverage  # Joint values that were measured
+    values: Array  # Joint values within the joint limits, in steps of a degree, shape (v,) [rad]
+    correction: Array  # Angle to add to each joint value before it is commanded, shape (v,) [rad]
+    std: Array  # Standard deviation of the correction, shape (v,) [rad]; infinite if it is not determined
 
     @property
     def is_measured(self) -> Array:

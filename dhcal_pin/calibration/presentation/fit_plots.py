@@ -1,25 +1,26 @@
-"""Plots of the result of one calibration, for people who explore it in Python.
+"""Plots and tables that a result makes of itself, for people who explore it in Python.
 
-The methods `plot_...` of `calibration.Result` call these functions. Each draws into the axes `ax`, or into a
-new figure if `ax` is None, and returns the axes. Long series are thinned evenly, so that a plot of many
-samples is as fast as one of few.
+Long series are thinned evenly, so that a plot of many samples is as fast as one of few.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ... import plots
+from ... import formatting, plots
 from ..._typing import Array
-from ...exceptions import UnknownNameError
+from ...exceptions import InvalidArgumentError, UnknownNameError
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...plots import COLORS, DOT_SIZES, MAX_DOTS, new_axes
 from ...subsampling import evenly_spaced_indices
 from ..evaluation import Comparison
+from ..summary import describe_convergence, generalization_lines, headline, largest_corrections
+from .curves import joint_curves
+from .workspace import predict_workspace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,72 +100,11 @@ def _chosen_group(group: str | None, choices: Sequence[str]) -> str:
     return group or choices[0]
 
 
-# --- errors ----------------------------------------------------------------------------------------
-
-
-def plot_accuracy(fit: Evidence, ax: Axes | None = None, *, group: str | None = None) -> Axes:
-    """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile."""
-    ax = ax or new_axes()[0]
-    regions = fit.generalization.region_holdout
-    comparisons = list(fit.comparisons)
-    if regions is not None and all(each.title != "region hold-out" for each in comparisons):
-        comparisons.insert(-1, regions)
-    name = _chosen_group(group, list(comparisons[0].after.groups))
-    rows = [each for each in comparisons if name in each.after.groups]
-    factor, unit = plots.shown_unit(ERROR_GROUPS[name].unit)
-    values = []
-    for state, offset in (("before", -0.14), ("after", 0.14)):
-        sides: list[ErrorStatistics] = [getattr(each, state).groups[name] for each in rows]
-        height = np.arange(len(rows)) + offset
-        rms, p95 = (factor * np.array([getattr(side, key) for side in sides]) for key in ("rms", "p95"))
-        ax.hlines(height, rms, p95, color=COLORS[state], linewidth=1.6)
-        plots.plot_dots(ax, rms, height, COLORS[state], 7.0, label=f"{state}, RMS")
-        ax.plot(p95, height, "|", color=COLORS[state], markersize=9, label=f"{state}, 95th percentile")
-        values += [*rms, *p95]
-    ax.set_yticks(range(len(rows)), [_comparison_label(each, name) for each in rows])
-    ax.set(xlabel=f"{ERROR_GROUPS[name].label}, {unit}", ylim=(len(rows) - 0.5, -0.5))
-    if 0 < min(values) and max(values) > plots.MAX_MEDIAN_RATIO * min(values):
-        plots.make_logarithmic(ax, "x")
-    else:
-        ax.set_xlim(left=0.0)
-    _legend(ax)
-    return ax
-
-
 def _comparison_label(comparison: Comparison, group: str) -> str:
     """Describe the samples of a comparison."""
     if comparison.title == "region hold-out":
         return "left-out regions"
     return f"{comparison.after.groups[group].samples} {comparison.title}"
-
-
-def plot_residuals(
-    fit: Evidence, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
-) -> Axes:
-    """Plot the errors of all samples before and after, fitted and held-out ones on the same axes."""
-    ax = ax or new_axes()[0]
-    errors = SampleErrors.from_fit(fit, group)
-    if isinstance(over, str) and over == "histogram":
-        _plot_histogram(errors, ax)
-        return ax
-    x, label = _abscissa(fit, over)
-    x = x[errors.index]
-    errors_known = np.isfinite(x)
-    for name, color, chosen, values in errors.series():
-        picked = np.flatnonzero(chosen & errors_known)
-        picked = picked[evenly_spaced_indices(len(picked), MAX_DOTS)] if len(picked) else picked
-        size = DOT_SIZES[name == "after, outlier" or len(picked) < 100]
-        plots.plot_dots(ax, x[picked], values[picked], color, size, label=name)
-    if not (isinstance(over, str) and over == "sample"):
-        for state, values in (("before", errors.before), ("after", errors.after)):
-            _plot_medians(ax, x[errors_known], values[errors_known], state, errors.unit)
-    ax.set(xlabel=label, ylabel=errors.label)
-    if errors.is_wide:
-        plots.make_logarithmic(ax, "y")
-    else:
-        ax.set_ylim(bottom=0.0)
-    _legend(ax)
-    return ax
 
 
 def _abscissa(fit: Evidence, over: str | Array) -> tuple[Array, str]:
@@ -231,91 +171,6 @@ def _plot_histogram(errors: SampleErrors, ax: Axes) -> None:
     _legend(ax)
 
 
-# --- parameters ------------------------------------------------------------------------------------
-
-
-def plot_parameters(fit: Evidence, ax: Axes | None = None, *, count: int = MAX_PARAMETERS) -> Axes:
-    """Plot the corrections of the robot with two standard deviations, relative to their priors.
-
-    A prior is drawn as a band of one and of two of its standard deviations. A line as long as the band
-    belongs to a parameter that the measurements do not determine.
-    """
-    prior = fit.prior_std
-    names = [estimate.name for estimate in fit.estimates[: len(fit.x)]]
-    robot = [i for i, estimate in enumerate(fit.estimates[: len(fit.x)]) if estimate.category == "robot"]
-    change, std = fit.x / prior, np.minimum(fit.std / prior, 10.0)
-    chosen = sorted(sorted(robot, key=lambda i: -abs(change[i]))[:count])
-    ax = ax or new_axes(size=(6.4, max(2.0, 0.22 * len(chosen) + 0.9)))[0]
-    height = np.arange(len(chosen))
-    for width, color in zip(_PRIOR_BANDS, ("#eef1f4", "#dfe5ea"), strict=True):
-        label = f"prior, {width:g} standard deviation{'s' if width > 1 else ''}"
-        ax.axvspan(-width, width, color=color, linewidth=0, label=label)
-    ax.axvline(0.0, color=COLORS["text"], linewidth=1.0)
-    ax.errorbar(
-        change[chosen],
-        height,
-        xerr=2 * std[chosen],
-        fmt="o",
-        color=COLORS["after"],
-        markersize=DOT_SIZES[1],
-        label="correction, 2 standard deviations",
-    )
-    ax.set_yticks(height, [names[i] for i in chosen])
-    reach = float(np.max(np.abs(change[chosen]) + 2 * np.minimum(std[chosen], 1.5), initial=2.2))
-    ax.set(xlabel="correction / standard deviation of the prior", xlim=(-reach, reach))
-    ax.set_ylim(max(len(chosen), 1) - 0.4, -0.6)
-    if len(chosen) < len(robot):
-        ax.set_ylabel(f"{len(chosen)} largest of {len(robot)} corrections")
-    _legend(ax)
-    return ax
-
-
-def plot_singular_values(fit: Evidence, ax: Axes | None = None) -> Axes:
-    """Plot the singular values of the whitened Jacobian relative to the largest one."""
-    ax = ax or new_axes()[0]
-    plots.plot_singular_values(fit.solution.system.singular_values, fit.rank, ax)
-    _legend(ax)
-    return ax
-
-
-def plot_correlation(fit: Evidence, ax: Axes | None = None) -> Axes:
-    """Plot the correlation matrix of all estimated parameters."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    correlation = fit.correlation
-    names = [parameter.name for parameter in fit.parameters]
-    side = min(9.0, 3.0 + 0.14 * len(names))
-    ax = ax or new_axes(size=(side, side * 0.86))[0]
-    colors = LinearSegmentedColormap.from_list("dhcal", [COLORS["before"], "#ffffff", COLORS["after"]])
-    colors = colors.with_extremes(bad=COLORS["unknown"])
-    image = ax.imshow(np.ma.masked_invalid(correlation), cmap=colors, vmin=-1.0, vmax=1.0)
-    ax.grid(visible=False)
-    if len(names) <= _MAX_NAMES:
-        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-        ax.set_yticks(range(len(names)), names, fontsize=7)
-    else:
-        ax.set(xlabel="parameter", ylabel="parameter")
-    _add_scale(ax, image, "correlation")
-    return ax
-
-
-def plot_workspace(
-    points: Array, std: Array, measured: Array, ax: Axes | None = None, *, plane: str = "xz"
-) -> Axes:
-    """Plot a map of the predicted standard deviation of the tool position, with a scale; see `plots`."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
-    if plane not in ("xy", "xz", "yz"):
-        raise UnknownNameError(f"plane {plane!r}: unknown; choose from xy, xz, yz")
-    ax = ax or new_axes(size=(5.6, 4.6))[0]
-    plots.plot_position_std_map(points, std, ax, plane=plane, measured=measured)
-    colors = ListedColormap([COLORS[f"level-{k}"] for k in range(plots.N_LEVELS)])
-    scale = ScalarMappable(BoundaryNorm(1e3 * plots.std_levels(std), plots.N_LEVELS), colors)
-    _add_scale(ax, scale, "predicted standard deviation, mm")
-    return ax
-
-
 def _add_scale(ax: Axes, image: ScalarMappable, label: str) -> None:
     """Add a scale of colours beside the axes."""
     if ax.figure is None:
@@ -344,3 +199,307 @@ def _legend(ax: Axes) -> None:
             handlelength=1.4,
             columnspacing=1.2,
         )
+
+
+class ResultPlots:
+    """Methods of `Result` that draw or tabulate it.
+
+    Every plot is drawn into the axes `ax`, or into a new figure if `ax` is None, and the axes are returned:
+
+        ax = fit.plot_accuracy()
+        ax.figure.savefig("accuracy.png")
+
+    A notebook shows the figure of the axes, `fit.plot_accuracy().figure`.
+    """
+
+    @property
+    def _result(self) -> Evidence:
+        return cast("Evidence", self)
+
+    def plot_accuracy(self, ax: Axes | None = None, *, group: str | None = None) -> Axes:
+        """Plot the error before and after: RMS as a dot, and a line up to the 95th percentile.
+
+        Example:
+            `fit.plot_accuracy().figure.savefig("accuracy.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            group: "position", "orientation" or "residual"; the first that was measured if None.
+
+        Returns:
+            The axes.
+        """
+        fit = self._result
+        ax = ax or new_axes()[0]
+        regions = fit.generalization.region_holdout
+        comparisons = list(fit.comparisons)
+        if regions is not None and all(each.title != "region hold-out" for each in comparisons):
+            comparisons.insert(-1, regions)
+        name = _chosen_group(group, list(comparisons[0].after.groups))
+        rows = [each for each in comparisons if name in each.after.groups]
+        factor, unit = plots.shown_unit(ERROR_GROUPS[name].unit)
+        values = []
+        for state, offset in (("before", -0.14), ("after", 0.14)):
+            sides: list[ErrorStatistics] = [getattr(each, state).groups[name] for each in rows]
+            height = np.arange(len(rows)) + offset
+            rms, p95 = (factor * np.array([getattr(side, key) for side in sides]) for key in ("rms", "p95"))
+            ax.hlines(height, rms, p95, color=COLORS[state], linewidth=1.6)
+            plots.plot_dots(ax, rms, height, COLORS[state], 7.0, label=f"{state}, RMS")
+            ax.plot(p95, height, "|", color=COLORS[state], markersize=9, label=f"{state}, 95th percentile")
+            values += [*rms, *p95]
+        ax.set_yticks(range(len(rows)), [_comparison_label(each, name) for each in rows])
+        ax.set(xlabel=f"{ERROR_GROUPS[name].label}, {unit}", ylim=(len(rows) - 0.5, -0.5))
+        if 0 < min(values) and max(values) > plots.MAX_MEDIAN_RATIO * min(values):
+            plots.make_logarithmic(ax, "x")
+        else:
+            ax.set_xlim(left=0.0)
+        _legend(ax)
+        return ax
+
+    def plot_residuals(
+        self, ax: Axes | None = None, *, over: str | Array = "sample", group: str | None = None
+    ) -> Axes:
+        """Plot the errors of all samples before and after, fitted and held-out ones on the same axes.
+
+        Example:
+            `fit.plot_residuals(over="elbow_joint").figure.savefig("elbow.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            over: "sample" (in the order of the files), "histogram", the name of a joint, or a number per
+                sample, shape (N,), such as the time [s]; fitted samples come first, as in `residuals`.
+            group: "position", "orientation" or "residual"; the first that was measured if None.
+
+        Returns:
+            The axes.
+        """
+        fit = self._result
+        ax = ax or new_axes()[0]
+        errors = SampleErrors.from_fit(fit, group)
+        if isinstance(over, str) and over == "histogram":
+            _plot_histogram(errors, ax)
+            return ax
+        x, label = _abscissa(fit, over)
+        x = x[errors.index]
+        errors_known = np.isfinite(x)
+        for name, color, chosen, values in errors.series():
+            picked = np.flatnonzero(chosen & errors_known)
+            picked = picked[evenly_spaced_indices(len(picked), MAX_DOTS)] if len(picked) else picked
+            size = DOT_SIZES[name == "after, outlier" or len(picked) < 100]
+            plots.plot_dots(ax, x[picked], values[picked], color, size, label=name)
+        if not (isinstance(over, str) and over == "sample"):
+            for state, values in (("before", errors.before), ("after", errors.after)):
+                _plot_medians(ax, x[errors_known], values[errors_known], state, errors.unit)
+        ax.set(xlabel=label, ylabel=errors.label)
+        if errors.is_wide:
+            plots.make_logarithmic(ax, "y")
+        else:
+            ax.set_ylim(bottom=0.0)
+        _legend(ax)
+        return ax
+
+    def plot_joint_corrections(self, ax: Sequence[Axes] | None = None) -> list[Axes]:
+        """Plot the correction curve of each joint with its 95 % band and the gaps between measurements.
+
+        Example:
+            `fit.plot_joint_corrections()[0].figure.savefig("curves.png")`
+
+        Args:
+            ax: Axes to draw into, one per joint with a curve; a new figure if None.
+
+        Returns:
+            The axes, one per joint with harmonics.
+
+        Raises:
+            InvalidArgumentError: No joint has a correction curve, or the number of axes is another one.
+        """
+        curves = joint_curves(self._result)
+        if not curves:
+            raise InvalidArgumentError(
+                "no joint has a correction curve; estimate harmonics with parameters or extend"
+            )
+        panels = plots.new_axes(len(curves), (3.6, 2.6)) if ax is None else list(ax)
+        if len(panels) != len(curves):
+            raise InvalidArgumentError(f"ax: {len(panels)} axes; expected one per curve, {len(curves)}")
+        for panel, curve in zip(panels, curves, strict=True):
+            coverage = curve.coverage
+            plots.plot_joint_corrections(
+                curve.values,
+                curve.correction,
+                curve.std,
+                panel,
+                gaps=coverage.gaps,
+                joint=coverage.joint,
+            )
+        return panels
+
+    def plot_parameters(self, ax: Axes | None = None, *, count: int = MAX_PARAMETERS) -> Axes:
+        """Plot the corrections of the robot with two standard deviations, relative to their priors.
+
+        A prior is drawn as a band of one and of two of its standard deviations. A line as long as the band
+        belongs to a parameter that the measurements do not determine.
+
+        Example:
+            `fit.plot_parameters().figure.savefig("parameters.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            count: Largest number of parameters; those with the largest corrections are drawn.
+
+        Returns:
+            The axes.
+        """
+        fit = self._result
+        prior = fit.prior_std
+        names = [estimate.name for estimate in fit.estimates[: len(fit.x)]]
+        robot = [i for i, estimate in enumerate(fit.estimates[: len(fit.x)]) if estimate.category == "robot"]
+        change, std = fit.x / prior, np.minimum(fit.std / prior, 10.0)
+        chosen = sorted(sorted(robot, key=lambda i: -abs(change[i]))[:count])
+        ax = ax or new_axes(size=(6.4, max(2.0, 0.22 * len(chosen) + 0.9)))[0]
+        height = np.arange(len(chosen))
+        for width, color in zip(_PRIOR_BANDS, ("#eef1f4", "#dfe5ea"), strict=True):
+            label = f"prior, {width:g} standard deviation{'s' if width > 1 else ''}"
+            ax.axvspan(-width, width, color=color, linewidth=0, label=label)
+        ax.axvline(0.0, color=COLORS["text"], linewidth=1.0)
+        ax.errorbar(
+            change[chosen],
+            height,
+            xerr=2 * std[chosen],
+            fmt="o",
+            color=COLORS["after"],
+            markersize=DOT_SIZES[1],
+            label="correction, 2 standard deviations",
+        )
+        ax.set_yticks(height, [names[i] for i in chosen])
+        reach = float(np.max(np.abs(change[chosen]) + 2 * np.minimum(std[chosen], 1.5), initial=2.2))
+        ax.set(xlabel="correction / standard deviation of the prior", xlim=(-reach, reach))
+        ax.set_ylim(max(len(chosen), 1) - 0.4, -0.6)
+        if len(chosen) < len(robot):
+            ax.set_ylabel(f"{len(chosen)} largest of {len(robot)} corrections")
+        _legend(ax)
+        return ax
+
+    def plot_singular_values(self, ax: Axes | None = None) -> Axes:
+        """Plot the singular values of the whitened Jacobian relative to the largest one.
+
+        Example:
+            `fit.plot_singular_values().figure.savefig("singular_values.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+
+        Returns:
+            The axes.
+        """
+        fit = self._result
+        ax = ax or new_axes()[0]
+        plots.plot_singular_values(fit.solution.system.singular_values, fit.rank, ax)
+        _legend(ax)
+        return ax
+
+    def plot_correlation(self, ax: Axes | None = None) -> Axes:
+        """Plot the correlation matrix of all estimated parameters.
+
+        Example:
+            `fit.plot_correlation().figure.savefig("correlation.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+
+        Returns:
+            The axes.
+        """
+        from matplotlib.colors import LinearSegmentedColormap
+
+        fit = self._result
+        correlation = fit.correlation
+        names = [parameter.name for parameter in fit.parameters]
+        side = min(9.0, 3.0 + 0.14 * len(names))
+        ax = ax or new_axes(size=(side, side * 0.86))[0]
+        colors = LinearSegmentedColormap.from_list("dhcal", [COLORS["before"], "#ffffff", COLORS["after"]])
+        colors = colors.with_extremes(bad=COLORS["unknown"])
+        image = ax.imshow(np.ma.masked_invalid(correlation), cmap=colors, vmin=-1.0, vmax=1.0)
+        ax.grid(visible=False)
+        if len(names) <= _MAX_NAMES:
+            ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+            ax.set_yticks(range(len(names)), names, fontsize=7)
+        else:
+            ax.set(xlabel="parameter", ylabel="parameter")
+        _add_scale(ax, image, "correlation")
+        return ax
+
+    def plot_workspace(self, ax: Axes | None = None, *, plane: str = "xz") -> Axes:
+        """Plot a map of the predicted standard deviation of the tool position, with the measured positions.
+
+        Example:
+            `fit.plot_workspace(plane="xy").figure.savefig("map.png")`
+
+        Args:
+            ax: Axes to draw into; a new figure if None.
+            plane: Horizontal and vertical coordinate in the base frame: "xy", "xz" or "yz".
+
+        Returns:
+            The axes.
+        """
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import BoundaryNorm, ListedColormap
+
+        if plane not in ("xy", "xz", "yz"):
+            raise UnknownNameError(f"plane {plane!r}: unknown; choose from xy, xz, yz")
+        ax = ax or new_axes(size=(5.6, 4.6))[0]
+        found = predict_workspace(self._result, self._result.inliers)
+        plots.plot_position_std_map(found.points, found.std, ax, plane=plane, measured=found.measured)
+        colors = ListedColormap([COLORS[f"level-{k}"] for k in range(plots.N_LEVELS)])
+        scale = ScalarMappable(BoundaryNorm(1e3 * plots.std_levels(found.std), plots.N_LEVELS), colors)
+        _add_scale(ax, scale, "predicted standard deviation, mm")
+        return ax
+
+    def to_dataframe(self) -> Any:
+        """Return the estimates of all parameters as a `pandas.DataFrame`, one row per parameter.
+
+        Example:
+            `fit.to_dataframe().sort_values("change").to_csv("parameters.csv")`
+
+        Returns:
+            Data frame with the name of the parameter as index and the attributes of `Estimate` as columns, in
+            SI units.
+
+        Raises:
+            InvalidArgumentError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # lazy import: an optional package
+        except ModuleNotFoundError:
+            raise InvalidArgumentError("to_dataframe: pandas is not installed; pip install pandas") from None
+        names = (
+            "name unit nominal value change std prior observability fixed category frame direction".split()
+        )
+        rows = [{name: getattr(e, name) for name in names} for e in self._result.estimates]
+        return pd.DataFrame(rows).set_index("name")
+
+    def summary(self) -> str:
+        """Summarize the result in a few sentences: verdict, accuracy, where it holds, and what was estimated.
+
+        Example:
+            `print(fit.summary())`
+
+        Returns:
+            Text of several lines.
+        """
+        fit = self._result
+        count = len(fit.parameters)
+        lines = [
+            f"Verdict: {fit.verdict.status}.",
+            *fit.verdict.reasons,
+            headline(fit.comparisons).text,
+            *generalization_lines(fit.generalization, fit.comparisons),
+            f"{count} parameters from {fit.sample_count}; {fit.rank} combinations are identifiable; "
+            f"{describe_convergence(fit.converged, fit.iterations)}.",
+        ]
+        largest = largest_corrections(fit.estimates, fit.x, fit.solution.system)[:5]
+        if largest:
+            texts = [
+                f"{e.name} {formatting.format_quantity(e.change, e.unit, e.std, small=True)}" for e in largest
+            ]
+            lines.append(f"Largest corrections: {', '.join(texts)}.")
+        return "\n".join(lines)

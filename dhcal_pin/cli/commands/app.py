@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from argparse import SUPPRESS, ArgumentParser, Namespace
+from argparse import SUPPRESS, Namespace
 
-from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, add_open_option
+from .. import screens
+from ..options import NON_NEGATIVE_INTEGER, POSITIVE_INTEGER, Options, open_option
 
 EXAMPLE = "dhcal app"
 _MEGABYTE = 10**6
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal app`."""
-    parser.add_argument(
-        "--port",
-        metavar="N",
-        type=NON_NEGATIVE_INTEGER,
-        default=0,
-        help="port of the loopback address (default: any free one)",
-    )
-    parser.add_argument(
-        "--max-size",
-        metavar="MB",
-        type=POSITIVE_INTEGER,
-        default=100,
-        help="largest size of all files that are dropped together, in MB (default: %(default)s)",
-    )
-    add_open_option(parser, "the page", default=True)
-    parser.add_argument("--no-browser", dest="open", action="store_false", help=SUPPRESS)
+ARGUMENTS: Options = {
+    "--port N": {
+        "type": NON_NEGATIVE_INTEGER,
+        "default": 0,
+        "help": "port of the loopback address (default: any free one)",
+    },
+    "--max-size MB": {
+        "type": POSITIVE_INTEGER,
+        "default": 100,
+        "help": "largest size of all files that are dropped together, in MB (default: %(default)s)",
+    },
+    **open_option("open the page in the browser (default)"),
+    "--no-browser": {"dest": "open", "action": "store_false", "help": SUPPRESS},
+}
 
 
 def run(args: Namespace) -> int:
@@ -35,12 +31,11 @@ def run(args: Namespace) -> int:
     import asyncio  # lazy import, as the following: slow to load
 
     from ...app import serve
-    from ..screens import console
 
     def show_address(url: str) -> None:
-        console.print_lines(url, "end with Ctrl-C")
-        if args.open:
-            console.open_url(url)
+        screens.print_lines(url, "end with Ctrl-C")
+        if args.open is not False:
+            screens.open_url(url)
 
     asyncio.run(serve(show_address, port=args.port, limit=args.max_size * _MEGABYTE))
     return 0

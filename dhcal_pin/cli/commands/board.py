@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
 from ... import detection, io
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, RIG
+from .. import screens
+from ..options import JSON, Options
 
 EXAMPLE = "dhcal board rig.toml --paper a4 -o board.pdf"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal board`."""
-    parser.add_argument("rig", metavar=RIG["metavar"], help="rig file with the board")
-    parser.add_argument(
-        "--board", metavar="NAME", help="board of the rig file; only needed if it has several"
-    )
-    parser.add_argument(
-        "--paper",
-        metavar="SIZE",
-        choices=("a4", "letter"),
-        help="sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig "
+ARGUMENTS: Options = {
+    "rig RIG.toml": "rig file with the board",
+    "--board NAME": "board of the rig file; only needed if it has several",
+    "--paper SIZE": {
+        "choices": ("a4", "letter"),
+        "help": "sheet of paper, a4 or letter, with a ruler line: its measured length, ruler_mm in the rig "
         "file, corrects the scale of the printer (default: a page of the size of the board)",
-    )
-    parser.add_argument("-o", "--output", metavar="board.pdf", required=True, help="page to write")
-    parser.add_argument("--json", **JSON)
+    },
+    "-o --output board.pdf": {"required": True, "help": "page to write"},
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
     """Draw a board."""
-    from ..outputs import require_writable_outputs, write_with_json  # lazy import, as the following
-    from ..screens import console
-    from ..screens.result_screens import files_screen
+    from ..outputs import require_writable_outputs, write_with_json  # lazy import: loads Pinocchio
 
     require_writable_outputs([args.output, args.json], [args.rig])
     if not args.output.lower().endswith(".pdf"):
@@ -47,6 +41,6 @@ def run(args: Namespace) -> int:
             "Print it at 100 %, without fitting it to the page. Measure the ruler line and write its length "
             f"to [board.{board.name}] of {args.rig}, such as ruler_mm = 149.6. Glue the sheet to a plate."
         )
-    console.show(files_screen([args.output]), args.verbosity)
-    console.print_lines(advice)
+    screens.show(screens.files_screen([args.output]), args.verbosity)
+    screens.print_lines(advice)
     return 0

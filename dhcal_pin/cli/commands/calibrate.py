@@ -4,44 +4,38 @@ from __future__ import annotations
 
 import atexit
 import gc
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
 from ...exceptions import InvalidArgumentError
-from ..job import BUNDLE_ENDING, DOUBTFUL, Job, add_job_arguments, is_manifest
-from ..options import add_execution_options
+from .. import screens
+from ..job import BUNDLE_ENDING, DOUBTFUL, Job, is_manifest, job_options
+from ..options import Options, execution_options
 
 # Exit status of a refused calibration.
 REFUSED = 3
 
 EXAMPLE = "dhcal calibrate ur10.urdf laser.csv --tip tool0 --holdout 0.3 -o ur10_calibrated.urdf"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal calibrate`."""
-    add_job_arguments(parser)
-    parser.add_argument(
-        "--from",
-        dest="source",
-        metavar=f"NAME{BUNDLE_ENDING}",
-        help="repeat the calibration of a bundle; a ROBOT and options that are named replace its own, and "
-        "DATA is added to its measurements",
-    )
-    add_execution_options(parser, "processes (default: 1; with a manifest, one per processor)", jobs=None)
-    parser.add_argument(
-        "--progress",
-        choices=("status", "lines"),
-        default="status",
-        help="status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` on "
-        "stderr for each step, for programs that run this command",
-    )
-    parser.add_argument(
-        "--strict",
-        action="store_true",
-        help="exit status 4 for the verdict caution, and 3 for a refused robot with --force; the files are "
-        "written",
-    )
+ARGUMENTS: Options = {
+    **job_options(),
+    "--from": {
+        "dest": "source",
+        "metavar": f"NAME{BUNDLE_ENDING}",
+        "help": "repeat the calibration of a bundle; a ROBOT and options that are named replace its own, "
+        "and DATA is added to its measurements",
+    },
+    **execution_options("processes (default: 1; with a manifest, one per processor)", jobs=None),
+    "--progress": {
+        "choices": ("status", "lines"),
+        "default": "status",
+        "help": "status: a status line on a terminal (default); lines: a line `progress: PHASE STEP/TOTAL` "
+        "on stderr for each step, for programs that run this command",
+    },
+    "--strict": "exit status 4 for the verdict caution, and 3 for a refused robot with --force; the files "
+    "are written",
+}
 
 
 def run(args: Namespace) -> int:
@@ -80,12 +74,11 @@ def _calibrate_robot(args: Namespace) -> int:
     """Calibrate one robot and show its result."""
     from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from ..bundled_job import job_source, run_any_job
-    from ..screens import console
     from ..screens.calibration_screen import calibration_screen
 
     shown = {
-        "status": console.show_progress("reading the files"),
-        "lines": nullcontext(console.print_progress),
+        "status": screens.show_progress("reading the files"),
+        "lines": nullcontext(screens.print_progress),
     }
     with (
         job_source(args) as (job, folder),
@@ -93,7 +86,7 @@ def _calibrate_robot(args: Namespace) -> int:
         shown[args.progress] as progress,
     ):
         outcome = run_any_job(job, folder, progress, executor)
-    console.show(calibration_screen(outcome, job), args.verbosity)
+    screens.show(calibration_screen(outcome, job), args.verbosity)
     verdict = outcome.fit.verdict
     if verdict.is_refused and (args.strict or not job.force):
         return REFUSED

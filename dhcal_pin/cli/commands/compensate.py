@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ... import io, robot
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_motion_options, add_urdf_options, read_robot_or_table
+from .. import screens
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, motion_options, read_robot_or_table
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -26,39 +27,26 @@ _COMPUTED_DIGITS = 15
 # Numbers that differ from a multiple of this angle by less than the tolerance are design values [rad].
 _DESIGN_ANGLE, _DESIGN_TOL = math.pi / 12, 1e-6
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal compensate`."""
-    parser.add_argument(
-        "nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help="robot model of the controller"
-    )
-    parser.add_argument(
-        "calibrated", metavar="CALIBRATED.urdf", type=ROBOT["type"], help="the same robot, calibrated"
-    )
-    parser.add_argument("targets", metavar="targets.csv", help="positions or poses of the tool")
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="corrected.csv",
-        required=True,
-        help="joint values and corrected targets to write, one row per target",
-    )
-    add_urdf_options(parser)
-    parser.add_argument(
-        "--frame",
-        choices=FRAMES,
-        default=BASE,
-        help="frame of the targets: base (base link of the robot, default) or measuring (measuring frame of "
-        "the calibration)",
-    )
-    parser.add_argument(
-        "--tcp",
-        metavar="FRAME|FILE",
-        help="tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m and "
-        "rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
-    )
-    add_motion_options(parser, "rad")
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "nominal NOMINAL.urdf": {"type": ROBOT["type"], "help": "robot model of the controller"},
+    "calibrated CALIBRATED.urdf": {"type": ROBOT["type"], "help": "the same robot, calibrated"},
+    "targets targets.csv": "positions or poses of the tool",
+    "-o --output corrected.csv": {
+        "required": True,
+        "help": "joint values and corrected targets to write, one row per target",
+    },
+    **URDF_OPTIONS,
+    "--frame": {
+        "choices": FRAMES,
+        "default": BASE,
+        "help": "frame of the targets: base (base link of the robot, default) or measuring (measuring frame "
+        "of the calibration)",
+    },
+    "--tcp FRAME|FILE": "tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m "
+    "and rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
+    **motion_options("rad"),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -67,8 +55,6 @@ def run(args: Namespace) -> int:
     from ...programs import program_text, require_program_ending
     from ..output_table import numbered
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import compensation_screen
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
@@ -78,7 +64,7 @@ def run(args: Namespace) -> int:
         require_program_ending(path)
     nominal, calibrated = read_robots(args)
     targets = io.read_targets(args.targets, calibrated)
-    with console.progress_bar("compensating", len(targets.values)) as progress:
+    with screens.progress_bar("compensating", len(targets.values)) as progress:
         result = compensate(nominal, calibrated, targets.values, targets.near, progress, targets.conditions)
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
     for path in args.export:
@@ -95,7 +81,7 @@ def run(args: Namespace) -> int:
         status=list(result.status),
         warnings=[f"{args.nominal}: {warning}"] if warning else [],
     )
-    screen = compensation_screen(
+    screen = screens.compensation_screen(
         f"targets: {_tool_text(args, calibrated)} in {frame}",
         result,
         calibrated,
@@ -104,7 +90,7 @@ def run(args: Namespace) -> int:
         _frame_hint(args, result),
         contents,
     )
-    console.show(screen, args.verbosity)
+    screens.show(screen, args.verbosity)
     return 0
 
 

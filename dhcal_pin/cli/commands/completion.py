@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace, _SubParsersAction
+from argparse import Namespace, _SubParsersAction
 
 from ...exceptions import InvalidArgumentError
-from ..options import IntegerType, expand_placeholders
+from ..options import IntegerType, Options, expand_placeholders
 
 EXAMPLE = "dhcal completion bash"
 SHELLS = ("bash", "zsh", "fish")
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal completion`."""
-    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help=f"shell: {', '.join(SHELLS)}")
+ARGUMENTS: Options = {
+    "shell SHELL": {"choices": SHELLS, "help": f"shell: {', '.join(SHELLS)}"},
+}
 
 
 def run(args: Namespace) -> int:

@@ -2,83 +2,56 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 
 from ... import io
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from .. import screens
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal convert`."""
-    parser.add_argument(
-        "input",
-        metavar="IN",
-        type=ROBOT["type"],
-        help=f"{ROBOT['help']}; "
-        "with --template, corrections of a maker: {correction_formats}; "
-        "or a recording: .bag, .mcap, or the folder of a ROS 2 bag",
-    )
-    parser.add_argument(
-        "output",
-        metavar="OUT",
-        help="file to write; its ending selects the format: {written_formats}; of a recording, a measurement "
-        "file (.csv)",
-    )
-    add_urdf_options(parser)
-    parser.add_argument(
-        "--convention", choices=("standard", "modified"), help="DH convention of the file to write"
-    )
-    parser.add_argument(
-        "--template",
-        metavar="FILE",
-        type=ROBOT["type"],
-        help="write this URDF or MJCF of the same robot with the kinematics of IN; joints are matched by "
+ARGUMENTS: Options = {
+    "input IN": {
+        "type": ROBOT["type"],
+        "help": f"{ROBOT['help']}; with --template, corrections of a maker: {{correction_formats}}; or a "
+        "recording: .bag, .mcap, or the folder of a ROS 2 bag",
+    },
+    "output OUT": "file to write; its ending selects the format: {written_formats}; of a recording, a "
+    "measurement file (.csv)",
+    **URDF_OPTIONS,
+    "--convention": {"choices": ("standard", "modified"), "help": "DH convention of the file to write"},
+    "--template FILE": {
+        "type": ROBOT["type"],
+        "help": "write this URDF or MJCF of the same robot with the kinematics of IN; joints are matched by "
         "their names, and all else stays",
-    )
-    parser.add_argument(
-        "--template-tip",
-        metavar="LINK",
-        help="link, body or site of the template that is the tip of IN (default: the one of the same name)",
-    )
-    parser.add_argument(
-        "--pose-topic",
-        metavar="TOPIC",
-        help="topic of the measured poses or points of a recording, TOPIC:FRAME for a child frame of "
-        "transforms; without it the candidates are listed",
-    )
-    parser.add_argument(
-        "--joint-topic",
-        metavar="TOPIC",
-        help="topic of the joint positions of a recording (default: the only one of its type, or "
-        "/joint_states)",
-    )
-    parser.add_argument(
-        "--robot",
-        **{
-            **ROBOT,
-            "help": "write the joints of this robot only; needed for prismatic joints of a recording",
-        },
-    )
-    parser.add_argument("--json", **JSON)
+    },
+    "--template-tip LINK": "link, body or site of the template that is the tip of IN (default: the one of "
+    "the same name)",
+    "--pose-topic TOPIC": "topic of the measured poses or points of a recording, TOPIC:FRAME for a child "
+    "frame of transforms; without it the candidates are listed",
+    "--joint-topic TOPIC": "topic of the joint positions of a recording (default: the only one of its type, "
+    "or /joint_states)",
+    "--robot": {
+        **ROBOT,
+        "help": "write the joints of this robot only; needed for prismatic joints of a recording",
+    },
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
     """Convert a robot file to the format that the ending of the output selects, or a recording."""
     from ...io.measurement_files.bag import is_bag  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     others = [path for path in (args.robot, args.template) if path]
     inputs = [args.input, *others]
     require_writable_outputs([args.output, args.json], inputs)
     text, notes = (_convert_bag if is_bag(args.input) else _convert_robot)(args)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=list(notes))
-    console.show(files_screen([args.output], notes), args.verbosity)
+    screens.show(screens.files_screen([args.output], notes), args.verbosity)
     return 0
 
 

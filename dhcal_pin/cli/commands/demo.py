@@ -7,13 +7,14 @@ and a summary in Markdown are written into a folder.
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import io, paper, report, visualization
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, add_open_option
+from .. import screens
+from ..options import JSON, Options, open_option
 from ..screens.screen import Block, Screen
 
 if TYPE_CHECKING:
@@ -22,18 +23,15 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal demo -o demo"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal demo`."""
-    parser.add_argument(
-        *("-o", "--output", "--out"),
-        dest="out",
-        default="demo",
-        metavar="DIR",
-        help="folder for the results (default: %(default)s)",
-    )
-    add_open_option(parser, "the report")
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "-o --output --out DIR": {
+        "dest": "out",
+        "default": "demo",
+        "help": "folder for the results (default: %(default)s)",
+    },
+    **open_option("open the report in the browser"),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -42,7 +40,6 @@ def run(args: Namespace) -> int:
     from ...formatting import Table
     from ...paper import simulations
     from ..outputs import require_writable_outputs
-    from ..screens import console
 
     require_writable_outputs([args.json], [])
     folder = args.out
@@ -74,11 +71,11 @@ def run(args: Namespace) -> int:
         Block(excluded, "yellow", noun="excluded row of Table 5", rank=0, n_kept=0, has_space=True),
         Block([f"wrote into {folder}: {', '.join(names)}"], has_space=True),
     ]
-    console.show(
+    screens.show(
         Screen(blocks, lambda: [block for section in details for block in section.blocks()]), args.verbosity
     )
     if args.open:
-        console.open_page(document["files"]["report"])
+        screens.open_page(document["files"]["report"])
     return 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from ... import detection, io
 from ...exceptions import InvalidArgumentError
-from ..options import JSON, POSITIVE_INTEGER, RIG
+from .. import screens
+from ..options import JSON, POSITIVE_INTEGER, RIG, Options
 
 if TYPE_CHECKING:
     from ..._typing import PathLike
@@ -20,59 +21,33 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal detect images --rig rig.toml --joints joints.csv -o corners.csv"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal detect`."""
-    parser.add_argument(
-        "images",
-        metavar="IMAGES",
-        nargs="+",
-        help="image files, folders of images, or videos: one still of each pause of the arm is used",
-    )
-    parser.add_argument(
-        "--stills",
-        metavar="DIR",
-        help="folder for the stills of videos, VIDEO-001.png, VIDEO-002.png and so on in the order of the "
-        "pauses; --joints has these names in the column `image` (default: they are not kept)",
-    )
-    parser.add_argument(
-        "--rig", **{**RIG, "required": True, "help": "rig file with the camera and the boards"}
-    )
-    parser.add_argument(
-        "--joints",
-        metavar="FILE",
-        help="joint values of each image: a table with a column `image` with the file names and one column "
-        "per joint, or those of the pose of the flange (x[mm],y[mm],z[mm] and qw,qx,qy,qz or "
-        "rx[rad],ry[rad],rz[rad]), or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names "
-        "of the images are times such as 1700000000.25.png; without it the output has no joint values. "
-        "Columns approach_JOINT have the direction in which a joint moved last (-1, 0 or 1); the comment "
-        "`# rows: in order` says that the rows are in the order in which the images were taken",
-    )
-    parser.add_argument(
-        "--joint-topic",
-        metavar="TOPIC",
-        help="topic of the joint positions in the recording (default: the only one, or /joint_states)",
-    )
-    parser.add_argument(
-        "--camera", metavar="NAME", help="camera of the rig file; only needed if it has several"
-    )
-    parser.add_argument(
-        "--overlay",
-        metavar="DIR",
-        help="folder for pictures of the images: circles are the corners that were found, crosses those "
-        "reprojected with the board pose of this image and the lens of the rig, or the lens estimated from "
-        "the images if the rig states none",
-    )
-    parser.add_argument(
-        "--jobs",
-        metavar="N",
-        type=POSITIVE_INTEGER,
-        help="images that are searched at the same time (default: one per processor)",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="corners.csv", required=True, help="image coordinates to write"
-    )
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "images IMAGES": {
+        "nargs": "+",
+        "help": "image files, folders of images, or videos: one still of each pause of the arm is used",
+    },
+    "--stills DIR": "folder for the stills of videos, VIDEO-001.png, VIDEO-002.png and so on in the order "
+    "of the pauses; --joints has these names in the column `image` (default: they are not kept)",
+    "--rig": {**RIG, "required": True, "help": "rig file with the camera and the boards"},
+    "--joints FILE": "joint values of each image: a table with a column `image` with the file names and one "
+    "column per joint, or those of the pose of the flange (x[mm],y[mm],z[mm] and qw,qx,qy,qz or "
+    "rx[rad],ry[rad],rz[rad]), or a recording (.bag, .mcap, or the folder of a ROS 2 bag) if the names of "
+    "the images are times such as 1700000000.25.png; without it the output has no joint values. Columns "
+    "approach_JOINT have the direction in which a joint moved last (-1, 0 or 1); the comment `# rows: in "
+    "order` says that the rows are in the order in which the images were taken",
+    "--joint-topic TOPIC": "topic of the joint positions in the recording (default: the only one, or "
+    "/joint_states)",
+    "--camera NAME": "camera of the rig file; only needed if it has several",
+    "--overlay DIR": "folder for pictures of the images: circles are the corners that were found, crosses "
+    "those reprojected with the board pose of this image and the lens of the rig, or the lens estimated "
+    "from the images if the rig states none",
+    "--jobs N": {
+        "type": POSITIVE_INTEGER,
+        "help": "images that are searched at the same time (default: one per processor)",
+    },
+    "-o --output corners.csv": {"required": True, "help": "image coordinates to write"},
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -104,8 +79,6 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     """Find the corners in images and write them."""
     from ...io.measurement_files.columns import IN_ORDER  # lazy import, as the following: they load Pinocchio
     from ..outputs import require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import detection_screen
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
@@ -123,7 +96,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
         place = {name: number for number, name in enumerate(read.joints)}
         paths.sort(key=lambda path: place[os.path.basename(path)])
         comments.append(IN_ORDER)
-    with console.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
+    with screens.progress_bar("finding boards", len(paths) * len(rig.boards)) as on_progress:
         detections = detection.detect_boards(rig, camera, paths, on_progress, args.jobs)
     columns = detection.corner_columns(rig, camera, detections, joints)
     used = {image.path for each in detections for image in each.used}
@@ -159,7 +132,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     named = {"output": args.output} | ({"overlay": args.overlay} if args.overlay else {})
     write_with_json(contents, args.json, named, inputs, boards=boards, notes=notes)
     written = [args.output, *([f"{args.overlay} ({len(paths)} pictures)"] if args.overlay else [])]
-    console.show(detection_screen(detections, notes, written), args.verbosity)
+    screens.show(screens.detection_screen(detections, notes, written), args.verbosity)
     return 0
 
 

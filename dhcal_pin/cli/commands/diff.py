@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
 from ... import diagnostics, io, report
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from .. import screens
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 from ..output_table import Output
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
 
-
 OUTPUTS = {"json": Output(), "report": Output("the report of a difference", (".html",), (".htm",))}
 
 
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal diff`."""
-    text = "{} robot: a calibrated robot with its sidecar, or the nominal one"
-    parser.add_argument("first", metavar="A", type=ROBOT["type"], help=text.format("one"))
-    parser.add_argument("second", metavar="B", type=ROBOT["type"], help=text.format("the other"))
-    add_urdf_options(parser)
-    parser.add_argument("--report", metavar="F.html", help="report with maps and both robots in 3-D (.html)")
-    parser.add_argument("--json", **JSON)
+_HELP = "{} robot: a calibrated robot with its sidecar, or the nominal one"
+ARGUMENTS: Options = {
+    "first A": {"type": ROBOT["type"], "help": _HELP.format("one")},
+    "second B": {"type": ROBOT["type"], "help": _HELP.format("the other")},
+    **URDF_OPTIONS,
+    "--report F.html": "report with maps and both robots in 3-D (.html)",
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
     """Compare two robots, write the difference and show it."""
     from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import difference_screen
 
     robots = [args.first, args.second]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -41,7 +39,7 @@ def run(args: Namespace) -> int:
         outputs, {"report": lambda path: report.difference_page(names, difference, digests)}
     )
     write_outputs(contents, args.json, document)
-    console.show(difference_screen(difference, contents), args.verbosity)
+    screens.show(screens.difference_screen(difference, contents), args.verbosity)
     return 0
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from dataclasses import asdict
 
 from ...messages import message_line
-from ..options import JSON
+from ..options import JSON, Options
 
 EXAMPLE = "dhcal doctor"
 _STYLES = {"ok": "", "note": "yellow", "failed": "bold red"}
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal doctor`."""
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:

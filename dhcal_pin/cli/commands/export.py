@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 
-from ..options import JSON, ROBOT, add_urdf_options, read_one_robot
+from .. import screens
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal export ur10_calibrated.urdf --tip tool0 -o model.h"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal export`."""
-    parser.add_argument("robot", **ROBOT)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="FILE",
-        required=True,
-        help="file to write: NAME.h, a C99 header whose functions begin with the name of the file, or "
+ARGUMENTS: Options = {
+    "robot": ROBOT,
+    "-o --output FILE": {
+        "required": True,
+        "help": "file to write: NAME.h, a C99 header whose functions begin with the name of the file, or "
         "NAME.py, a Python module that needs NumPy only",
-    )
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+    },
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
     """Write the source code."""
     from ...model_code import model_code, require_code_ending  # lazy import, as the following
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     require_code_ending(args.output)
     inputs = [args.robot, *existing_sidecars([args.robot])]
     require_writable_outputs([args.output, args.json], inputs)
     text = model_code(read_one_robot(args.robot, args), args.output)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs)
-    console.show(files_screen([args.output]), args.verbosity)
+    screens.show(screens.files_screen([args.output]), args.verbosity)
     return 0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from dataclasses import asdict
 
 from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
-from ..options import DATA, JSON, RIG, ROBOT, add_table_options, add_urdf_options, read_one_robot
+from .. import screens
+from ..options import DATA, JSON, RIG, ROBOT, TABLE_OPTIONS, URDF_OPTIONS, Options, read_one_robot
 
 EXAMPLE = "dhcal inspect laser.csv --robot ur10.urdf --tip tool0"
 # Why some options need the robot.
@@ -18,22 +19,16 @@ _ROBOT_REASONS = {
     "servos": "whose joints the servos move",
 }
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal inspect`."""
-    parser.add_argument("data", **DATA)
-    parser.add_argument(
-        "--robot", **{**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"}
-    )
-    add_table_options(parser)
-    parser.add_argument("--rig", **RIG)
-    parser.add_argument(
-        "--skip-bad-rows",
-        action="store_true",
-        help="as in other commands: rows that lack a number or a name are always skipped here, and listed",
-    )
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "data": DATA,
+    "--robot": {**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"},
+    **TABLE_OPTIONS,
+    "--rig": RIG,
+    "--skip-bad-rows": "as in other commands: rows that lack a number or a name are always skipped here, "
+    "and listed",
+    **URDF_OPTIONS,
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -42,8 +37,6 @@ def run(args: Namespace) -> int:
         return _inspect_bundle(args)
     from ...measurements.mounting import mount_rig  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import inspection_screen
 
     for option, reason in _ROBOT_REASONS.items():
         if getattr(args, option) and not args.robot:
@@ -72,15 +65,13 @@ def run(args: Namespace) -> int:
     about = ""
     if chain is not None:
         about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
-    console.show(inspection_screen(about, inspections), args.verbosity)
+    screens.show(screens.inspection_screen(about, inspections), args.verbosity)
     return 0
 
 
 def _inspect_bundle(args: Namespace) -> int:
     """Show what a bundle holds."""
-    from ..outputs import require_writable_outputs, write_outputs  # lazy import, as the following
-    from ..screens import console
-    from ..screens.result_screens import bundle_screen
+    from ..outputs import require_writable_outputs, write_outputs  # lazy import: loads Pinocchio
 
     if len(args.data) > 1 or args.robot or args.columns or args.rig:
         raise InvalidArgumentError(f"{args.data[0]}: a bundle is inspected alone; leave out other files")
@@ -103,5 +94,5 @@ def _inspect_bundle(args: Namespace) -> int:
         "sha256": bundle.digests,
     }
     write_outputs({}, args.json, document)
-    console.show(bundle_screen(document, bundle.result), args.verbosity)
+    screens.show(screens.bundle_screen(document, bundle.result), args.verbosity)
     return 0

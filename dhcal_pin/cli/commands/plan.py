@@ -6,8 +6,9 @@ from argparse import Namespace
 
 from ... import planning, report
 from ...exceptions import InvalidArgumentError
+from .. import screens
 from ..options import read_one_robot
-from ..plan_options import add_arguments as add_arguments
+from ..plan_options import ARGUMENTS as ARGUMENTS
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
 
@@ -27,8 +28,6 @@ def run(args: Namespace) -> int:
     from ..outputs import checked_files, require_workbook, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
     from ..plan_outputs import OUTPUTS, Planned, content_makers, plan_document
-    from ..screens import console
-    from ..screens.result_screens import plan_screen
 
     count, n_repeated = planned_count(args)
     kind, inputs = planned_kind(args), input_paths(args)
@@ -38,12 +37,12 @@ def run(args: Namespace) -> int:
         require_program_ending(path)
     chain = with_arm_type(read_one_robot(args.robot, args), args.arm, args.servos, args.parameters)
     given, rows = read_input(args, chain, kind)
-    with console.show_progress(f"choosing {count} poses") as progress:
+    with screens.show_progress(f"choosing {count} poses") as progress:
         result = planning.plan(chain, count, progress=progress, **given)
     if n_repeated:
         result = planning.with_repeats(result, chain, n_repeated, given["space"], given["margin"])
     done = Planned(result, chain, given, rows, args, report.file_digests(inputs))
     contents = file_contents(files, content_makers(done))
     write_outputs(contents, args.json, plan_document(done))
-    console.show(plan_screen(result, done.moves, contents), args.verbosity)
+    screens.show(screens.plan_screen(result, done.moves, contents), args.verbosity)
     return 0

@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import Any
 
 from ... import io, report, session
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    JSON,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    add_table_options,
-    add_urdf_options,
-    read_data,
-    read_one_robot,
-)
+from .. import options, screens
 from ..output_table import Makers, Output
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
@@ -25,41 +16,29 @@ EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur
 # Exit status of each verdict.
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
-
 OUTPUTS = {
     "json": Output(),
     "history": Output("a history", (".jsonl",)),
     "plot": Output("a plot of the history", (".html",), (".htm",)),
 }
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal recheck`."""
-    parser.add_argument("robot", **{**ROBOT, "help": f"calibrated {ROBOT['help']}, with its sidecar"})
-    parser.add_argument("data", **DATA)
-    add_urdf_options(parser)
-    add_table_options(parser)
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--sigma",
-        metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis of instrument and robot repeatability (default: the columns sigma "
-        "of DATA, else estimated from the measurements)",
-    )
-    parser.add_argument(
-        "--size",
-        metavar="LENGTH",
-        default="1mm",
-        help="smallest motion of the tool that the check must reveal; if it cannot, the answer is `cannot "
-        "say` (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--history", metavar="FILE.jsonl", help="add the check to this file, one JSON line each"
-    )
-    parser.add_argument(
-        "--plot", metavar="H.html", help="page with the checks of --history over time (.html)"
-    )
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: options.Options = {
+    "robot": {**options.ROBOT, "help": f"calibrated {options.ROBOT['help']}, with its sidecar"},
+    "data": options.DATA,
+    **options.URDF_OPTIONS,
+    **options.TABLE_OPTIONS,
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
+    "--sigma LENGTH[,ANGLE]": "standard deviation per axis of instrument and robot repeatability (default: "
+    "the columns sigma of DATA, else estimated from the measurements)",
+    "--size LENGTH": {
+        "default": "1mm",
+        "help": "smallest motion of the tool that the check must reveal; if it cannot, the answer is "
+        "`cannot say` (default: %(default)s)",
+    },
+    "--history FILE.jsonl": "add the check to this file, one JSON line each",
+    "--plot H.html": "page with the checks of --history over time (.html)",
+    "--json": options.JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -70,8 +49,6 @@ def run(args: Namespace) -> int:
     from ...units import parse_noise
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import recheck_screen
 
     sidecar = io.existing_sidecar(args.robot)
     inputs = [args.robot, *args.data, *filter(None, (sidecar, args.columns, args.servos))]
@@ -81,7 +58,7 @@ def run(args: Namespace) -> int:
         raise InvalidArgumentError("--plot: needs --history, the file with the checks that are shown")
     noise = Noise(*parse_noise(args.sigma, "--sigma")) if args.sigma else None
     size = parse_noise(args.size, "--size")[0]
-    chain = read_one_robot(args.robot, args)
+    chain = options.read_one_robot(args.robot, args)
     if sidecar is None:
         raise InvalidArgumentError(
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
@@ -91,7 +68,7 @@ def run(args: Namespace) -> int:
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
             raise InvalidArgumentError(f"{path}: recheck does not use images; expected positions or poses")
-    files = read_data(args, chain, servos)
+    files = options.read_data(args, chain, servos)
     earlier = read_history(args.history) if args.history and os.path.exists(args.history) else []
     data, known = [file.data for file in files], io.read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
@@ -114,5 +91,5 @@ def run(args: Namespace) -> int:
     contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(recheck_screen(result, notes, contents), args.verbosity)
+    screens.show(screens.recheck_screen(result, notes, contents), args.verbosity)
     return STATUS[result.verdict]

@@ -4,78 +4,54 @@ from __future__ import annotations
 
 import os
 import re
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from ... import estimation, io, robot
 from ...exceptions import InvalidArgumentError, UnknownNameError
-from ..options import (
-    JSON,
-    NON_NEGATIVE_INTEGER,
-    POSITIVE_INTEGER,
-    ROBOT,
-    add_urdf_options,
-    read_robot_or_table,
-)
+from .. import options, screens
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal simulate`."""
-    parser.add_argument("robot", metavar="ROBOT", type=ROBOT["type"], help=f"nominal {ROBOT['help']}")
-    parser.add_argument(
-        *("-n", "--count", "-m", "--samples"),
-        dest="samples",
-        type=POSITIVE_INTEGER,
-        required=True,
-        metavar="N",
-        help="number of samples",
-    )
-    parser.add_argument(
-        *("--sigma", "--noise"),
-        dest="noise",
-        default="0mm",
-        metavar="LENGTH[,ANGLE]",
-        help="standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind camera "
-        "in pixels, such as 0.2px",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="data.csv", required=True, help="measurement CSV file to write"
-    )
-    parser.add_argument(
-        "--truth",
-        metavar="T.urdf",
-        type=ROBOT["type"],
-        help="robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
+ARGUMENTS: options.Options = {
+    "robot ROBOT": {"type": options.ROBOT["type"], "help": f"nominal {options.ROBOT['help']}"},
+    "-n --count -m --samples N": {
+        "dest": "samples",
+        "type": options.POSITIVE_INTEGER,
+        "required": True,
+        "help": "number of samples",
+    },
+    "--sigma --noise LENGTH[,ANGLE]": {
+        "dest": "noise",
+        "default": "0mm",
+        "help": "standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind "
+        "camera in pixels, such as 0.2px",
+    },
+    "-o --output data.csv": {"required": True, "help": "measurement CSV file to write"},
+    "--truth T.urdf": {
+        "type": options.ROBOT["type"],
+        "help": "robot with errors (default: ROBOT); conditions that its joint errors depend on, such as "
         "directions of approach or temperatures, are drawn and written",
-    )
-    parser.add_argument(
-        "--errors",
-        metavar="LENGTH,ANGLE",
-        help="robot with random errors: standard deviations of the position and orientation of every joint "
-        "origin, such as 1mm,0.3deg; drawn with the seed",
-    )
-    parser.add_argument(
-        "--kind",
-        metavar="KIND",
-        default="pose",
-        help="kind of measurement (default: %(default)s): {kinds}; "
-        "camera: six points on the tip in two cameras of 4096 x 4096 px that stand still, in which 1 mm at "
-        "the robot is 1 px; their rig file NAME.rig.toml is written beside NAME.csv",
-    )
-    add_urdf_options(parser)
-    parser.add_argument(
-        "--seed",
-        metavar="N",
-        type=NON_NEGATIVE_INTEGER,
-        default=0,
-        help="random seed of joint values and noise (default: %(default)s)",
-    )
-    parser.add_argument("--json", **JSON)
+    },
+    "--errors LENGTH,ANGLE": "robot with random errors: standard deviations of the position and orientation "
+    "of every joint origin, such as 1mm,0.3deg; drawn with the seed",
+    "--kind KIND": {
+        "default": "pose",
+        "help": "kind of measurement (default: %(default)s): {kinds}; camera: six points on the tip in two "
+        "cameras of 4096 x 4096 px that stand still, in which 1 mm at the robot is 1 px; their rig file "
+        "NAME.rig.toml is written beside NAME.csv",
+    },
+    **options.URDF_OPTIONS,
+    "--seed N": {
+        "type": options.NON_NEGATIVE_INTEGER,
+        "default": 0,
+        "help": "random seed of joint values and noise (default: %(default)s)",
+    },
+    "--json": options.JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -85,8 +61,6 @@ def run(args: Namespace) -> int:
     from ...measurements import KINDS, Noise
     from ...units import parse_noise
     from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
@@ -99,7 +73,7 @@ def run(args: Namespace) -> int:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
     nominal = truth = io.read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
-        truth = read_robot_or_table(args.truth, args)
+        truth = options.read_robot_or_table(args.truth, args)
         if truth.joint_names != nominal.joint_names:
             raise InvalidArgumentError(
                 f"{args.truth}: its joints are {', '.join(truth.joint_names)}; "
@@ -122,13 +96,13 @@ def run(args: Namespace) -> int:
     facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
-    console.show(files_screen(contents), args.verbosity)
+    screens.show(screens.files_screen(contents), args.verbosity)
     return 0
 
 
 def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
     """Return joint positions with random values of the conditions that the robot depends on."""
-    import numpy as np  # lazy import, as the following: they are slow to load
+    import numpy as np  # lazy import: slow to load
 
     rng = np.random.default_rng([seed, 2])
     needed = {family.condition for family in truth.error_families}
@@ -147,7 +121,7 @@ def _length_of_pixels(noise: str) -> str:
 
 def _with_random_errors(nominal: robot.Chain, length: float, angle: float, seed: int) -> robot.Chain:
     """Move every joint origin by normally distributed errors, with standard deviations in m and rad."""
-    import numpy as np  # lazy import, as the following: they are slow to load
+    import numpy as np  # lazy import: slow to load
 
     errors = estimation.select_parameters(nominal, "placement")
     std = np.array([length if parameter.unit == "m" else angle for parameter in errors.parameters])

@@ -7,27 +7,22 @@ interruption the same command resumes with the next block.
 from __future__ import annotations
 
 import os
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 
 from ... import io, studies
-from ..options import JSON, add_execution_options
+from .. import screens
+from ..options import JSON, Options, execution_options
 
 EXAMPLE = "dhcal study ur10_poses --jobs 2 -o results.csv"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal study`."""
-    parser.add_argument(
-        "study",
-        metavar="STUDY.toml",
-        help="grid of settings, or the name of a study that is part of the package: {shipped_studies}",
-    )
-    parser.add_argument(
-        "-o", "--output", metavar="results.csv", required=True, help="table to write, one row per setting"
-    )
-    add_execution_options(parser, "processes on this computer (default: %(default)s)", jobs=1)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: Options = {
+    "study STUDY.toml": "grid of settings, or the name of a study that is part of the package: "
+    "{shipped_studies}",
+    "-o --output results.csv": {"required": True, "help": "table to write, one row per setting"},
+    **execution_options("processes on this computer (default: %(default)s)", jobs=1),
+    "--json": JSON,
+}
 
 
 def run(args: Namespace) -> int:
@@ -35,7 +30,6 @@ def run(args: Namespace) -> int:
     from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from ...saving import complete_interrupted_save
     from ..outputs import existing_sidecars, require_writable_outputs, written_files
-    from ..screens import console
 
     is_file = os.path.exists(args.study) or args.study.endswith(".toml")
     path = args.study if is_file else io.shipped_file(f"{args.study}.study.toml")
@@ -49,10 +43,10 @@ def run(args: Namespace) -> int:
     try:
         with studies.open_journal(journal_path, study) as journal:
             if n_done := len(journal.blocks):
-                console.print_lines(f"{journal_path}: resuming after {n_done} of {total} blocks")
+                screens.print_lines(f"{journal_path}: resuming after {n_done} of {total} blocks")
             with (
                 open_executor(args.jobs, args.scheduler) as executor,
-                console.progress_bar(study.title or "study", total, n_done) as progress,
+                screens.progress_bar(study.title or "study", total, n_done) as progress,
             ):
                 for block in studies.run(study, n_done, executor):
                     journal.append(block)
@@ -62,7 +56,7 @@ def run(args: Namespace) -> int:
     except KeyboardInterrupt:
         if written_files():
             raise
-        console.print_lines(
+        screens.print_lines(
             f"dhcal: interrupted; {journal_path} contains {n_done} of {total} blocks; run the same command "
             "to resume"
         )
@@ -82,8 +76,6 @@ def _write_results(
 
     from ...plots import study_svg
     from ..outputs import write_with_json
-    from ..screens import console
-    from ..screens.result_screens import study_screen
 
     header, rows = studies.result_table(study, journal.blocks)
     drawing = study_svg(study.title or "study", header, rows, len(fields(studies.Setting)))
@@ -93,4 +85,4 @@ def _write_results(
     settings = [dict(zip(header, row, strict=True)) for row in rows]
     facts = {"title": study.title, "settings": settings}
     write_with_json({**contents, journal.path: None}, args.json, named, inputs, **facts)
-    console.show(study_screen(study, header, rows, contents), args.verbosity)
+    screens.show(screens.study_screen(study, header, rows, contents), args.verbosity)

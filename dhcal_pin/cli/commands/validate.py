@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    FIT_FRAMES,
-    JSON,
-    RIG,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    add_table_options,
-    add_urdf_options,
-    read_data,
-    read_one_robot,
-)
+from .. import options, screens
 from ..output_table import Makers, Output
 
 if TYPE_CHECKING:
@@ -32,46 +21,31 @@ EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal u
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
 FRAMES_TOL = 1e-9
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal validate`."""
-    parser.add_argument("robot", **ROBOT)
-    parser.add_argument("data", **DATA)
-    add_urdf_options(parser)
-    add_table_options(parser)
-    parser.add_argument(
-        "--rig",
-        **{**RIG, "help": f"{RIG['help']} (default: those of the sidecar, as a calibration estimated them)"},
-    )
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--sidecar",
-        metavar="S.toml",
-        help="file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
-    )
-    parser.add_argument(
-        "--nominal",
-        metavar="ROBOT",
-        type=ROBOT["type"],
-        help="robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
+ARGUMENTS: options.Options = {
+    "robot": options.ROBOT,
+    "data": options.DATA,
+    **options.URDF_OPTIONS,
+    **options.TABLE_OPTIONS,
+    "--rig": {
+        **options.RIG,
+        "help": f"{options.RIG['help']} (default: those of the sidecar, as a calibration estimated them)",
+    },
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
+    "--sidecar S.toml": "file with base, tool and joint errors (default: NAME.calibration.toml beside ROBOT)",
+    "--nominal ROBOT": {
+        "type": options.ROBOT["type"],
+        "help": "robot before the calibration, shown beside ROBOT; its base and tool are fitted to the "
         "measurements if ROBOT has others",
-    )
-    parser.add_argument("--fit-frames", **FIT_FRAMES)
-    parser.add_argument(
-        "--map",
-        metavar="MAP",
-        help="write the predicted position uncertainty and the measured errors over the workspace (.csv or "
-        ".html)",
-    )
-    parser.add_argument(
-        "--iso9283",
-        action="store_true",
-        help="compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
-        "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` "
-        "writes it (default: rows with equal joint values are one point)",
-    )
-    parser.add_argument("--report", metavar="R.html", help="write a report (.html)")
-    parser.add_argument("--json", **JSON)
+    },
+    "--fit-frames": options.FIT_FRAMES,
+    "--map MAP": "write the predicted position uncertainty and the measured errors over the workspace (.csv "
+    "or .html)",
+    "--iso9283": "compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
+    "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` writes "
+    "it (default: rows with equal joint values are one point)",
+    "--report R.html": "write a report (.html)",
+    "--json": options.JSON,
+}
 
 
 class Given(NamedTuple):
@@ -118,8 +92,6 @@ def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
     from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
-    from ..screens import console
-    from ..screens.result_screens import validation_screen
 
     sidecar = args.sidecar or io.existing_sidecar(args.robot)
     nominal = [args.nominal] if args.nominal else []
@@ -176,8 +148,8 @@ def run(args: Namespace) -> int:
     title = f"{args.robot}: accuracy on {document['samples']} samples"
     shown = {name: path for name, path in files.items() if name != "json"}
     tables = characteristics.tables() if characteristics else []
-    screen = validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
-    console.show(screen, args.verbosity)
+    screen = screens.validation_screen(title, accuracies, done.remarks, notes, warnings, shown, tables)
+    screens.show(screen, args.verbosity)
     return 0
 
 
@@ -185,11 +157,11 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
     from ...measurements.position import require_common_reference_target  # lazy import: loads Pinocchio
 
-    chain = read_one_robot(args.robot, args, sidecar)
+    chain = options.read_one_robot(args.robot, args, sidecar)
     servos = io.read_servos(args.servos) if args.servos else None
     rig, estimated = _mounted_rig(args, sidecar, chain, servos)
     predictor = _predictor(chain, sidecar, args) if args.map else None
-    files = read_data(args, chain, servos, rig)
+    files = options.read_data(args, chain, servos, rig)
     instrument = io.read_instrument(sidecar) if sidecar else {}
     require_common_reference_target({file.source: file.data for file in files}, instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
@@ -230,12 +202,12 @@ def _accuracy_on_all(
 
 def _document(done: report.Validation, judged: Judged) -> dict[str, Any]:
     """Create the part of the JSON document that a calibration has, too."""
+    models = (judged.before, list(judged.accuracies.values())[-1], judged.alone)
+    before, after, alone = map(report.main_statistics, models)
     if judged.fit:
         document = report.result_to_dict(judged.fit, {}, done.inputs, is_calibration=False)
     else:
-        document = report.validation_to_dict(done.chain, done.data, done.inputs, done.known)
-    before, alone = report.main_statistics(judged.before), report.main_statistics(judged.alone)
-    after = report.main_statistics(list(judged.accuracies.values())[-1])
+        document = report.validation_to_dict(done.data, done.inputs, before, after)
     return document | {"before": before, "after": after, "urdf_alone": {"before": before, "after": alone}}
 
 
@@ -244,12 +216,11 @@ def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
     from ...calibration.evaluation import compute_errors, find_inliers, take_errors  # lazy import
     from ...calibration.summary import statistic
     from ...measurements.groups import ERROR_GROUPS
-    from ..screens.screen import list_first
 
     errors = compute_errors(judged.chain, data, judged.known)
     masks = find_inliers(errors)
     rows = [(item.source, item.rows[~mask].tolist()) for item, mask in zip(data, masks, strict=True)]
-    texts = [f"{source}: {list_first(lines)}" for source, lines in rows if lines]
+    texts = [f"{source}: {screens.list_first(lines)}" for source, lines in rows if lines]
     if not texts:
         return []
     group, rest = next(iter(calibration.Accuracy.from_errors(take_errors(errors, masks)).groups.items()))
@@ -279,10 +250,7 @@ def _rig_remarks(args: Namespace, given: Given, sidecar: str | None) -> list[str
 def _mounted_rig(
     args: Namespace, sidecar: str | None, chain: robot.Chain, servos: io.ServoFile | None
 ) -> tuple[MountedRig | None, list[str]]:
-    """Return the cameras and boards of the images, with the estimates of a calibration.
-
-    Without a rig file, they are those of the sidecar. Other measurements than images need none.
-    """
+    """Return the cameras and boards of images, of the sidecar without a rig file, and which are estimates."""
     from ...io.measurement_files.reading import has_image_coordinates  # lazy import, as the following
     from ...measurements.mounting import mount_rig
 
@@ -319,9 +287,9 @@ def _nominal_accuracy(
     chain: robot.Chain, data: Sequence[Measurement], known: Mapping[str, float], args: Namespace
 ) -> tuple[calibration.Accuracy, tuple[robot.Chain, Mapping[str, float]], list[str]]:
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
-    import numpy as np  # lazy import, as the following
+    import numpy as np  # lazy import: slow to load
 
-    nominal = read_one_robot(args.nominal, args)
+    nominal = options.read_one_robot(args.nominal, args)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "

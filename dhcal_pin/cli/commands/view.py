@@ -4,27 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
-from ..options import (
-    DATA,
-    FIT_FRAMES,
-    JSON,
-    POSITIVE_INTEGER,
-    RIG,
-    ROBOT,
-    SKIP_BAD_ROWS,
-    add_open_option,
-    add_table_options,
-    add_urdf_options,
-    read_data,
-    read_mounted_rig,
-    read_robot_or_table,
-)
+from .. import options, screens
 from ..output_table import Output, chosen_files, require_endings
 
 if TYPE_CHECKING:
@@ -34,57 +20,45 @@ OUTPUTS = {"html": Output("a scene", (".html",), (".htm",))}
 
 EXAMPLE = "dhcal view ur10.urdf ur10_calibrated.urdf --tip tool0 --data laser.csv --html scene.html"
 
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the arguments of `dhcal view`."""
-    parser.add_argument("nominal", metavar="NOMINAL.urdf", type=ROBOT["type"], help=ROBOT["help"])
-    parser.add_argument("calibrated", metavar="CALIBRATED.urdf", nargs="?", help="the same robot, calibrated")
-    parser.add_argument(
-        "--data", **{**DATA, "help": f"{DATA['help']}; their poses are drawn and played"}, default=[]
-    )
-    add_table_options(parser)
-    parser.add_argument("--skip-bad-rows", **SKIP_BAD_ROWS)
-    parser.add_argument(
-        "--rig",
-        metavar=RIG["metavar"],
-        help="cameras and boards to draw, with their poses (default: those of the calibrated robot, "
-        "which play image coordinates, too); needed for image coordinates of a robot that is not calibrated",
-    )
-    parser.add_argument(
-        "--html", metavar="FILE", help="page to write (default: a temporary file, opened in the browser)"
-    )
-    add_open_option(parser, "the page", default=None)
-    parser.add_argument(
-        "--magnification",
-        metavar="S",
-        type=float,
-        default=1.0,
-        help="initial magnification of the errors, 1 to 500 (default: 1)",
-    )
-    parser.add_argument(
-        "--simplify",
-        metavar="N",
-        type=POSITIVE_INTEGER,
-        nargs="?",
-        default=60_000,
-        const=15_000,
-        help="maximum number of mesh triangles; fewer give a smaller page (default: "
-        "%(default)s; %(const)s without N)",
-    )
-    parser.add_argument(
-        "--live", action="store_true", help="serve a moving scene on this computer until Ctrl-C, no page"
-    )
-    parser.add_argument("--fit-frames", **FIT_FRAMES)
-    add_urdf_options(parser)
-    parser.add_argument("--json", **JSON)
+ARGUMENTS: options.Options = {
+    "nominal NOMINAL.urdf": {"type": options.ROBOT["type"], "help": options.ROBOT["help"]},
+    "calibrated CALIBRATED.urdf": {"nargs": "?", "help": "the same robot, calibrated"},
+    "--data": {
+        **options.DATA,
+        "help": f"{options.DATA['help']}; their poses are drawn and played",
+        "default": [],
+    },
+    **options.TABLE_OPTIONS,
+    "--skip-bad-rows": options.SKIP_BAD_ROWS,
+    "--rig RIG.toml": "cameras and boards to draw, with their poses (default: those of the calibrated "
+    "robot, which play image coordinates, too); needed for image coordinates of a robot that is not "
+    "calibrated",
+    "--html FILE": "page to write (default: a temporary file, opened in the browser)",
+    **options.open_option("open the page in the browser"),
+    "--magnification S": {
+        "type": float,
+        "default": 1.0,
+        "help": "initial magnification of the errors, 1 to 500 (default: 1)",
+    },
+    "--simplify N": {
+        "type": options.POSITIVE_INTEGER,
+        "nargs": "?",
+        "default": 60_000,
+        "const": 15_000,
+        "help": "maximum number of mesh triangles; fewer give a smaller page (default: %(default)s; "
+        "%(const)s without N)",
+    },
+    "--live": "serve a moving scene on this computer until Ctrl-C, no page",
+    "--fit-frames": options.FIT_FRAMES,
+    **options.URDF_OPTIONS,
+    "--json": options.JSON,
+}
 
 
 def run(args: Namespace) -> int:
     """Write the page of a robot, or serve a live scene."""
     from ...visualization import scene  # lazy import, as the following: they load Pinocchio
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_with_json
-    from ..screens import console
-    from ..screens.result_screens import files_screen
 
     if args.live and (args.html or args.open or args.json):
         raise InvalidArgumentError("--live writes no page; omit --html, --open and --json")
@@ -100,11 +74,11 @@ def run(args: Namespace) -> int:
     require_writable_outputs([page, args.json], inputs)
     require_workbook(args.sheet, inputs)
     require_endings(chosen_files(vars(args), OUTPUTS))
-    chains = [read_robot_or_table(path, args) for path in robots]
+    chains = [options.read_robot_or_table(path, args) for path in robots]
     sidecar = io.existing_sidecar(robots[-1])
-    rig = read_mounted_rig(args.rig, sidecar, chains[-1])
+    rig = options.read_mounted_rig(args.rig, sidecar, chains[-1])
     servos = io.read_servos(args.servos) if args.servos else None
-    files = read_data(args, chains[0], servos, rig)
+    files = options.read_data(args, chains[0], servos, rig)
     data = [file.data for file in files]
     known = io.read_instrument(sidecar) if sidecar else {}
     predictor = io.read_uncertainty(sidecar, chains[-1]) if sidecar and len(chains) > 1 else None
@@ -130,9 +104,9 @@ def run(args: Namespace) -> int:
     findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
     write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
     notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    console.show(files_screen([page], notes, warnings), args.verbosity)
+    screens.show(screens.files_screen([page], notes, warnings), args.verbosity)
     if args.open if args.open is not None else not args.html:
-        console.open_page(page)
+        screens.open_page(page)
     return 0
 
 
@@ -141,13 +115,12 @@ def _serve_live(chains: Sequence[robot.Chain], data: Sequence[Measurement], args
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ...visualization import live
-    from ..screens import console
 
     q = np.concatenate([item.configurations() for item in data] or [np.zeros((1, chains[0].n_joints))])
     with live.serve(*chains, magnification=args.magnification, triangles=args.simplify) as server:
-        console.print_lines(server.url, "end with Ctrl-C")
+        screens.print_lines(server.url, "end with Ctrl-C")
         if args.open is not False:
-            console.open_url(server.url)
+            screens.open_url(server.url)
         try:
             while True:
                 server.play(q)

@@ -44,10 +44,7 @@ def _find_columns(table: DataTable, column_map: ColumnMap) -> dict[str | int, in
 def read_mapped_table(
     source: PathLike | Any, column_map: ColumnMap, known: Set[str], sheet: str
 ) -> DataTable:
-    """Read a file of another maker as a table with the project's own columns.
-
-    A file whose header has the project's columns only, and lacks columns of the map, is read as it is.
-    """
+    """Read a file of another maker with the project's columns; one that has them already stays as it is."""
     named = frozenset(name for name in column_map.source_columns if isinstance(name, str))
     column_map = replace(column_map, layout=replace(column_map.layout, sheet=sheet, names=named))
     native = TextLayout(sheet=sheet, names=known)

@@ -131,10 +131,7 @@ def read_measurement_file(
     sheet: str = "",
     max_rows: int | None = None,
 ) -> MeasurementFile:
-    """Read a measurement file with its division into fitted and held-out samples.
-
-    A file with more than `max_rows` rows is reduced to that number of rows, which are drawn at random.
-    """
+    """Read a measurement file with its hold-out samples, of many rows `max_rows` drawn at random."""
     check_joint_names(chain)
     table = open_measurement_table(source, chain, columns, servos, sheet)
     table = table.thinned(max_rows) if max_rows else table

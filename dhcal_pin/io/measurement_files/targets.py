@@ -23,26 +23,16 @@ TARGETS = TextLayout(header_example="x[mm],y[mm],z[mm]")
 
 @dataclass(frozen=True, eq=False)
 class TargetPoses:
-    """Positions or poses that a tool shall reach.
+    """Positions or poses that a tool shall reach."""
 
-    Attributes:
-        source: Name of the file.
-        values: Positions, shape (m, 3) [m], or poses, shape (m, 4, 4), if the file has rotations.
-        near: Joint positions near which solutions are wanted, shape (m, n) [rad or m]; None without the
-            columns.
-        units: Unit that each column was written in.
-        lines: Line of each target in the file, shape (m,).
-        notes: Sentences on what of the file is not used.
-        conditions: Conditions at the targets; None without columns of conditions.
-    """
-
-    source: str
-    values: Array
+    source: str  # Name of the file
+    values: Array  # Positions, shape (m, 3) [m], or poses, shape (m, 4, 4), if the file has rotations
+    # Joint positions near which solutions are wanted, shape (m, n) [rad or m]; None without the columns.
     near: Array | None
-    units: Mapping[str, str]
-    lines: Array
-    notes: tuple[str, ...]
-    conditions: Conditions | None
+    units: Mapping[str, str]  # Unit that each column was written in
+    lines: Array  # Line of each target in the file, shape (m,)
+    notes: tuple[str, ...]  # Sentences on what of the file is not used
+    conditions: Conditions | None  # Conditions at the targets; None without columns of conditions
 
 
 def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
