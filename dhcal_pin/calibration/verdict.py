@@ -268,7 +268,7 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
 def _unrelated_images(fit: Evidence) -> list[Finding]:
     """Refuse images that are not those of the joint values or of the robot."""
     sentence = fit.hand_eye_fit.unrelated if fit.hand_eye_fit else ""
-    return [Finding("refused", sentence)] if sentence else []
+    return (_mixups(fit.image_diagnosis) or [Finding("refused", sentence)]) if sentence else []
 
 
 def _few_images(fit: Evidence) -> list[Finding]:
@@ -382,7 +382,8 @@ def _implausible_correction(fit: Evidence) -> list[Finding]:
     if size.ratio <= MAX_USUAL_DISPLACEMENT:
         return []
     status: Status = "refused" if size.ratio > MAX_DISPLACEMENT else "caution"
-    return [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
+    named = _mixups(fit.image_diagnosis) if status == "refused" else []
+    return named or [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
 
 
 def _implausible_errors(fit: Evidence) -> list[Finding]:

@@ -23,7 +23,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, label_stops
 from ..measurements.euler_angles import (
     EULER_NOTATIONS,
     ROTATION_VECTOR,
@@ -107,7 +107,7 @@ class JointChange:
 
 @dataclass(frozen=True)
 class RowShift:
-    """Joint positions belong to the measured values `step` rows below them."""
+    """Joint positions belong to the measured values `step` rows below them, or to those of that image."""
 
     step: int  # 1 or -1
 
@@ -116,6 +116,12 @@ class RowShift:
         if not item.configurations_per_row or len(item.rows) < 2:
             return None
         order = np.argsort(item.rows, kind="stable")
+        if item.n_images:
+            _, first, labels = np.unique(label_stops(item)[order], return_index=True, return_inverse=True)
+            places = np.empty(len(order), int)
+            places[order] = np.argsort(np.argsort(first))[labels] - self.step
+            inside = (places >= 0) & (places < len(first))
+            return item.take(inside).resample(item.q[order[np.sort(first)]][places[inside]])
         gaps = np.diff(item.rows[order])
         if not np.any(gaps > 0):
             return None
@@ -371,6 +377,13 @@ class Hypothesis:
         if all(item is None for item in changed):
             return None
         return [old if new is None else new for new, old in zip(changed, data, strict=True)]
+
+    @property
+    def concerns_joints(self) -> bool:
+        """Whether only the joint positions of the samples are changed."""
+        if isinstance(self.change, BothChanges):
+            return self.change.first.concerns_joints and self.change.second.concerns_joints
+        return isinstance(self.change, JointChange | RowShift)
 
     def log_jacobian(self, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""

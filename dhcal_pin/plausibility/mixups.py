@@ -88,6 +88,21 @@ def diagnose_mixups(
     return trial.find_common([_find_alone(chain, part, sets, report) for part in _parts(items[0])])
 
 
+def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
+    """Look for a mistake in the joint positions of images that do not move as these say.
+
+    Each file is examined alone: images of another camera have a base and a tool of their own.
+    """
+    found = [Diagnosis(NO_EVIDENCE)] if not images else []
+    for item in images:
+        one = diagnose_mixups(chain, [item.tool_poses()], sets)
+        named = tuple(each for each in one.hypotheses if each.concerns_joints)
+        found.append(replace(one, hypotheses=named, source=item.source))
+    first, *_ = sorted(found, key=lambda one: not one.hypotheses)
+    is_common = all(one.hypotheses == first.hypotheses for one in found)
+    return replace(first, source="") if is_common else first
+
+
 def _parts(item: Measurement) -> list[Measurement]:
     """Divide a measurement into parts that follow each other."""
     order = np.argsort(item.rows, kind="stable")

@@ -16,6 +16,7 @@ from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES
 from dhcal_pin.calibration.cameras.image_checks import MIN_DIFFERENCE, _angle_difference
 from dhcal_pin.calibration.verdict import _few_images, judge
 from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.plausibility.hypotheses import mend
 
 MESSAGE = r"do not move as the joint values say: the rotations between images differ by [1-9]\d°"
 
@@ -34,10 +35,15 @@ def require_refusal(fit):
 def test_images_that_are_shifted_by_rows_are_related(shift):
     chain = ARMS["ur10"]()
     q = np.random.default_rng(0).uniform(-2, 2, (14, 6))
-    images: Any = SimpleNamespace(tool_poses=lambda: Pose(q[2 + shift : 12 + shift], chain.poses(q[2:12])))
-    assert _angle_difference(chain, images) < 1e-6
+    # Two rows in three are fitted, and the others held out.
+    of_robot, of_images = q[2 + shift : 12 + shift], q[2:12]
+    is_fitted = np.arange(10) % 3 < 2
+    images: Any = SimpleNamespace(
+        tool_poses=lambda: Pose(of_robot[is_fitted], chain.poses(of_images)[is_fitted])
+    )
+    assert _angle_difference(chain, images, of_robot) < 1e-6
     images = SimpleNamespace(tool_poses=lambda: Pose(q[:7], chain.poses(q[7:])))
-    assert _angle_difference(chain, images) > MIN_DIFFERENCE
+    assert _angle_difference(chain, images, q[:7]) > MIN_DIFFERENCE
 
 
 @pytest.mark.parametrize(("seed", "n_images"), some_slow([(2, 8), (1, 6), (0, 12), (1, 12)], {0}))
@@ -47,6 +53,49 @@ def test_images_of_another_arm_are_refused(seed, n_images):
     other = wrong_arm(chain, 1.0, rng)
     setup = simulate(chain, other, rng, is_on_wrist=seed % 2 == 0, n_images=n_images, sigma=0.3)
     require_refusal(calibrate(chain, setup.images))
+
+
+def with_wrong_joint_values(images, change):
+    """Return images with other joint values, which a function makes of those of all images in turn."""
+    order = np.unique(images.q, axis=0, return_index=True)[1]
+    q = images.q[np.sort(order)]
+    changed = {tuple(old): new for old, new in zip(q, change(q), strict=True)}
+    return images.resample(np.array([changed[tuple(old)] for old in images.q]))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_in_order", "cause", "key"),
+    [
+        (
+            lambda q: q * [1, 1, 1, -1, 1, 1],
+            False,
+            "The sign of joint wrist_1_joint is wrong",
+            "sign:wrist_1_joint",
+        ),
+        (
+            lambda q: q[:, [0, 1, 2, 4, 3, 5]],
+            False,
+            "wrist_1_joint and wrist_2_joint are exchanged",
+            "swap:wrist_1_joint:wrist_2_joint",
+        ),
+        (lambda q: np.roll(q, -1, 0), True, "belongs to the joint values one row before", "rows:below"),
+        (lambda q: np.roll(q, 1, 0), True, "belongs to the joint values one row after", "rows:above"),
+    ],
+)
+def test_wrong_joint_values_of_images_are_named_and_mended(change, is_in_order, cause, key):
+    """A third of the images is held out; the option that the reason names leads to a good calibration."""
+    chain, rng = ARMS["ur10"](), np.random.default_rng(0)
+    images = simulate(chain, chain, rng, is_on_wrist=True, n_images=30, sigma=0.2).images
+    wrong = with_wrong_joint_values(images, change)
+    is_held_out = np.unique(wrong.q, axis=0, return_inverse=True)[1] % 3 == 0
+    fit = calibrate(chain, wrong.take(~is_held_out), holdout=wrong.take(is_held_out))
+    assert fit.verdict.status == "refused"
+    (reason,) = [reason for reason in fit.verdict.reasons if cause in reason]
+    assert re.search(rf"--mend {key}[ .]", reason)
+    mended = mend(chain, wrong, key)
+    assert calibrate(chain, mended).verdict.status == "ok"
+    if not is_in_order:
+        np.testing.assert_allclose(mended.q, images.q)
 
 
 def test_images_that_are_mostly_outliers_are_refused(monkeypatch):

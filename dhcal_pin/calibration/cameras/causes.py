@@ -174,7 +174,7 @@ def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> Came
         return item
     sequence = hand_eye.sequence
     different, of_row = np.unique(item.q, axis=0, return_inverse=True)
-    number = np.array([int(np.argmin(np.abs(sequence - q).max(1))) for q in different])
+    number = places_in_sequence(sequence, different)
     place = number[of_row] + causes.shift
     low = np.clip(np.floor(place).astype(int), 0, len(sequence) - 2)
     part = (place - low)[:, None]
@@ -196,6 +196,11 @@ def file_sequence(data: Sequence[Measurement]) -> Array:
     is_new = np.ones(len(q), bool)
     is_new[1:] = np.any(q[1:] != q[:-1], 1)
     return q[is_new]
+
+
+def places_in_sequence(sequence: Array, q: Array) -> Array:
+    """Return the places of joint values (m, n) in a sequence (k, n) that contains them."""
+    return np.array([int(np.argmin(np.abs(sequence - each).max(1))) for each in q], int)
 
 
 # ------------------------------------------------------------------------------------ sizes and shifts

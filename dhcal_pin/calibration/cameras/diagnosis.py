@@ -540,9 +540,10 @@ def _pairing_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     if abs(shift - round(shift)) < 0.05 and round(shift):
         count = abs(round(shift))
         rows = f"{count} rows" if count > 1 else "one row"
+        mended = f", or add --mend rows:{'below' if shift < 0 else 'above'}" if count == 1 else ""
         return (
             f"the pairing: each image belongs to the {stated} {rows} {side} its own",
-            f"Correct the table of {stated}.",
+            f"Correct the table of {stated}{mended}.",
         )
     return (
         f"the pairing: each image belongs to {stated} {abs(shift):.2g} rows {side} its own, a time "

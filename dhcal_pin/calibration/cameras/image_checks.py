@@ -31,6 +31,7 @@ from ...measurements.mounting import Mount, MountedRig
 from ...robot.chain import Chain
 from ..partition import different_configurations
 from ..reweighting import Fit
+from .causes import file_sequence, places_in_sequence
 from .sets import describe_configurations
 from .stages import fitted_error
 
@@ -53,7 +54,7 @@ MIN_BOARD_ERROR = 1e-6
 MORE_ROTATIONS = "Add images that are turned by 30° or more about two axes that are not parallel."
 
 
-def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
+def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain, max_error: float) -> str:
     """Return what shows that images are not those of the joint values or robot of a fit, else nothing.
 
     A fit whose corners are within `max_error` [px] of the model, and not mostly rejected, is not questioned.
@@ -64,7 +65,12 @@ def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
     images = [item for item in fit.data if isinstance(item, CameraCorners)]
     if len(images) < len(fit.data):
         return ""
-    differences = [_angle_difference(chain, item) for item in images]
+    differences = [
+        _angle_difference(
+            chain, item, file_sequence([item, *(held for held in holdout if held.source == item.source)])
+        )
+        for item in images
+    ]
     if min(differences) < MIN_DIFFERENCE:
         return ""
     stated = describe_configurations(fit.data)
@@ -76,23 +82,22 @@ def find_unrelated_images(fit: Fit, chain: Chain, max_error: float) -> str:
     )
 
 
-def _angle_difference(chain: Chain, item: CameraCorners) -> float:
+def _angle_difference(chain: Chain, item: CameraCorners, sequence: Array) -> float:
     """Return the median difference of angles between images and robot [rad], for the best shift of rows.
 
-    It is zero if there are too few images.
+    The sequence (k, n) has the joint values of all images of the file. The difference is zero if there are
+    too few images.
     """
     shown = item.tool_poses()
-    # Consecutive images, so that shifts can be seen.
     shown = shown.take(np.arange(min(len(shown.rows), MAX_IMAGES)))
-    n = len(shown.rows)
-    if n < MIN_IMAGES:
+    if len(shown.rows) < MIN_IMAGES:
         return 0.0
-    of_robot, of_images = _angles(chain.poses(shown.q)), _angles(shown.poses)
-    places = np.arange(n)
+    of_images, places = _angles(shown.poses), places_in_sequence(sequence, shown.q)
     differences = []
     for shift in (0, *SHIFTS):
-        inside = places[(places + shift >= 0) & (places + shift < n)]
-        pairs = of_robot[np.ix_(inside + shift, inside + shift)] - of_images[np.ix_(inside, inside)]
+        inside = np.flatnonzero((places + shift >= 0) & (places + shift < len(sequence)))
+        of_robot = _angles(chain.poses(sequence[places[inside] + shift]))
+        pairs = of_robot - of_images[np.ix_(inside, inside)]
         differences.append(np.median(np.abs(pairs[np.triu_indices(len(inside), 1)])))
     return float(min(differences))
 

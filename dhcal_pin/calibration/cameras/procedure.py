@@ -119,7 +119,7 @@ def calibrate_images(
     """Calibrate from images, starting from a first fit."""
     max_error = fitting.arm_type.max_error
     is_stuck = not (fit.solution.converged or fit.solution.iterations)
-    unrelated = find_unrelated_images(fit, chain, max_error)
+    unrelated = find_unrelated_images(fit, holdout, chain, max_error)
     if is_stuck and fitted_error(fit).pixels > max_error and not unrelated:
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
@@ -129,7 +129,7 @@ def calibrate_images(
     has_arm = fit.problem.errors.has_arm
     if not unrelated:
         fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
-        unrelated = find_unrelated_images(fit, chain, max_error)
+        unrelated = find_unrelated_images(fit, holdout, chain, max_error)
     if unrelated:
         frames = without_arm(fit, fitting.max_iterations) if has_arm else fit
         result = replace(make_result(frames, 1.0, holdout, "lm"), arm_type=fitting.arm_type)
@@ -156,5 +156,5 @@ def calibrate_images(
     if gate.is_open and fitted_error(gated.fit).pixels < max_error:
         return replace(result, board_size=find_board_size(ungated))
     frames = gated.nominal if has_arm else ungated
-    unrelated = find_unrelated_images(frames, chain, max_error)
+    unrelated = find_unrelated_images(frames, holdout, chain, max_error)
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout, unrelated, has_arm))
