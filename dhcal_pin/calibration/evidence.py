@@ -19,7 +19,7 @@ from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import diagnose_images, diagnose_mixups, has_enough_rows
+from ..plausibility.mixups import diagnose_mixups, has_enough_rows
 from ..session import Session
 from ..session.linear_model import measures_positions
 from . import cameras
@@ -154,12 +154,6 @@ class Evidence(FittedModel):
     def diagnosis(self) -> Diagnosis:
         """Mistakes in the measurements that explain them better than the measurements as they were read."""
         return diagnose(self, None)
-
-    @cached_property
-    def image_diagnosis(self) -> Diagnosis:
-        """Mistakes in the joint values of images without other measurements."""
-        images = self.data if all(item.n_images for item in self.data) else ()
-        return diagnose_images(self.errors.chain, images, HAND_BUILT if self.signs else MANUFACTURED)
 
     @cached_property
     def comparisons(self) -> tuple[Comparison, ...]:

@@ -93,7 +93,7 @@ def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MAN
 
     Each file is examined alone: images of another camera have a base and a tool of their own.
     """
-    found = [Diagnosis(NO_EVIDENCE)] if not images else []
+    found = []
     for item in images:
         one = diagnose_mixups(chain, [item.tool_poses()], sets)
         named = tuple(each for each in one.hypotheses if each.concerns_joints)
