@@ -44,16 +44,14 @@ class CameraFrame:
 
 
 def camera_frames(rig: MountedRig, chain: Chain, name: str | None) -> list[CameraFrame]:
-    """Find the frame of each camera in a URDF.
-
-    A rig states the poses of cameras in the measuring frame or in the tool frame. In the URDF they are poses
-    in links: the base and the tool of the chain are between.
-    """
+    """Find the frame of each camera in a URDF."""
     frames = []
     for i, camera in enumerate(rig.cameras):
         moves = rig.camera_mounts[i].moves
         stated = camera.link if camera.link in chain.urdf.links else chain.root
         parent = chain.tip if camera.link == TIP else stated
+        # The rig states poses in the measuring frame or in the tool frame, the URDF in links: the base and
+        # the tool of the chain are between.
         end, pose = (chain.tip, chain.tool) if moves else (chain.root, se3.inverse(chain.base))
         end_in_parent = chain.fixed_pose(parent, end)
         assert end_in_parent is not None
@@ -135,14 +133,11 @@ def opencv_text(camera: Camera) -> str:
 
 
 def hand_eye_text(frame: CameraFrame, position_std: float | None = None) -> str:
-    """Return the pose of a camera in its link as easy_handeye 0.4 keeps it.
-
-    Its publisher sends the pose of `tracking_base_frame` in `robot_effector_frame` if `eye_on_hand` is true,
-    otherwise in `robot_base_frame`. It also stores all frames in the parameter server of ROS, under
-    `namespace`, and stops at one without a name. Keys that it does not know stop it, too: the standard
-    deviation of the position [m] is a comment.
-    """
+    """Return the pose of a camera in its link as easy_handeye 0.4 keeps it."""
     ending = "eye_on_hand" if frame.moves else "eye_on_base"
+    # The publisher sends the pose of `tracking_base_frame` in `robot_effector_frame` if `eye_on_hand` is
+    # true, otherwise in `robot_base_frame`. It also stores all frames in the parameter server of ROS, under
+    # `namespace`, and stops at one without a name.
     parameters = {
         "namespace": f"/{frame.camera.name}_{ending}/",
         "eye_on_hand": frame.moves,
@@ -152,6 +147,7 @@ def hand_eye_text(frame: CameraFrame, position_std: float | None = None) -> str:
         "tracking_marker_frame": frame.board,
     }
     values = [*frame.pose[:3, 3], *pin.Quaternion(frame.pose[:3, :3]).coeffs()]
+    # The publisher stops at keys that it does not know: the standard deviation [m] is a comment.
     comment = []
     if position_std is not None and np.isfinite(position_std):
         std = Quantity.error(position_std, "m")

@@ -42,14 +42,10 @@ def without_negligible_moves(chain: Chain, min_move: float = MIN_MOVE) -> Chain:
 
 
 def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
-    """Compute the changed origin of each joint of the URDF, and the remaining tool pose.
-
-    The origins of fixed joints before a moving joint stay; the origin of the moving joint takes up the whole
-    change. A change of the tip goes to the last fixed joint after the last moving joint whose origin the file
-    can hold. Without such a joint it goes to the tool.
-    """
+    """Compute the changed origin of each joint of the URDF, and the remaining tool pose."""
     nominal = chain.nominal()
     changed: dict[str, Array] = {}
+    # The origins of fixed joints before a moving joint stay; that of the moving joint takes up the change.
     pairs = zip(chain.moving_joints, chain.joint_placements, nominal.joint_placements, strict=True)
     for name, new, old in pairs:
         if not np.array_equal(new, old):
@@ -58,6 +54,8 @@ def joint_origins(chain: Chain) -> tuple[dict[str, Array], Array]:
     new, old = chain.origins[-1], nominal.origins[-1]
     if np.array_equal(new, old) or chain.n_reversed == len(chain.moving_joints):
         return changed, chain.tool
+    # A change of the tip goes to the last fixed joint after the last moving joint whose origin the file can
+    # hold. Without such a joint, it goes to the tool.
     _, last_fixed = _fixed_part(chain, chain.tip)
     if last_fixed is None:
         return changed, se3.inverse(old) @ new @ chain.tool

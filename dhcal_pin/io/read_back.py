@@ -96,10 +96,8 @@ def _pose_in_base(robot: Any, by_child: Mapping[str, Any], link: str) -> Array:
 
 @cache
 def _yourdfpy_reader() -> dict[str, Any]:
-    """Return the names of yourdfpy's module that reads URDF, with a replacement of trimesh.
-
-    The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it.
-    """
+    """Return the names of yourdfpy's module that reads URDF, with a replacement of trimesh."""
+    # The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it.
     trimesh: Any = ModuleType("trimesh")
     trimesh.Trimesh = trimesh.Scene = object  # in annotations
     trimesh.transformations = SimpleNamespace(

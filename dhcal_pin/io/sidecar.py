@@ -640,12 +640,10 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
 
 
 def _coefficient_indices(chain: Chain) -> dict[str, int]:
-    """Return the index of each transmission coefficient, those of the parameters of the chain first.
-
-    Gravity may have loaded other joints of the nominal robot.
-    """
+    """Return the index of each transmission coefficient, those of the parameters of the chain first."""
     parameters = (parameter for name in FAMILIES for parameter in PARAMETER_SETS[name](chain))
     found = {p.name: p.coefficient_index for p in parameters if p.coefficient_index is not None}
+    # Gravity may have loaded other joints of the nominal robot.
     parts = coefficient_indices(*chain.mimic_matrix.shape)
     return found | {
         f"{(chain.link_names if family.link_term else chain.joint_names)[c.owner]}.{c.name}": c.entry
@@ -842,15 +840,13 @@ def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, 
 
 
 def _compressed_text(rows: Array, number: str) -> str:
-    """Compress an array and encode it as lines of base85 text.
-
-    Small integers of both signs become small ones without a sign: 0, -1, 1, -2 to 0, 1, 2, 3. The first bytes
-    of all numbers stand together, then the second ones, which makes equal bytes neighbours.
-    """
+    """Compress an array and encode it as lines of base85 text."""
     values = np.ascontiguousarray(rows, number)
     if values.dtype.kind == "i":
+        # Small integers of both signs become small ones without a sign: 0, -1, 1, -2 to 0, 1, 2, 3.
         wide = values.astype(np.int64)
         values = ((wide << 1) ^ (wide >> 63)).astype(number.replace("i", "u"))
+    # The first bytes of all numbers stand together, then the second ones: equal bytes become neighbours.
     planes = values.reshape(-1, 1).view(np.uint8).T.tobytes()
     return _lines(base64.b85encode(lzma.compress(planes, check=lzma.CHECK_CRC32)).decode())
 

@@ -53,20 +53,14 @@ OFFSET_PRIOR = 1.0
 
 @dataclass(frozen=True)
 class InstrumentParameter:
-    """Unknown scalar of an instrument, which is estimated together with the robot.
+    """Unknown scalar of an instrument, which is estimated together with the robot."""
 
-    Attributes:
-        name: Name that users see. Measurements share the parameters that have the same name.
-        unit: "m", "rad", "px" or "1".
-        nominal: Initial value; NaN if another measurement has to provide it.
-        prior: Prior standard deviation of the difference from `nominal`, in `unit`.
-        is_local: Whether the value only has a meaning for the measurement object that initialized it.
-    """
-
+    #: Name that users see. Measurements share the parameters that have the same name.
     name: str
-    unit: str
-    nominal: float
-    prior: float
+    unit: str  #: "m", "rad", "px" or "1"
+    nominal: float  #: Initial value; NaN if another measurement has to provide it
+    prior: float  #: Prior standard deviation of the difference from `nominal`, in `unit`
+    #: Whether the value only has a meaning for the measurement object that initialized it.
     is_local: bool = False
 
 
@@ -89,31 +83,22 @@ class Measurement(ABC):
 
     Objects are immutable. Constructors check their arguments; `take`, `replace` and the methods `with_...`
     return copies without checking again, as solvers call them for each chunk of samples.
-
-    Attributes:
-        q: Joint positions of the first configuration of each sample, (m, n) [rad or m].
-        rows: Line of each sample in its file, (m,), as text editors count; samples from Python are numbered
-            from 1.
-        sigma: Standard deviations of the measured values, (m, k) [m, rad or px].
-        source: Name of the file; empty for samples from Python.
-        has_stated_sigma: Whether the standard deviations are those of the instrument, not placeholders that
-            are estimated with the fit.
-        instrument_parameters: The s instrument parameters, in the order of u.
-        has_joint_values: Whether the joint positions were measured. Otherwise they only reproduce measured
-            poses of the tip, and say nothing about the joint space of a robot.
-        rig: Cameras and boards of image coordinates; None for all other kinds.
-        recorded: Conditions that were recorded with the samples; None without.
     """
 
-    q: Array
+    q: Array  #: Joint positions of the first configuration of each sample, (m, n) [rad or m]
+    #: Line of each sample in its file, (m,), as text editors count; samples from Python are numbered from 1.
     rows: Array
-    sigma: Array
+    sigma: Array  #: Standard deviations of the measured values, (m, k) [m, rad or px]
+    #: Whether the standard deviations are those of the instrument, not placeholders that are estimated with
+    #: the fit.
     has_stated_sigma: bool
-    instrument_parameters: tuple[InstrumentParameter, ...]
-    source: str
+    instrument_parameters: tuple[InstrumentParameter, ...]  #: The s instrument parameters, in the order of u
+    source: str  #: Name of the file; empty for samples from Python
+    #: Whether the joint positions were measured. Otherwise they only reproduce measured poses of the tip, and
+    #: say nothing about the joint space of a robot.
     has_joint_values: bool
-    rig: MountedRig | None
-    recorded: Conditions | None
+    rig: MountedRig | None  #: Cameras and boards of image coordinates; None for all other kinds
+    recorded: Conditions | None  #: Conditions that were recorded with the samples; None without
 
     # Name of the kind in files, on the command line and in studies.
     kind: ClassVar[str]
@@ -513,11 +498,8 @@ def errors_of(item: Measurement, chain: Chain, values: Mapping[str, float]) -> d
 def whitened_jacobian(
     item: Measurement, model: tuple[Chain, Array, Array], frames: FrameBatch, u: Array, residual: Array
 ) -> Array:
-    """Compute the Jacobian (p, k, m) of the whitened model with respect to the error parameters.
-
-    The model is the chain with bodies and twists of the errors; see `Chain.tool_jacobian`. The residual (k,
-    m) is whitened and holds at the given frames and instrument parameters u.
-    """
+    """Compute the Jacobian (p, k, m) of the whitened model with respect to the error parameters."""
+    # The model is the chain with bodies and twists of the errors; see `Chain.tool_jacobian`.
     chain, bodies, twists = model
     observation = item.observation_matrix(frames, u, residual)
     jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)

@@ -65,10 +65,9 @@ _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Projection:
-    """Model of all corners at one state. Derivatives by the unknowns are computed on first use.
+    """Model of all corners at one state; derivatives by the unknowns are computed on first use."""
 
-    What belongs to a camera or a board has shape (..., 1) if the rig has only one, else (..., m).
-    """
+    # What belongs to a camera or a board has shape (..., 1) if the rig has only one, else (..., m).
 
     pixels: Array  # Image coordinates, (2, m) [px]
     by_local: Array  # Derivative by the corner in the frame of the camera, (2, 3, m) [px/m]
@@ -471,10 +470,8 @@ class CameraCorners(Measurement):
 
     @cached_property
     def _jitter_bases(self) -> list[tuple[Array, Array, Array]]:
-        """Images with jitter by their number c of corners.
-
-        Samples (g, c), basis U (g, 2c, 6) and factors 1 - 1/√(1 + s²) (g, 6) of the g images with c corners.
-        """
+        """Images with jitter by their number c of corners."""
+        # Samples (g, c), basis U (g, 2c, 6) and factors 1 - 1/√(1 + s²) (g, 6) of g images with c corners.
         out: list[tuple[Array, Array, Array]] = []
         if not self.has_jitter:
             return out
@@ -639,21 +636,19 @@ class CameraCorners(Measurement):
     def _simulate(
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> CameraCorners:
-        """Return images of six points on the tool, by two cameras in turn that look at the robot.
-
-        The cameras have a scale of one pixel per millimetre at the robot: noise of a millimetre is noise of a
-        pixel. The place of the points on the tool is known, that of the cameras is not.
-        """
+        """Return images of six points on the tool, by two cameras in turn that look at the robot."""
         q = conditions.q
         rig = mount_rig(simulated_rig(chain, q), chain)
         corner = np.tile(np.arange(6), len(q))
         camera = [rig.cameras[i % 2].name for i in range(len(q)) for _ in range(6)]
+        # The scale is one pixel per millimetre at the robot: noise of a millimetre is noise of a pixel.
         sigma = _SCALE * noise.position
         shown = conditions[np.repeat(np.arange(len(q)), 6)]
         exact = cls(shown.q, np.full((len(corner), 2), 2048.0), corner, rig, camera)
         u = np.array([parameter.nominal for parameter in exact.instrument_parameters])
         pixels = exact._project(chain.forward_kinematics(shown), u).pixels.T
         pixels = pixels + sigma * rng.standard_normal(pixels.shape)
+        # The place of the points on the tool is known, that of the cameras is not.
         without_guess = tuple(replace(camera, pose=None) for camera in rig.cameras)
         seen = cls(exact.q, pixels, corner, replace(rig, cameras=without_guess), camera, None, sigma or None)
         return seen.replace(recorded=shown if shown.names else None)
@@ -682,13 +677,11 @@ def simulated_rig(chain: Chain, q: Array) -> Rig:
 
 
 def _end_poses(parts: Sequence[Array], mounts: Sequence[Any]) -> tuple[Array, Array]:
-    """Return poses in the frames of the ends (c, 4, 4), and their derivatives by rotation vectors (c, 3, 3).
-
-    A change δ of the rotation vector turns the pose by exp([L·δ]×), in axes of the end, with L = R_link·Jl.
-    """
+    """Return poses in the frames of the ends (c, 4, 4), and derivatives by rotation vectors (c, 3, 3)."""
     values = np.array([part[:6] for part in parts])
     links = np.array([mount.link_pose for mount in mounts])
     rotations, jacobians = exp_and_jacobian(values[:, 3:])
+    # A change δ of the rotation vector turns the pose by exp([L·δ]×), in axes of the end, with L = R_link·Jl.
     return links @ se3.transform(rotations, values[:, :3]), links[:, :3, :3] @ jacobians
 
 
@@ -711,14 +704,12 @@ def with_shown_entries(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
 
 
 def _solve_symmetric(matrices: Array, right: Array) -> Array:
-    """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2).
-
-    The solution is NaN for a matrix of zeros, such as that of a corner behind the camera.
-    """
+    """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2)."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     determinant = np.maximum(a * c - b * b, np.finfo(float).eps * a * c)
     x, y = right.T
     numerators, is_known = np.stack([c * x - b * y, a * y - b * x], 1), determinant[:, None] > 0
+    # NaN for a matrix of zeros, such as that of a corner behind the camera.
     return np.divide(numerators, determinant[:, None], np.full_like(numerators, np.nan), where=is_known)
 
 

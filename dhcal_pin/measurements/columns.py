@@ -44,24 +44,19 @@ def instrument_range(reach: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Column:
-    """Column of a measurement file.
+    """Column of a measurement file."""
 
-    Attributes:
-        name: Name in the header, without the unit.
-        quantity: "length" [m], "angle" [rad], "acceleration" [m/s2], "pixel" [px], "text", or "remark": a
-            text that only people need, so that it may be empty, and files of other kinds may have it, too.
-        argument: Argument of the kind's constructor that the column fills. Several numeric columns with the
-            same argument are stacked, (m, k).
-        is_implied: Whether the value is zero by definition, so that files have only its standard deviation.
-        is_common: Whether all rows of a file must have the same text; the argument is that text.
-        plausible_range: Plausible values of a length; None if it is not checked by itself.
-    """
-
-    name: str
+    name: str  # Name in the header, without the unit
+    # "length" [m], "angle" [rad], "acceleration" [m/s2], "pixel" [px], "text", or "remark": a text that only
+    # people need, so that it may be empty, and files of other kinds may have it, too.
     quantity: Literal["length", "angle", "acceleration", "pixel", "text", "remark"]
+    # Argument of the kind's constructor that the column fills. Several numeric columns with the same argument
+    # are stacked, (m, k).
     argument: str = ""
+    # Whether the value is zero by definition, so that files have only its standard deviation.
     is_implied: bool = False
-    is_common: bool = False
+    is_common: bool = False  # Whether all rows of a file must have the same text; the argument is that text
+    # Plausible values of a length; None if it is not checked by itself.
     plausible_range: PlausibleRange | None = None
 
     @property
@@ -96,11 +91,9 @@ def text_column(argument: str, name: str, is_common: bool = False) -> tuple[Colu
 
 
 def file_columns(columns: Sequence[Column]) -> dict[str, str]:
-    """Return the quantity of each column of a file, in the order in which files are written.
-
-    The columns of standard deviations follow the last numeric column.
-    """
+    """Return the quantity of each column of a file, in the order in which files are written."""
     sigmas = {column.sigma_name: column.quantity for column in columns if column.is_numeric}
+    # The columns of standard deviations follow the last numeric column.
     last = max((i for i, column in enumerate(columns) if column.is_numeric), default=-1)
     out: dict[str, str] = {}
     for i, column in enumerate(columns):

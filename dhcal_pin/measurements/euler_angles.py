@@ -70,10 +70,7 @@ def angles_to_matrix(angles: Array, notation: str) -> Array:
 
 
 def matrix_to_angles(rotations: Array, notation: str) -> Array:
-    """Convert rotations (m, 3, 3) to Euler angles (m, 3) [rad].
-
-    The second angle is within ±pi/2, or from 0 to pi if the first axis and the third are the same.
-    """
+    """Convert rotations (m, 3, 3) to Euler angles (m, 3) [rad]."""
     axes, step = _rotated_axes(notation)
     i, j, k = ("xyz".index(axis) for axis in axes)
     is_repeated = i == k
@@ -81,6 +78,7 @@ def matrix_to_angles(rotations: Array, notation: str) -> Array:
         k = 3 - i - j
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     r = np.moveaxis(rotations, 0, -1)
+    # The second angle is within ±pi/2, or from 0 to pi if the first axis and the third are the same.
     if is_repeated:
         angles = (
             np.arctan2(r[j, i], -sign * r[k, i]),

@@ -16,21 +16,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ErrorGroup:
-    """Errors that have common statistics.
+    """Errors that have common statistics."""
 
-    Attributes:
-        name: Name in the JSON document, such as "position".
-        unit: "m", "rad" or "px".
-        label: Name in texts, such as "position error".
-        order: Place among the groups of a calibration; the first one is the most important.
-        is_vector: Whether the errors are vectors along the axes of a frame.
-    """
-
-    name: str
-    unit: str
-    label: str
-    order: int = 2
-    is_vector: bool = False
+    name: str  # Name in the JSON document, such as "position"
+    unit: str  # "m", "rad" or "px"
+    label: str  # Name in texts, such as "position error"
+    order: int = 2  # Place among the groups of a calibration; the first one is the most important
+    is_vector: bool = False  # Whether the errors are vectors along the axes of a frame
 
 
 # Lengths of wires, distances of contacts, coordinates along single axes.
@@ -39,21 +31,13 @@ LENGTHS = ErrorGroup("residual", "m", "residual")
 
 @dataclass(frozen=True)
 class Group:
-    """Rows of the residual of a sample that share a unit and a standard deviation.
+    """Rows of the residual of a sample that share a unit and a standard deviation."""
 
-    Attributes:
-        rows: Rows of the residual.
-        unit: "m", "rad" or "px".
-        label: Name of the error in texts.
-        axes: Last letter of the name of each row, such as "xyz"; rows are numbered if empty.
-        statistics: Errors with which the error has common statistics; its own if None.
-    """
-
-    rows: slice
-    unit: str
-    label: str
-    axes: str = ""
-    statistics: ErrorGroup | None = None
+    rows: slice  # Rows of the residual
+    unit: str  # "m", "rad" or "px"
+    label: str  # Name of the error in texts
+    axes: str = ""  # Last letter of the name of each row, such as "xyz"; rows are numbered if empty
+    statistics: ErrorGroup | None = None  # Errors with which the error has common statistics; its own if None
 
     @classmethod
     def of(cls, errors: ErrorGroup, rows: slice, axes: str = "") -> Group:

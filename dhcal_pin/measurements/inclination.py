@@ -312,13 +312,11 @@ class Inclination(Measurement):
     def _simulate(
         cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
     ) -> Inclination:
-        """Return inclinations of a sensor that is turned on the tip, with normal noise of the direction.
-
-        Gravity is along the z axis of the base.
-        """
+        """Return inclinations of a sensor that is turned on the tip, with normal noise of the direction."""
         q = conditions.q
         item = cls(q, np.zeros((len(q), 2)), noise.rotation or None).mounted(chain)
         to_link = item._to_link(chain.forward_kinematics(conditions))
+        # Gravity is along the z axis of the base.
         up = np.einsum("ji,jkm,k->mi", se3.exp3([0.3, -0.2, 0.4]), to_link, chain.base[:3, 2])
         up += noise.rotation * rng.standard_normal(up.shape)
         return item.replace(angles=cls.from_acceleration(q, up).angles)

@@ -29,21 +29,13 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class MountedRig:
-    """Rig on a chain.
+    """Rig on a chain."""
 
-    Attributes:
-        cameras: Cameras in the order of their numbers.
-        boards: Boards in the order of their numbers.
-        camera_mounts: Mount of each camera.
-        board_mounts: Mount of each board.
-        source: Name of the rig file; empty for a rig from Python.
-    """
-
-    cameras: tuple[Camera, ...]
-    boards: tuple[Board, ...]
-    camera_mounts: tuple[Mount, ...]
-    board_mounts: tuple[Mount, ...]
-    source: str
+    cameras: tuple[Camera, ...]  #: Cameras in the order of their numbers
+    boards: tuple[Board, ...]  #: Boards in the order of their numbers
+    camera_mounts: tuple[Mount, ...]  #: Mount of each camera
+    board_mounts: tuple[Mount, ...]  #: Mount of each board
+    source: str  #: Name of the rig file; empty for a rig from Python
 
     @property
     def has_links_to_exchange(self) -> bool:

@@ -45,22 +45,15 @@ _RELATIVE_TERMS = (
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class PoseMeasurement(Measurement):
-    """Base of the kinds that measure a rigid motion.
+    """Base of the kinds that measure a rigid motion."""
 
-    Attributes:
-        poses: Measured homogeneous matrices, (m, 4, 4).
-        sigma: Standard deviations of the position, (m, 3) [m].
-        rotation_sigma: Standard deviations of the rotation vector, (m, 3) [rad].
-        notations: Notation of the Euler angles or rotation vector that each rotation was read from, (m,), see
-            `euler_angles`; empty texts for rotations that were read from neither.
-        angles: These angles or components, (m, 3) [rad]; NaN if they are not known.
-    """
-
-    poses: Array
-    sigma: Array
-    rotation_sigma: Array
+    poses: Array  #: Measured homogeneous matrices, (m, 4, 4)
+    sigma: Array  #: Standard deviations of the position, (m, 3) [m]
+    rotation_sigma: Array  #: Standard deviations of the rotation vector, (m, 3) [rad]
+    #: Notation of the Euler angles or rotation vector that each rotation was read from, (m,), see
+    #: `euler_angles`; empty texts for rotations that were read from neither.
     notations: Array
-    angles: Array
+    angles: Array  #: These angles or components, (m, 3) [rad]; NaN if they are not known
 
     residual_groups: ClassVar = {"position": POSITION, "orientation": ORIENTATION}
     sample_fields = (
@@ -318,14 +311,12 @@ class RelativePose(PoseMeasurement):
         return np.concatenate([translation, log_rotations(rotation)]) * self._weights
 
     def _observation_matrix(self, frames: FrameBatch, rotation_derivative: Array) -> ObservationMatrix:
-        """Return the terms of both parts.
-
-        The translation changes by R_aᵀ·(v_b - v_a - ω_a × d), d being p_b - p_a. The rotation vector changes
-        by D·R_bᵀ·(ω_b - ω_a), D being `rotation_derivative` (3, 3, m).
-        """
+        """Return the terms of the translation and of the rotation vector."""
         first, second = self._tool_frames(frames)
+        # The translation changes by R_aᵀ·(v_b - v_a - ω_a × d), d being p_b - p_a.
         translation = first[:3] * self._weights[:3, None]
         lever = np.cross(translation, (second[3] - first[3])[None], axis=1)
+        # The rotation vector changes by D·R_bᵀ·(ω_b - ω_a), D being `rotation_derivative` (3, 3, m).
         rotation = np.einsum("ikm,kjm->ijm", rotation_derivative, second[:3]) * self._weights[3:, None]
         linear = np.concatenate([-translation, lever, translation], 1)
         angular = np.concatenate([-rotation, rotation], 1)

@@ -38,15 +38,10 @@ _TARGET_TERMS = (np.repeat([0, 1, 2], 3), np.array([0, 4, 5, 1, 3, 5, 2, 3, 4]))
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class PointMeasurement(Measurement):
-    """Base of the kinds that depend on the position of the tool point alone.
+    """Base of the kinds that depend on the position of the tool point alone."""
 
-    Attributes:
-        values: Measured values, (m, k) [m].
-        sigma: Standard deviations, (m, k) [m].
-    """
-
-    values: Array
-    sigma: Array
+    values: Array  #: Measured values, (m, k) [m]
+    sigma: Array  #: Standard deviations, (m, k) [m]
 
     sample_fields = (*Measurement.sample_fields, "values", "sigma")
 

@@ -68,11 +68,8 @@ def validated_array(
 
 
 def validated_sigma(value: Any, shape: tuple[int, int], where: str) -> Array:
-    """Return positive, finite standard deviations as an array of a given shape (m, k).
-
-    The value is one number, one number per column, or an array of that shape; for a single column also one
-    number per sample, shape (m,).
-    """
+    """Return positive, finite standard deviations as an array of a given shape (m, k)."""
+    # The value is one number, one per column, or an array; for a single column also one per sample, (m,).
     expected = f"one number or shape {shape}"
     out = _as_numbers(value, where, expected)
     if shape[1] == 1 and out.shape == shape[:1]:

@@ -34,10 +34,7 @@ MIN_WEIGHT = 1e-9
 
 
 def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
-    """Return the ratio of the residuals of a measurement with the arm at x (p,) and with an arm of its own.
-
-    It is 1 if chance may make it as large.
-    """
+    """Return the ratio of the residuals of a measurement with the arm at x (p,) and an arm of its own."""
     errors, n_errors = problem.errors, len(problem.errors.parameters)
     geometric = tuple(p for p in errors.parameters if p.coefficient_index is None)
     # Increments of the geometric errors, which come first, and of the unknowns of the instrument.

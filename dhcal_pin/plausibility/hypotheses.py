@@ -149,15 +149,10 @@ class LengthChange:
 
 @dataclass(frozen=True)
 class AxisScale:
-    """Measured coordinate that is too long by a factor.
+    """Measured coordinate that is too long by a factor."""
 
-    Attributes:
-        axis: Number of the coordinate.
-        factor: Measured over true length.
-    """
-
-    axis: int
-    factor: float
+    axis: int  # Number of the coordinate
+    factor: float  # Measured over true length
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements with a scaled coordinate."""
@@ -170,13 +165,9 @@ class AxisScale:
 
 @dataclass(frozen=True)
 class LagChange:
-    """Joint positions that are earlier than the measured values.
+    """Joint positions that are earlier than the measured values."""
 
-    Attributes:
-        lag: Time between them, in seconds if the samples have times, else in rows.
-    """
-
-    lag: float
+    lag: float  # Time between them, in seconds if the samples have times, else in rows
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measured values with the joint positions at their time."""
@@ -311,12 +302,10 @@ def _rotations(numbers: Array, notation: str) -> Array:
 
 
 def _numbers(item: PoseMeasurement, notation: str) -> Array:
-    """Return the numbers (m, 3) of rotations in a notation; those of the file where they are known.
-
-    Other angles can give the same rotation in this notation, and another one in the true notation.
-    """
+    """Return the numbers (m, 3) of rotations in a notation; those of the file where they are known."""
     rotations = item.poses[:, :3, :3]
     computed = se3.log3(rotations) if notation == ROTATION_VECTOR else matrix_to_angles(rotations, notation)
+    # Other angles can give the same rotation in this notation, and another one in the true notation.
     is_known = (item.notations == notation)[:, None] & ~np.isnan(item.angles)
     return np.where(is_known, item.angles, computed)
 
@@ -628,10 +617,8 @@ def _rotation_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
 
 
 def _turn_hypotheses() -> Iterator[Hypothesis]:
-    """Yield frames of the positions that are turned against that of the rotations.
-
-    Such a turn has the same effect as some orders of Euler angles, and as two mistakes about the axes.
-    """
+    """Yield frames of the positions that are turned against that of the rotations."""
+    # Such a turn has the same effect as some orders of Euler angles, and as two mistakes about the axes.
     for (x, y, z), (i, j, k) in product(permutations(range(3)), product((1, -1), repeat=3)):
         sources, signs = (x, y, z), (i, j, k)
         if AxisChange(sources, signs).is_turn:

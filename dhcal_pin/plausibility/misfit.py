@@ -49,10 +49,7 @@ _TINY = 1e-300
 
 
 def nominal_misfits(chain: Chain, variants: Sequence[Sequence[Measurement]]) -> Array:
-    """Compute the relative misfit (v,) of variants of the same measurements; 0 without measured positions.
-
-    Above `MAX_MISFIT` it may be too small.
-    """
+    """Compute the relative misfit (v,) of variants of the same measurements; 0 without measured positions."""
     arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
     # Sum of the squared errors, their spread, the errors of rotations and the number of samples.
     sums = np.zeros((4, len(variants)))
@@ -63,6 +60,7 @@ def nominal_misfits(chain: Chain, variants: Sequence[Sequence[Measurement]]) -> 
             index = np.flatnonzero(sizes == size)
             sums[:, index] += _sums_of_errors(arm, [items[i] for i in index])
     squares, spreads, turns, counts = sums
+    # Above `MAX_MISFIT` it may be too small.
     return np.sqrt(squares / np.fmax(spreads, _TINY) + turns / np.fmax(counts, 1))
 
 

@@ -60,14 +60,7 @@ def diagnose_mixups(
     sets: str = MANUFACTURED,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Look for a mistake in measurements that explains why they do not fit the robot.
-
-    The robot may have errors of one of the parameter sets of `evidence`.
-
-    A mistake may be in all measurements or in one of several. Contacts with planes and spheres are left out:
-    a robot with other errors can touch an unknown surface exactly, whatever the mistake is. So are image
-    coordinates, which the mistakes listed here do not concern.
-    """
+    """Look for a mistake in measurements that explains why they do not fit the robot."""
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
@@ -75,6 +68,7 @@ def diagnose_mixups(
     diagnosis, trial = _find_single(chain, items, sets, report)
     if trial is None:
         return diagnosis
+    # The mistake may be in one of several measurements.
     if len(items) > 1 and not trial.single.hypotheses:
         separate = [(item, _find_one_or_two(chain, item, sets, report)) for item in items]
         for item, one in separate:
@@ -89,10 +83,8 @@ def diagnose_mixups(
 
 
 def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
-    """Look for a mistake in the joint positions of images that do not move as these say.
-
-    Each file is examined alone: images of another camera have a base and a tool of their own.
-    """
+    """Look for a mistake in the joint positions of images that do not move as these say."""
+    # Images of another camera have a base and a tool of their own: each file is examined alone.
     found = []
     for item in images:
         one = diagnose_mixups(chain, [item.tool_poses()], sets)
@@ -111,6 +103,8 @@ def _parts(item: Measurement) -> list[Measurement]:
 
 def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
     """Return the measurements, at most `_MAX_ITEMS`, that distinguish hypotheses about joints."""
+    # A robot with other errors can touch an unknown surface exactly, whatever the mistake is. The mistakes
+    # listed here do not concern image coordinates.
     items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
     items = [item for item in items if item.rig is None]
     return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]

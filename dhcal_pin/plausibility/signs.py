@@ -201,20 +201,16 @@ def simulate_decision(chain: Chain, q: Array, rng: np.random.Generator) -> SignD
 
 
 def first_errors(chain: Chain, data: Sequence[Measurement]) -> Mapping[str, float]:
-    """Estimate the errors of a low-cost arm by name, at which a fit of images starts; empty with few images.
-
-    A fit that starts at the nominal arm often ends in another minimum where zeros are wrong by 15°.
-    """
+    """Estimate errors of a low-cost arm by name, at which a fit of images starts; empty with few images."""
+    # A fit that starts at the nominal arm often ends in another minimum where zeros are wrong by 15°.
     samples = _samples(data) if all(item.rig is not None for item in data) else []
     return fit_evidence(chain, samples, HAND_BUILT).errors if samples else {}
 
 
 def _samples(data: Sequence[Measurement]) -> list[Measurement]:
-    """Draw the samples that arms are fitted to; none if they are too few.
-
-    Images show poses of the tool, one by one. Those of another camera have a base and a tool of their own.
-    """
+    """Draw the samples that arms are fitted to; none if they are too few."""
     if data and all(item.rig is not None for item in data):
+        # Images show poses of the tool, one by one. Those of another camera have another base and tool.
         data = [max((item.tool_poses() for item in data), key=lambda item: len(item.rows))]
     samples = draw_samples(comparable_items(data))[0]
     return samples if has_enough_rows(samples) else []

@@ -177,23 +177,21 @@ def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
 
 
 def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:
-    """Yield pairs of mistakes, in one order if the order does not matter.
-
-    Shifts of rows, which need the rows beside the samples, come first, as do units of one coordinate, which
-    are listed if the coordinates as they were read suggest them. Rotations have one notation. Two changes of
-    axes that are a turn of the frame together are a single hypothesis, and a turn beside another mistake is
-    rare.
-    """
+    """Yield pairs of mistakes, in one order if the order does not matter."""
     shifts = [each for each in singles if isinstance(each.hypothesis.change, RowShift)]
     joints = [each for each in singles if isinstance(each.hypothesis.change, JointChange)]
     values = [each for each in singles if not isinstance(each.hypothesis.change, RowShift | JointChange)]
+    # A turn of the frame beside another mistake is rare.
     values = [each for each in values if not _is_turn(each.hypothesis.change)]
+    # Shifts of rows come first, as they need the rows beside the samples.
     yield from product(shifts, [*joints, *values])
     moved = [change.joints for each in joints if isinstance(change := each.hypothesis.change, JointChange)]
     for i, j in permutations(range(len(joints)), 2):
         if i < j or moved[i] & moved[j]:
             yield joints[i], joints[j]
     yield from product(joints, values)
+    # Units of one coordinate come first, too: they are listed if the coordinates as they were read suggest
+    # them. Rotations have one notation; two changes of axes that are a turn together are one hypothesis.
     for first, second in permutations(values, 2):
         if not isinstance(second.hypothesis.change, AxisScale) and not _are_one(first, second):
             yield first, second
@@ -258,12 +256,10 @@ def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[
 
 
 def _decide(trial: Trial, scored: Sequence[_Score], is_partial: bool = False) -> Diagnosis:
-    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change.
-
-    If something else is wrong, too (`is_partial`), no robot needs to fit.
-    """
+    """Return the diagnosis with the best hypotheses if a robot fits the samples after their change."""
     best = max((log for log, _, _ in scored), default=-np.inf)
     ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
+    # If something else is wrong, too (`is_partial`), no robot needs to fit.
     ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]
     if best - trial.before.log < _MIN_LOG_RATIO or not ties:
         return Diagnosis(trial.before)

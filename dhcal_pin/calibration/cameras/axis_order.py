@@ -163,13 +163,10 @@ def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> Exch
 
 
 def _frames_error(chain: Chain, parts: Sequence[CameraCorners]) -> tuple[ImageError, int] | None:
-    """Return the error of images with fixed intrinsics and the nominal arm, and the number of unknowns.
-
-    None if the images do not determine the poses.
-    """
+    """Return the error of images with fixed intrinsics and the nominal arm, and the number of unknowns."""
     try:
         data = tuple(_thinned(part).initialized(chain) for part in parts)
-    except DhcalError:
+    except DhcalError:  # the images do not determine the poses
         return None
     known = {
         p.name: p.nominal

@@ -74,14 +74,11 @@ def _errors_and_slopes(item: CameraCorners, problem: Problem, x: Array) -> tuple
 def estimate_corner_variances(
     squares: Array, in_image: Array, at_board: Array, n_determined: float, is_stated: bool
 ) -> tuple[float, float]:
-    """Estimate the variances of corners in the image and at the board from the residuals of a fit.
-
-    The squared residuals and the stated or placeholder variances s² [px²] have shape (k,), as have the
-    squared derivatives |b|² [px²/m²]. The result is a factor to s², and the variance a² along each axis at
-    the board [m²].
-    """
+    """Estimate a factor to the variances s² of corners, and the variance per axis at the board [m²]."""
     from scipy.optimize import minimize_scalar  # lazy import: slow, and few calibrations need it
 
+    # The squared residuals, the stated or placeholder variances s² [px²] and the squared derivatives |b|²
+    # [px²/m²] have shape (k,).
     ratio = float(in_image.mean() / at_board.mean())
     freedom = max(1 - n_determined / len(squares), 0.2)
 

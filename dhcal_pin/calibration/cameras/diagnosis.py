@@ -112,29 +112,19 @@ class Trial:
 
 @dataclass(frozen=True)
 class HandEyeDiagnosis:
-    """Error of a hand-eye calibration and its likely cause.
+    """Error of a hand-eye calibration and its likely cause."""
 
-    Attributes:
-        error: Error of left-out images with the poses alone.
-        noise: Part of it that noise of the corners explains.
-        causes: Likely causes, the most important one first; the error of each is that with the ones before.
-        alternatives: Causes that explain the images as well as the first one.
-        trials: All causes that were tried alone.
-        rotation: RMS rotation of the tool about the axis with the second largest rotation [rad].
-        position_std: Largest standard deviation of the position of a camera or a board [m].
-        wrong_images: Label of each image that does not fit the others, and is left out; empty without names.
-        stated: What the files state of the robot: "joint values" or "flange poses".
-    """
-
-    error: ImageError
-    noise: ImageError
+    error: ImageError  # Error of left-out images with the poses alone
+    noise: ImageError  # Part of it that noise of the corners explains
+    # Likely causes, the most important one first; the error of each is that with the ones before.
     causes: tuple[Trial, ...]
-    alternatives: tuple[Trial, ...]
-    trials: tuple[Trial, ...]
-    rotation: float
-    position_std: float
+    alternatives: tuple[Trial, ...]  # Causes that explain the images as well as the first one
+    trials: tuple[Trial, ...]  # All causes that were tried alone
+    rotation: float  # RMS rotation of the tool about the axis with the second largest rotation [rad]
+    position_std: float  # Largest standard deviation of the position of a camera or a board [m]
+    # Label of each image that does not fit the others, and is left out; empty without names.
     wrong_images: tuple[str, ...]
-    stated: str
+    stated: str  # What the files state of the robot: "joint values" or "flange poses"
 
     @property
     def n_wrong_images(self) -> int:
@@ -335,10 +325,7 @@ def _n_examined(count: int, n_corners: int) -> int:
 
 
 def describe_contradiction(fit: Fit, errors: Accuracy) -> str:
-    """Say that images contradict measured lengths of the same fit, with its errors; empty if they do not.
-
-    Errors that both share, such as play, displace the images as much as they change the lengths.
-    """
+    """Say that images contradict measured lengths of the same fit, with its errors; empty if they do not."""
     board, pixels = errors.groups.get("board"), errors.groups.get("pixels")
     lengths = [group.rms for name, group in errors.groups.items() if group.unit == "m" and name != "board"]
     if board is None or pixels is None or not lengths:
@@ -349,6 +336,7 @@ def describe_contradiction(fit: Fit, errors: Accuracy) -> str:
     # Larger errors are refused.
     if not jitter.is_significant or not MAX_NOISE_RATIO * noise < pixels.rms <= MAX_LINEAR_ERROR:
         return ""
+    # Errors that both share, such as play, displace the images as much as they change the lengths.
     displacement = board.rms * np.sqrt(1 - (noise / pixels.rms) ** 2)
     if displacement <= MAX_LENGTH_RATIO * max(lengths):
         return ""

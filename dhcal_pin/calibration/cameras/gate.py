@@ -219,13 +219,10 @@ def temperature(n_configurations: int, samples: int) -> float:
 
 
 def rows_per_displacement(data: Sequence[Measurement]) -> float:
-    """Return the number of image coordinates per component of the displacement of an image, at least 1.
-
-    Corners that share a displacement contain six independent values per image, however many they are. If
-    they are taken for independent, they count as too many by this factor.
-    """
+    """Return the number of image coordinates per component of the displacement of an image, at least 1."""
     images = [item for item in data if isinstance(item, CameraCorners)]
     n_configurations = len(np.unique(configuration_groups(images)))
+    # Corners that share a displacement contain six independent values per image, however many they are.
     return max(sum(2 * len(item.rows) for item in images) / (6 * n_configurations), 1.0)
 
 
@@ -258,10 +255,7 @@ def _trial(
 
 
 def _others_ratio(fit: Fit, max_iterations: int) -> float:
-    """Return the error of left-out rows of other instruments, relative to that with the nominal arm.
-
-    It is NaN if there are too few.
-    """
+    """Return the error of left-out rows of other instruments relative to the nominal arm; NaN if too few."""
     others = [item for item in fit.problem.data if not item.n_images]
     folds = []
     for fold in cluster_folds(others) if others else ():

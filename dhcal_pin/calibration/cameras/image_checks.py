@@ -55,11 +55,9 @@ MORE_ROTATIONS = "Add images that are turned by 30° or more about two axes that
 
 
 def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain, max_error: float) -> str:
-    """Return what shows that images are not those of the joint values or robot of a fit, else nothing.
-
-    A fit whose corners are within `max_error` [px] of the model, and not mostly rejected, is not questioned.
-    """
+    """Return what shows that images are not those of the joint values or robot of a fit, else nothing."""
     rejected = np.concatenate([weights <= ZERO_WEIGHT for weights in fit.weights])
+    # Corners within `max_error` [px] of the model, and not mostly rejected, are not questioned.
     if fitted_error(fit).pixels <= max_error and rejected.mean() <= MAX_IMAGE_OUTLIER_SHARE:
         return ""
     images = [item for item in fit.data if isinstance(item, CameraCorners)]
@@ -83,11 +81,8 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
 
 
 def _angle_difference(chain: Chain, item: CameraCorners, sequence: Array) -> float:
-    """Return the median difference of angles between images and robot [rad], for the best shift of rows.
-
-    The sequence (k, n) has the joint values of all images of the file. The difference is zero if there are
-    too few images.
-    """
+    """Return the median difference of angles between images and robot [rad], for the best shift of rows."""
+    # The sequence (k, n) has the joint values of all images of the file. The result is 0 with few images.
     shown = item.tool_poses()
     shown = shown.take(np.arange(min(len(shown.rows), MAX_IMAGES)))
     if len(shown.rows) < MIN_IMAGES:
@@ -151,28 +146,22 @@ def largest_position_std(names: Sequence[str], covariance: Array) -> float:
 def largest_tool_std(
     rig: MountedRig, names: Sequence[str], covariance: Array, priors: Uncertainty
 ) -> float | None:
-    """Return the largest standard deviation of the position of a camera or a board relative to the tool [m].
-
-    `covariance` (p, p) is that of the unknowns `names`. `priors` are the standard deviations of the errors of
-    the arm before the measurement: what these imitate is not contained. None without such an unknown.
-    """
+    """Return the largest standard deviation of the position of a camera or board relative to the tool [m]."""
     gauge, blocks = tool_gauge_covariance(priors), []
     for entry, mount, pose in _entries(rig):
         if mount.moves and f"{entry}.x" in names:
             link_pose = mount.link_pose
             axes = link_pose[:3, :3]
             by_tool = np.concatenate([np.eye(3), -se3.skew(link_pose[:3, 3] + axes @ pose[:3, 3])], 1)
+            # What errors of the arm with these `priors` imitate is not contained.
             imitated = axes.T @ by_tool @ gauge @ by_tool.T @ axes
             blocks.append(_position_block(entry, names, covariance) - imitated)
     return _largest_std(blocks) if blocks else None
 
 
 def largest_fixed_std(rig: MountedRig, names: Sequence[str], covariance: Array) -> float | None:
-    """Return the largest standard deviation of the position of a camera or a board that stands still [m].
-
-    It is that in the measuring frame. `covariance` (p, p) is that of the unknowns `names`. None without such
-    an unknown.
-    """
+    """Return the largest standard deviation of the position of a camera or board that stands still [m]."""
+    # Such positions are in the measuring frame.
     blocks = [
         _position_block(entry, names, covariance)
         for entry, mount, _ in _entries(rig)
@@ -222,11 +211,9 @@ def describe_rotation(rotation: float) -> str:
 
 
 def describe_weak_positions(std: float, error: float, rotation: float) -> str:
-    """Say that the images do not determine camera and board relative to the arm; empty if they do.
-
-    Arguments are the standard deviation [m] of these positions, the error at the board [m] and the rotation
-    about the second axis [rad].
-    """
+    """Say that the images do not determine camera and board relative to the arm; empty if they do."""
+    # `std` [m] is that of these positions, `error` [m] that at the board, `rotation` [rad] that about the
+    # second axis.
     if std <= MAX_ERROR_RATIO * max(error, MIN_BOARD_ERROR):
         return ""
     size = f"have a standard deviation of {Quantity.error(std, 'm')}" if np.isfinite(std) else "are unknown"

@@ -42,10 +42,8 @@ def fit_image_session(
     start: Callable[[tuple[Measurement, ...]], Fit],
     arm: ArmType,
 ) -> SessionFit:
-    """Find what happened while images were taken, and fit them with the changes that are believed.
-
-    `calibrated` calibrates poses of the tool for some base and some tool; `start` fits images.
-    """
+    """Find what happened while images were taken, and fit them with the changes that are believed."""
+    # `calibrated` calibrates poses of the tool for some base and some tool; `start` fits images.
     found = find_image_session(chain, data, holdout, calibrated, arm)
     if found is None or found.changes.is_empty:
         return SessionFit(start(data), holdout, found)
@@ -72,10 +70,7 @@ def find_image_session(
     calibrated: Callable[[Sequence[Pose]], Result],
     arm: ArmType,
 ) -> Session | None:
-    """Find what happened while the images of one camera and one board were taken.
-
-    None if nothing can be said.
-    """
+    """Find what happened while images of one camera and one board were taken; None if it is unknown."""
     images = [item for item in data if isinstance(item, CameraCorners)]
     pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
     if len(images) < len(data) or len(pairs) != 1:
@@ -113,12 +108,10 @@ def find_image_session(
 
 
 def _explains_better(fit: Fit, other: Fit) -> bool:
-    """Return whether one fit explains images so much better than another one that this is evidence.
-
-    An image has six degrees of freedom, and counts no more than an outlier does.
-    """
+    """Return whether one fit explains images so much better than another one that this is evidence."""
     squares = [_image_squares(each) for each in (fit, other)]
     noise = max(min(float(np.median(each)) for each in squares), MIN_NOISE**2)
+    # An image has six degrees of freedom, and counts no more than an outlier does.
     limit = 1 + MAX_SAMPLE_COST / 6
     costs = [6 * float(np.sum(np.minimum(each / noise, limit))) for each in squares]
     return costs[1] - costs[0] > 2 * MIN_LOG_EVIDENCE

@@ -26,41 +26,26 @@ STAGES = ("axis order", "frames", "intrinsics", "target points", "arm")
 
 @dataclass(frozen=True)
 class ImageError:
-    """Error of corners in images.
+    """Error of corners in images."""
 
-    Attributes:
-        pixels: RMS distance between the measured and the modelled corner in the image [px].
-        distance: RMS distance of the corner from the line of sight through its measured image, at the
-            board [m].
-        n_corners: Number of corners.
-    """
-
-    pixels: float
+    pixels: float  # RMS distance between the measured and the modelled corner in the image [px]
+    # RMS distance of the corner from the line of sight through its measured image, at the board [m].
     distance: float
-    n_corners: int
+    n_corners: int  # Number of corners
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Accuracy after one more group of unknowns was freed.
+    """Accuracy after one more group of unknowns was freed."""
 
-    Attributes:
-        name: One of `STAGES`.
-        is_kept: Whether the unknowns of this stage are free in the result.
-        n_unknowns: Number of unknowns of the fit of this stage.
-        fitted: Error of the fitted images.
-        by_image: Error of random images that were held out; None if there are too few.
-        by_region: Error of regions of joint space that were held out; None if there are too few images.
-        reason: Sentence that says why the unknowns are free or held.
-    """
-
-    name: str
-    is_kept: bool
-    n_unknowns: int
-    fitted: ImageError
-    by_image: ImageError | None
+    name: str  # One of `STAGES`
+    is_kept: bool  # Whether the unknowns of this stage are free in the result
+    n_unknowns: int  # Number of unknowns of the fit of this stage
+    fitted: ImageError  # Error of the fitted images
+    by_image: ImageError | None  # Error of random images that were held out; None if there are too few
+    # Error of regions of joint space that were held out; None if there are too few images.
     by_region: ImageError | None
-    reason: str
+    reason: str  # Sentence that says why the unknowns are free or held
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for the JSON document."""

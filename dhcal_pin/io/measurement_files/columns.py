@@ -183,10 +183,7 @@ def joints_off_the_chain(chain: Chain) -> list[str]:
 
 
 def needs_column_map(table: DataTable, chain: Chain) -> bool:
-    """Return whether a file has no header, one that names no joint or no measured value, or Euler angles.
-
-    A file with too few unknown columns to be described by a map does not need one.
-    """
+    """Return whether a file has no header, one that names no joint or no measured value, or Euler angles."""
     if table.has_numbers_as_header:
         return True
     values = value_table(table, chain)
@@ -196,6 +193,7 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     joints = {*joint_column_names(chain.joint_names)}
     if euler_columns(table, chain):
         return True
+    # A map cannot describe a file with too few unknown columns.
     n_unknown = len(names - known_columns(chain))
     if set(values.columns) & VALUE_COLUMNS:
         return not names & joints and n_unknown >= chain.n_joints

@@ -211,13 +211,11 @@ class DataTable:
         return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
 
     def thinned(self, max_rows: int) -> DataTable:
-        """Return a table with at most a number of rows, drawn at random, and a note if some are left out.
-
-        Rows at regular distances could all be of one target, or none of them held out.
-        """
+        """Return a table with at most a number of rows, drawn at random, and a note if some are left out."""
         count = len(self.lines)
         if count <= max_rows:
             return self
+        # Rows at regular distances could all be of one target, or none of them held out.
         rows = np.sort(np.random.default_rng(0).permutation(count)[:max_rows])
         note = f"{max_rows} of {count} rows are used, drawn at random, as more do not improve a calibration"
         return replace(self._with_rows(rows.tolist()), notes=(*self.notes, note))
@@ -323,9 +321,7 @@ class _ColumnRows(Sequence[list[str]]):
 
 
 def format_lines(lines: Iterable[int]) -> str:
-    """Return a list of line numbers as text, with consecutive ones joined.
-
-    After MAX_LISTED_RUNS numbers or runs of numbers, the text says how many lines follow.
+    """Return line numbers as text: up to MAX_LISTED_RUNS runs of them, then how many lines follow.
 
     >>> format_lines([2, 5, 6, 7, 11])
     '2, 5-7, 11'

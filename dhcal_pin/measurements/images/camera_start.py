@@ -143,11 +143,7 @@ def first_values(item: Corners, views: BoardViews, chain: Chain, used: Array) ->
 
 
 def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
-    """Return samples (k,) and poses (k, 4, 4) of the moving one of camera and board in the other one.
-
-    They are those of the pair with the most views, without badly fitting ones: poses of the tool for some
-    base and some tool. Both are empty if no camera and board move against each other.
-    """
+    """Return samples (k,) and poses (k, 4, 4) of the moving one of camera and board in the other one."""
     pairs = np.stack([item.camera, item.board], 1)[views.sample]
     camera_moves, board_moves = (
         np.array([mount.moves for mount in mounts], bool)[pairs[:, i]]
@@ -155,8 +151,9 @@ def moving_poses(item: Corners, views: BoardViews) -> tuple[Array, Array]:
     )
     is_usable = camera_moves != board_moves
     labels, counts = np.unique(pairs[is_usable], axis=0, return_counts=True)
-    if not len(labels):
+    if not len(labels):  # no camera and board move against each other
         return np.empty(0, int), np.empty((0, 4, 4))
+    # Those of the pair with the most views are poses of the tool for some base and some tool.
     of_pair = np.flatnonzero(np.all(pairs == labels[np.argmax(counts)], 1))
     good = _well_fitting(views.rms, of_pair)
     poses = views.poses[good, 0]
@@ -169,10 +166,7 @@ def _well_fitting(rms: Array, of_pair: Array) -> Array:
 
 
 def moving_information(item: Corners, views: BoardViews, samples: Array) -> Array:
-    """Return the information about twists of the poses of `moving_poses`, (k, 6, 6).
-
-    The twists are in the frame of the one that stands still. The noise is that of all images.
-    """
+    """Return the information about twists of the poses of `moving_poses`, (k, 6, 6)."""
     if not len(samples):
         return np.empty((0, 6, 6))
     number = {int(sample): i for i, sample in enumerate(views.sample)}
@@ -184,6 +178,7 @@ def moving_information(item: Corners, views: BoardViews, samples: Array) -> Arra
         points = item.rig.boards[item.board[sample]].points[item.corner[own]]
         information = pose_information(pose, points)
         if item.rig.camera_mounts[item.camera[sample]].moves:
+            # The twists are in the frame of the one that stands still.
             by_twist = se3.adjoint(pose)
             information = by_twist.T @ information @ by_twist
         out.append(information)

@@ -26,23 +26,17 @@ ARM_STD = 5e-4, 5e-4
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class ImagePose(Pose):
-    """Poses with covariances.
+    """Poses with covariances."""
 
-    Attributes:
-        roots: Upper triangular factors R, (m, 6, 6) [1/m and 1/rad].
-    """
-
-    roots: Array
+    roots: Array  # Upper triangular factors R, (m, 6, 6) [1/m and 1/rad]
 
     sample_fields = (*Pose.sample_fields, "roots")
 
     @classmethod
     def of(cls, q: Array, poses: Array, information: Array) -> Self:
-        """Return poses (m, 4, 4) [m] with the information (m, 6, 6) of images about twists of them.
-
-        The twists [v, ω] are about the origin of the measuring frame. Errors of the arm are added.
-        """
+        """Return poses (m, 4, 4) [m] with the information (m, 6, 6) of images about twists of them."""
         plain = Pose(q, poses)
+        # The twists [v, ω] are about the origin of the measuring frame.
         by_twist = np.tile(np.eye(6), (len(q), 1, 1))
         by_twist[:, :3, 3:] = -se3.skew(plain.positions())
         covariance = by_twist @ np.linalg.pinv(information, hermitian=True) @ by_twist.swapaxes(1, 2)
