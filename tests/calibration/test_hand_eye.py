@@ -41,6 +41,7 @@ from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
 pytestmark = pytest.mark.usefixtures("own_loss")
@@ -334,7 +335,11 @@ def test_a_shift_of_flange_poses_is_named():
     check_cause(fit, "rows")
     assert fit.hand_eye is not None
     assert "belongs to the flange poses one row" in fit.hand_eye.likely
-    assert "Correct the table of flange poses." in fit.hand_eye.likely
+    assert "Correct the table of flange poses, or add --mend rows:below." in fit.hand_eye.likely
+    mended = mend(chain, images, "rows:below").replace(has_joint_values=False)
+    after = dh.calibrate(chain, mended, "camera,board", loss="linear")
+    assert after.hand_eye is not None
+    assert after.hand_eye.is_noise
     # No other cause is tried.
     assert [trial.cause for trial in fit.hand_eye.trials] == ["pairing"]
     with pytest.raises(dh.DhcalError, match="'minimal': need joint values"):

@@ -88,6 +88,14 @@ def test_json_for_a_terminal_of_another_encoding(robot_folder):
 # --- interrupts ------------------------------------------------------------------------------------
 
 
+@pytest.fixture(autouse=True)
+def _interrupts_are_not_ignored():
+    """A shell starts commands in the background with interrupts ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupt(*_, **__):
     signal.raise_signal(signal.SIGINT)
 
