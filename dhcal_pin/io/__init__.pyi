@@ -42,6 +42,7 @@ from .sidecar import existing_sidecar as existing_sidecar
 from .sidecar import read_fitted as read_fitted
 from .sidecar import read_instrument as read_instrument
 from .sidecar import read_measured_region as read_measured_region
+from .sidecar import read_tip as read_tip
 from .sidecar import read_tool as read_tool
 from .sidecar import read_uncertainty as read_uncertainty
 from .sidecar import sidecar_path as sidecar_path

@@ -383,6 +383,11 @@ def read_fitted(path: PathLike) -> Fitted:
     return Fitted(manifest.get("fitted_sha256", ()), rows)
 
 
+def read_tip(path: PathLike) -> str | None:
+    """Read the link at which the calibrated chain ends; None if the sidecar does not state it."""
+    return TomlTable.read(path, MAX_SIDECAR_BYTES).some_values({"tip": _FRAME_KEYS["tip"]})["tip"]
+
+
 def read_tool(path: PathLike) -> Array:
     """Read the pose of a tool."""
     table = TomlTable.read(path, MAX_SIDECAR_BYTES)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import CALIBRATE, HEADER, KEYS, json_of, parse_json, stdout_of, tool_positions, unfolded
-from robots import URDF
+from robots import URDF, robot_file
 
 
 def test_sidecar_is_an_input(run, robot_folder):
@@ -31,6 +31,31 @@ def test_json_of_a_validation(run, robot_folder):
     rows = np.loadtxt("data.csv", delimiter=",", skiprows=1)
     off = np.linalg.norm(tool_positions(rows[:, :3]) - rows[:, 3:], axis=1) / 1e3
     assert document["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+
+
+def test_another_tip_than_that_of_the_calibration_is_named(run, robot_folder):
+    """The tool of a UR10 is calibrated; with the link before the tip, the tool does not count."""
+    Path("ur10.urdf").write_text(robot_file("ur_description/urdf/ur10_robot.urdf").read_text())
+    simulate = [
+        "simulate",
+        "ur10.urdf",
+        "--tip",
+        "tool0",
+        "-m",
+        "40",
+        "--errors",
+        "1mm,0.2deg",
+        "--noise",
+        "0.05mm",
+    ]
+    assert run(*simulate, "--kind", "position", "-o", "ur10.csv")[0] == 0
+    assert run("calibrate", "ur10.urdf", "ur10.csv", "--tip", "tool0", "-o", "out.urdf")[0] == 0
+    validate = ["validate", "out.urdf", "ur10.csv", "--json", "-", "--tip"]
+    other, same = (parse_json(run(*validate, tip)[1]) for tip in ("wrist_2_link", "tool0"))
+    (warning,) = [text for text in other["warnings"] if "the tool of" in text]
+    assert warning.endswith("is that of the tip tool0: run again with --tip tool0")
+    assert not any("the tool of" in text for text in same["warnings"])
+    assert same["after"]["position_rms_m"] < 0.01 * other["after"]["position_rms_m"]
 
 
 def test_fit_frames_finds_the_measuring_frame(run, robot_folder):

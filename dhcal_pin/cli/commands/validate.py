@@ -58,6 +58,7 @@ class Given(NamedTuple):
     estimated: list[str]  # Cameras and boards of the rig that the calibration estimated
     region: MeasuredRegion | None  # Measured region of the calibration
     predictor: estimation.Predictor | None  # Uncertainty of the robot, for maps
+    calibrated_tip: str  # Link that the tool of the sidecar is on
 
     @property
     def data(self) -> list[Measurement]:
@@ -166,8 +167,9 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     require_common_reference_target({file.source: file.data for file in files}, instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
     known = {name: value for name, value in instrument.items() if name in used}
-    region = io.read_measured_region(sidecar, chain) if sidecar else None
-    return Given(chain, files, known, rig, estimated, region, predictor)
+    calibrated_tip = (sidecar and io.read_tip(sidecar)) or chain.tip
+    region = io.read_measured_region(sidecar, chain) if sidecar and calibrated_tip == chain.tip else None
+    return Given(chain, files, known, rig, estimated, region, predictor, calibrated_tip)
 
 
 def _judge(args: Namespace, given: Given) -> Judged:
@@ -320,6 +322,8 @@ def _input_warnings(
         ]
     if not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
         warnings[args.robot] = [diagnostics.FRAMES_WARNING]
+    if (tip := given.calibrated_tip) != given.chain.tip:
+        warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
     return warnings
 
 
