@@ -107,7 +107,7 @@ class JointChange:
 
 @dataclass(frozen=True)
 class RowShift:
-    """Joint positions belong to the measured values `step` rows below them, or to those of that image."""
+    """Joint positions belong to the measured values `step` rows below them; of images, `step` images."""
 
     step: int  # 1 or -1
 

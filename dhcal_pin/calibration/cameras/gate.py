@@ -13,8 +13,9 @@ of the arm are those of greatest evidence at T, however narrow.
   (`arm_types`).
 - r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
   arm is demonstrably wrong, too, whatever the images show.
-- Otherwise the nominal arm is kept. Errors of another kind, such as periodic ones of the joints, can be
-  imitated by errors of the links where images were taken, with a ratio of 0.3 to 0.5, but not elsewhere.
+- Otherwise the nominal arm is kept, unless elasticity and play complete the model (`joint_errors`). Errors of
+  another kind, such as periodic ones of the joints, can be imitated by errors of the links where images were
+  taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
 The corners of an image share a displacement of the arm (`jitter`), unless corners that are displaced
 independently (`corner_noise`) predict the left-out clusters better. Then T is larger by the number of image
