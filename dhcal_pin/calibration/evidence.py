@@ -19,7 +19,7 @@ from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import diagnose_mixups, has_enough_rows
+from ..plausibility.mixups import diagnose_images, diagnose_mixups, has_enough_rows
 from ..session import Session
 from ..session.linear_model import measures_positions
 from . import cameras
@@ -295,8 +295,18 @@ def positions_beside_images(data: Sequence[Measurement]) -> tuple[Measurement, .
 
 def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
     """Look for mistakes in the measurements of a calibration, if this was not done before."""
-    sets = HAND_BUILT if fit.signs else MANUFACTURED
-    return fit.earlier_diagnosis or diagnose_mixups(fit.errors.chain, fit.data, sets, progress)
+    return fit.earlier_diagnosis or diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress)
+
+
+def diagnose_joint_values(fit: Evidence) -> Diagnosis:
+    """Look for mistakes in the joint values of images without other measurements."""
+    images = fit.data if all(item.n_images for item in fit.data) else ()
+    return diagnose_images(fit.errors.chain, images, _usual_errors(fit))
+
+
+def _usual_errors(fit: Evidence) -> str:
+    """Return the parameter sets of the errors that such a robot usually has."""
+    return HAND_BUILT if fit.signs else MANUFACTURED
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, str], float]:

@@ -34,12 +34,10 @@ from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
-from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import diagnose_images
 from ..robot.chain import BASE_FRAME
 from . import cameras
 from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
-from .evidence import Evidence, count_geometric_directions
+from .evidence import Evidence, count_geometric_directions, diagnose_joint_values
 from .model_selection import FULL_SET
 from .partition import configuration_groups
 from .reweighting import Fit
@@ -270,7 +268,7 @@ def _unmoved_joints(fit: Evidence) -> list[Finding]:
 def _unrelated_images(fit: Evidence) -> list[Finding]:
     """Refuse images that are not those of the joint values or of the robot."""
     sentence = fit.hand_eye_fit.unrelated if fit.hand_eye_fit else ""
-    return (_mixed_up_images(fit) or [Finding("refused", sentence)]) if sentence else []
+    return (_mixups(diagnose_joint_values(fit)) or [Finding("refused", sentence)]) if sentence else []
 
 
 def _few_images(fit: Evidence) -> list[Finding]:
@@ -301,14 +299,6 @@ def _mixups(diagnosis: Diagnosis) -> list[Finding]:
     if not diagnosis.hypotheses:
         return []
     return [Finding("refused", f"{diagnosis.sentence} {diagnosis.remedy}")]
-
-
-def _mixed_up_images(fit: Evidence) -> list[Finding]:
-    """Refuse images without other measurements that other joint values explain, and say how to mend them."""
-    if not all(item.n_images for item in fit.data):
-        return []
-    sets = HAND_BUILT if fit.signs else MANUFACTURED
-    return _mixups(diagnose_images(fit.errors.chain, fit.data, sets))
 
 
 def _signs(fit: Evidence) -> list[Finding]:
@@ -392,7 +382,7 @@ def _implausible_correction(fit: Evidence) -> list[Finding]:
     if size.ratio <= MAX_USUAL_DISPLACEMENT:
         return []
     status: Status = "refused" if size.ratio > MAX_DISPLACEMENT else "caution"
-    named = _mixed_up_images(fit) if status == "refused" else []
+    named = _mixups(diagnose_joint_values(fit)) if status == "refused" else []
     return named or [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
 
 

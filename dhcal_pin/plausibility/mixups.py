@@ -85,12 +85,12 @@ def diagnose_mixups(
 def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
     """Look for a mistake in the joint positions of images that do not move as these say."""
     # Images of another camera have a base and a tool of their own: each file is examined alone.
-    found = []
+    found: list[Diagnosis] = []
     for item in images:
         one = diagnose_mixups(chain, [item.tool_poses()], sets)
         named = tuple(each for each in one.hypotheses if each.concerns_joints)
         found.append(replace(one, hypotheses=named, source=item.source))
-    first, *_ = sorted(found, key=lambda one: not one.hypotheses)
+    first = next((one for one in found if one.hypotheses), Diagnosis(NO_EVIDENCE))
     is_common = all(one.hypotheses == first.hypotheses for one in found)
     return replace(first, source="") if is_common else first
 

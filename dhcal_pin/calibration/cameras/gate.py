@@ -183,20 +183,12 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at), opened)
 
 
-def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, Gate]:
-    """Estimate the displacement of images anew, fit with it, and judge the arm again if it was kept."""
+def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
+    """Estimate the displacement of images anew, fit with it, and return the temperature of the fit."""
     fit, jitter = fit_with_jitter(fit, max_iterations)
     n_configurations = gate.n_configurations if jitter.is_significant else 0
     opened_at = temperature(n_configurations, OPEN_SAMPLES)
-    opened = _solve(fit, fit.problem, opened_at, max_iterations)
-    if not gate.is_open:
-        errors = [
-            held_out_error(each, cluster_folds(fit.problem.data))
-            for each in (opened, without_arm(fit, max_iterations))
-        ]
-        after, nominal = (error.pixels if error else float("nan") for error in errors)
-        gate = replace(gate, ratio=after / nominal, is_complete=not jitter.is_significant)
-    return opened, replace(gate, temperature=opened_at)
+    return _solve(fit, fit.problem, opened_at, max_iterations), opened_at
 
 
 def _kept_fit(nominal: Fit, is_right: bool, folds: Sequence[Fold], max_iterations: int) -> Fit:

@@ -35,7 +35,7 @@ from ..model_selection import (
     select_families,
     with_selected,
 )
-from .gate import GatedFit, cluster_folds, open_fit
+from .gate import GatedFit, cluster_folds, open_fit, without_arm
 from .stages import held_out_error
 
 # Families that images show: displacements follow from the direction of approach and from gravity. Periodic
@@ -66,21 +66,27 @@ def add_joint_errors(
     problem, x, family = with_selected(start, selected, model)
     problem = problem.with_prior_weights(prior_weights(problem, family, model.widths))
     solution = minimize(problem, "lm", x, max_iterations, loose=True)
-    opened, gate = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
+    opened, temperature = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
     folds = cluster_folds(fit.data)
     errors = [held_out_error(each, folds) for each in (fit, opened)]
     before, after = (error.pixels if error else float("nan") for error in errors)
+    if not gate.is_open:
+        nominal = held_out_error(without_arm(opened, max_iterations), folds)
+        ratio = after / nominal.pixels if nominal else float("nan")
+        # The temperature is 1 if no displacement of the images is left.
+        gate = replace(gate, ratio=ratio, is_complete=temperature == 1)
     if not gate.is_open or after > before:
         trials = tuple(replace(trial, is_selected=False) for trial in trials)
         return gated, replace(extension, trials=trials)
     extension = Extension(
         trials,
-        gate.temperature,
+        temperature,
         gate.n_configurations,
         random_ratio=random_ratio,
         region_ratio=after / before if before else float("nan"),
     )
     with_arm = gated.with_arm if gated.gate.is_open else opened
+    gate = replace(gate, temperature=temperature)
     return replace(gated, fit=opened, with_arm=with_arm, gate=gate), extension
 
 

@@ -320,10 +320,10 @@ def _input_warnings(
             *(f"line {item.row}: {item.reason}" for item in unreachable),
             *_fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
-    if not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
-        warnings[args.robot] = [diagnostics.FRAMES_WARNING]
     if (tip := given.calibrated_tip) != given.chain.tip:
         warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
+    elif not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
+        warnings[args.robot] = [diagnostics.FRAMES_WARNING]
     return warnings
 
 
