@@ -22,6 +22,7 @@ from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
 
+import coal
 import fast_simplification
 import numpy as np
 import pinocchio as pin
@@ -38,6 +39,9 @@ from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_files, mesh_r
 GRID = 8000
 # Coarser grids, which are tried one after the other for meshes that are simplified.
 COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)
+# Of the trees of bounding volumes that Coal builds for each mesh, these take the least time of those whose
+# meshes have vertices in Python. The trees are not used.
+_MESH_LOADER = coal.MeshLoader(coal.BV_OBB)
 # Largest number of missing meshes that a note names.
 MAX_NAMED = 3
 # Colours of the tool frame in the URDF of a DH table.
@@ -177,7 +181,11 @@ def _load_geometry(
     try:
         with discard_native_messages():
             geometry = pin.buildGeomFromUrdfString(
-                model, text, pin.GeometryType.VISUAL, package_dirs=[*folders]
+                model,
+                text,
+                pin.GeometryType.VISUAL,
+                package_dirs=[*folders],
+                mesh_loader=_MESH_LOADER,
             )
     except (ValueError, RuntimeError):
         return None

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -29,10 +30,10 @@ from ...robot.sampling import ConfigurationSampler, WorkspaceConstraints, random
 from ..evaluation import position_errors
 
 # Configurations of a prediction by configurations, and of a map by cells.
-N_PREDICTED_CONFIGURATIONS, N_MAP_CONFIGURATIONS = 16_000, 20_000
-# The same of a scene, with at least this number of cells along the largest extent of the workspace; a cell of
-# a robot with six joints contains about ten of the configurations.
-N_SCENE_CONFIGURATIONS, MIN_SCENE_CELLS = 6000, 10
+N_PREDICTED_CONFIGURATIONS, N_MAP_CONFIGURATIONS = 6000, 20_000
+# Smallest number of cells of a scene along the largest extent of the workspace; a cell of a robot with six
+# joints contains about ten of the predicted configurations.
+MIN_SCENE_CELLS = 10
 # Added to texts on predictions where the measurements leave the pose of base or tool free.
 RELATIVE_TEXT = (
     "The measurements leave the pose of the base or of the tool free, at least in part: unknown poses of "
@@ -55,10 +56,10 @@ class WorkspacePrediction:
 
 def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> WorkspacePrediction:
     """Predict the accuracy in configurations all over the joint ranges, and in the measured ones."""
-    drawn = random_configurations(model.chain, N_PREDICTED_CONFIGURATIONS)
+    points, std = _predict_drawn_positions(model, N_PREDICTED_CONFIGURATIONS)
     measured = [item.configurations() for item in data if item.configurations_per_row > 0]
-    parts = (drawn, np.concatenate([drawn[:0], *measured]))
-    (points, std), (measured_points, measured_std) = (_predict_positions(model, q) for q in parts)
+    q = np.concatenate([np.empty((0, model.chain.n_joints)), *measured])
+    measured_points, measured_std = _predict_positions(model, q)
     base = se3.inverse(model.chain.base)
     return WorkspacePrediction(
         se3.transform_points(base, points), std, se3.transform_points(base, measured_points), measured_std
@@ -139,7 +140,7 @@ class UncertaintyCells:
 
 def uncertainty_cells(model: Predictor) -> UncertaintyCells:
     """Predict the uncertainty of the tool position by cells; configurations without one are left out."""
-    points, std = _predict_positions(model, random_configurations(model.chain, N_SCENE_CONFIGURATIONS))
+    points, std = _predict_drawn_positions(model, N_PREDICTED_CONFIGURATIONS)
     is_finite = np.isfinite(std)
     points = se3.transform_points(se3.inverse(model.chain.base), points[is_finite])
     if not len(points):
@@ -147,6 +148,13 @@ def uncertainty_cells(model: Predictor) -> UncertaintyCells:
     size = round_down(max(float(np.ptp(points, axis=0).max()) / MIN_SCENE_CELLS, 1e-3))
     cells, index = _cells(points, size)
     return UncertaintyCells(size, cells, _root_mean(index, std[is_finite] ** 2, len(cells)))
+
+
+# A report has a map and a scene of the same robot.
+@lru_cache(maxsize=1)
+def _predict_drawn_positions(model: Predictor, count: int) -> tuple[Array, Array]:
+    """Return tool points in configurations all over the joint ranges, and their standard deviations."""
+    return _predict_positions(model, random_configurations(model.chain, count))
 
 
 def _predict_positions(model: Predictor, q: Array) -> tuple[Array, Array]:
