@@ -117,11 +117,12 @@ class RowShift:
             return None
         order = np.argsort(item.rows, kind="stable")
         if item.n_images:
-            _, first, labels = np.unique(label_stops(item)[order], return_index=True, return_inverse=True)
+            # The arm may return to a configuration: that is another stop.
+            is_new = np.diff(label_stops(item)[order], prepend=-1) != 0
             places = np.empty(len(order), int)
-            places[order] = np.argsort(np.argsort(first))[labels] - self.step
-            inside = (places >= 0) & (places < len(first))
-            return item.take(inside).resample(item.q[order[np.sort(first)]][places[inside]])
+            places[order] = np.cumsum(is_new) - 1 - self.step
+            inside = (places >= 0) & (places < np.count_nonzero(is_new))
+            return item.take(inside).resample(item.q[order[is_new]][places[inside]])
         gaps = np.diff(item.rows[order])
         if not np.any(gaps > 0):
             return None

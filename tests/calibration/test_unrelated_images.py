@@ -98,6 +98,20 @@ def test_wrong_joint_values_of_images_are_named_and_mended(change, is_in_order, 
         np.testing.assert_allclose(mended.q, images.q)
 
 
+def test_joint_values_are_moved_by_images_where_the_arm_returns_to_a_configuration():
+    chain, visits = ARMS["ur10"](), [0, 1, 0, 2, 3, 0, 4]
+    images = simulate(chain, chain, np.random.default_rng(0), is_on_wrist=True, n_images=5, sigma=0.2).images
+    q, stops = np.unique(images.q, axis=0, return_inverse=True)
+    rows = [np.flatnonzero(stops.reshape(-1) == visit) for visit in visits]
+    right = images.take(np.concatenate(rows))
+    right = right.replace(rows=np.arange(len(right.rows)))
+    place = np.repeat(np.arange(len(visits)), [len(each) for each in rows])
+    wrong = right.resample(q[np.roll(visits, -1)][place])
+    mended = mend(chain, wrong, "rows:below")
+    np.testing.assert_array_equal(mended.q, right.q[place > 0])
+    np.testing.assert_array_equal(mended.rows, right.rows[place > 0])
+
+
 def test_images_that_are_mostly_outliers_are_refused(monkeypatch):
     chain = ARMS["ur10"]()
     rng = np.random.default_rng(3)
