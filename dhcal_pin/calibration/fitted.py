@@ -304,6 +304,15 @@ class FittedModel:
         return self.unit_weight_std**2 > 1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
 
     @cached_property
+    def sigma_ratios(self) -> tuple[float | None, ...]:
+        """Residuals of each measurement over its stated standard deviations; None unless those are too small."""
+        if not all(item.has_stated_sigma for item in self.data) or not self.contradicts_sigma:
+            return (None,) * len(self.data)
+        per_freedom = sum(n_rows for _, _, n_rows in self._row_counts) / self.degrees_of_freedom
+        squares = [residual_of(item, self.chain, self.instruments) ** 2 for item in self.inliers]
+        return tuple(float(np.sqrt(per_freedom * np.mean(each))) if each.size else None for each in squares)
+
+    @cached_property
     def _sigma_scale(self) -> float:
         """Factor to the standard deviations of the whitened rows; NaN if it cannot be determined."""
         # A noise scale from few rows is uncertain itself: ±1.96 of the standard deviations contain 95 % of a

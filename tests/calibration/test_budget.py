@@ -57,6 +57,9 @@ def test_contributions_that_are_not_known_apart_are_named():
     assert rows[3][0] == "model error, with repeatability and instrument"
     total = np.sqrt(3 * (INSTRUMENT**2 + ARM**2 + MODEL**2))
     assert found.combined == pytest.approx(total, rel=0.25)
+    found, comparison = budget(INSTRUMENT, repeats=1)
+    rest = found.table(comparison.title).texts[3][0]
+    assert rest == "model error, with repeatability and noise above that of the instrument"
 
 
 def test_json_has_the_contributions_in_metres():

@@ -239,3 +239,21 @@ def test_sections_of_a_document_on_a_terminal():
     expected = ["Title", "A sentence.", "an item", "", "caption", "name  value", "a      1 mm"]
     assert lines == [*expected, "", "Other", "name", "b"]
     assert Screen([], lambda: pytest.fail("made")).lines("normal") == []
+
+
+@pytest.mark.parametrize(
+    ("stated", "text"), [(0.5, "sigma 0.5 mm"), (0.05, "sigma 0.05 mm, residuals 10 times")]
+)
+def test_residuals_above_the_stated_standard_deviation_are_mentioned(run, robot_folder, stated, text):
+    arm = URDF / "experiment.dh.toml"
+    noise = ("--noise", "0.5mm", "--seed", 1)
+    stdout_of(
+        run("simulate", arm, "--errors", "1mm,0.3deg", "-m", 400, "--kind", "position", *noise, "-o", "d.csv")
+    )
+    file = Path("d.csv")
+    file.write_text(file.read_text().replace(",0.0005", f",{stated / 1e3:.5f}"))
+    _, _, err = run(
+        "calibrate", arm, "d.csv", "-o", "o.urdf", "--parameters", "minimal,base,tool", "--extend", "none"
+    )
+    assert f"d.csv: 400 rows, position, {text}" in unfolded(err)
+    assert ("residuals" in err) == (stated < 0.5)

@@ -72,7 +72,8 @@ class UncertaintyBudget:
         """Return one line per contribution, in mm, for k = 1 and k = 2."""
         rest = "model error"
         if self.repeatability is None:
-            rest += ", with repeatability" + (" and instrument" if self.instrument is None else "")
+            noise = "instrument" if self.instrument is None else "noise above that of the instrument"
+            rest += f", with repeatability and {noise}"
         entries = {
             "instrument": self.instrument,
             "sampling: repeatability of the arm"

@@ -24,6 +24,8 @@ from .screen import Block, Screen, list_first, section_blocks
 
 # Number of corrections that are shown.
 N_CORRECTIONS = 5
+# Residuals this many times as large as the stated standard deviations are mentioned.
+MIN_SIGMA_RATIO = 2.0
 
 _VERDICT_STYLES = {"ok": "green", "caution": "yellow", "refused": "red"}
 
@@ -112,10 +114,13 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
 def _data_lines(outcome: CalibrationOutcome, names: Mapping[str, str]) -> list[str]:
     """Describe each measurement file: rows, kind and standard deviations, and how the rows were used."""
     lines = []
+    ratios = dict(zip(outcome.data.fitted, outcome.fit.sigma_ratios, strict=True))
     for path, n_rows in outcome.data.n_rows.items():
         fitted = [outcome.data.fitted[path]] if path in outcome.data.fitted else []
         held_out = [item for name, item in outcome.data.held_out if name == path]
         facts = [f"{n_rows} rows", *_describe_data([*fitted, *held_out])]
+        if (ratio := ratios.get(path)) and ratio >= MIN_SIGMA_RATIO:
+            facts.append(f"residuals {ratio:.2g} times as large")
         uses = f"; {_describe_use(fitted, held_out)}" if held_out else ""
         lines.append(f"{names[path]}: {', '.join(facts)}{uses}")
     return lines
