@@ -305,7 +305,7 @@ class FittedModel:
 
     @cached_property
     def sigma_ratios(self) -> tuple[float | None, ...]:
-        """Residuals of each measurement over its stated standard deviations; None unless those are too small."""
+        """Residuals of each measurement over its stated sigmas; None unless the sigmas are too small."""
         if not all(item.has_stated_sigma for item in self.data) or not self.contradicts_sigma:
             return (None,) * len(self.data)
         per_freedom = sum(n_rows for _, _, n_rows in self._row_counts) / self.degrees_of_freedom

@@ -154,6 +154,7 @@ def judge(fit: Evidence) -> Verdict:
     if not any(finding.status == "refused" for finding in findings):
         findings += [
             *_mixups(fit.diagnosis),
+            *_wrong_joint_values(fit),
             *_signs(fit),
             *_large_zeros(fit),
             *_board_size(fit),
@@ -162,16 +163,18 @@ def judge(fit: Evidence) -> Verdict:
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
-        # A cause that explains the errors of images explains the correction, too.
+        # A cause that explains the errors of images explains the correction, and a fit that does not converge.
         has_cause = bool(fit.hand_eye and fit.hand_eye.causes)
+        is_explained = has_cause and any(error.status == "refused" for error in errors)
+        is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
         hidden = _hidden_outliers(fit)
         found = [
             *([*errors, *correction] if has_cause else [*correction, *errors]),
             *_session(fit),
             *_contradictions(fit),
-            *_convergence(fit),
+            *([] if is_explained else _convergence(fit)),
             *_hand_eye_images(fit),
-            *(_weak_positions(fit) or _hidden_position_errors(fit)),
+            *([] if is_wrong else _weak_positions(fit) or _hidden_position_errors(fit)),
             *_fitted_holdout(fit),
             *_held_out_errors(fit),
             *_unexplained_holdout(fit),
@@ -374,6 +377,14 @@ def _sufficient_iterations(fit: Evidence) -> int | None:
     return None
 
 
+def _wrong_joint_values(fit: Evidence) -> list[Finding]:
+    """Refuse images whose joint values are wrong, if the arm would need a correction of implausible size."""
+    if not (fit.camera_stages and fit.errors.has_arm):
+        return []
+    is_implausible = measure_correction(fit.errors, fit.chain).ratio > MAX_DISPLACEMENT
+    return _mixups(diagnose_joint_values(fit)) if is_implausible else []
+
+
 def _implausible_correction(fit: Evidence) -> list[Finding]:
     """Refuse corrections that are far larger than manufacturing errors."""
     if not fit.errors.has_arm:
@@ -382,8 +393,7 @@ def _implausible_correction(fit: Evidence) -> list[Finding]:
     if size.ratio <= MAX_USUAL_DISPLACEMENT:
         return []
     status: Status = "refused" if size.ratio > MAX_DISPLACEMENT else "caution"
-    named = _mixups(diagnose_joint_values(fit)) if status == "refused" else []
-    return named or [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
+    return [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
 
 
 def _implausible_errors(fit: Evidence) -> list[Finding]:
