@@ -163,7 +163,7 @@ def judge(fit: Evidence) -> Verdict:
     if not any(finding.status == "refused" for finding in findings):
         # A mistake in the measurements explains all of these.
         correction, errors = _implausible_correction(fit), _implausible_errors(fit) or _hand_eye_error(fit)
-        # A cause that explains the errors of images explains the correction, and a fit that does not converge.
+        # A cause of the errors of images explains the correction, too, and a fit that does not converge.
         has_cause = bool(fit.hand_eye and fit.hand_eye.causes)
         is_explained = has_cause and any(error.status == "refused" for error in errors)
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
