@@ -646,6 +646,8 @@ class _Search:
         sizes = np.array([names[c].prior for c in geometric])
         block = Block("robot", "", np.array(geometric), sizes)
         count = float(np.sum(self.groups >= 0))
+        if count < len(self.layout.model) + len(sizes):
+            return None  # Two robots fit so few samples whatever was measured.
         needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
         for first in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):

@@ -287,6 +287,15 @@ def test_few_samples_are_the_first_reason_of_a_correction_that_is_too_large():
     assert "Check the robot" in second
 
 
+@pytest.mark.parametrize(("n_poses", "seed"), [(9, 901), (10, 2054)])
+def test_fewer_rows_than_the_unknowns_of_two_robots_do_not_show_two(n_poses, seed):
+    simulation = Simulation("ur10", n_poses, seed)
+    data = simulation.measure(Pose)
+    fit = calibrate(simulation.chain, Pose(data.q, data.poses, 5e-5, 1e-4), extend="none")
+    assert fit.session and not fit.session.events
+    assert not fit.verdict.is_refused
+
+
 def test_a_figure_that_is_not_reliable_is_not_ok():
     """Nine poses with stated noise have enough redundancy, but too few to judge the accuracy."""
     simulation = Simulation("ur10", 9, 901)
