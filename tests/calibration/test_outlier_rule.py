@@ -292,7 +292,8 @@ def test_fewer_rows_than_the_unknowns_of_two_robots_do_not_show_two(n_poses, see
     simulation = Simulation("ur10", n_poses, seed)
     data = simulation.measure(Pose)
     fit = calibrate(simulation.chain, Pose(data.q, data.poses, 5e-5, 1e-4), extend="none")
-    assert fit.session and not fit.session.events
+    assert fit.session
+    assert not fit.session.events
     assert not fit.verdict.is_refused
 
 
