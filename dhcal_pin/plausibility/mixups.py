@@ -79,6 +79,8 @@ def diagnose_mixups(
     found = trial.find_pair()
     if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):
         return found
+    if len(items[0].rows) < _N_PARTS * _MIN_SAMPLES_PER_ITEM:
+        return found
     return trial.find_common([_find_alone(chain, part, sets, report) for part in _parts(items[0])])
 
 
