@@ -296,21 +296,30 @@ class FittedModel:
         freedom = self.degrees_of_freedom
         return float(np.sqrt(self.solution.system.cost / freedom)) if freedom else float("nan")
 
+    @cached_property
+    def _squared_residuals(self) -> list[float]:
+        """Weighted sum of the squared residuals of each measurement, in units of its own sigmas."""
+        # Those of the problem are scaled where joint errors were added.
+        residuals = self.problem.residuals(self.solution.x, self.data)
+        return [float(np.sum(r**2 * w)) for r, w in zip(residuals, self.weights, strict=True)]
+
     @property
     def contradicts_sigma(self) -> bool:
         """Whether the residuals are larger than the standard deviations explain, if all are stated."""
-        if not self.degrees_of_freedom:
-            return False
-        return self.unit_weight_std**2 > 1 + CONTRADICTION_SIGMAS * np.sqrt(2 / self.degrees_of_freedom)
+        freedom = self.degrees_of_freedom
+        return bool(freedom) and _exceeds_one(sum(self._squared_residuals) / freedom, freedom)
 
-    @cached_property
+    @property
     def sigma_ratios(self) -> tuple[float | None, ...]:
         """Residuals of each measurement over its stated sigmas; None unless the sigmas are too small."""
         if not all(item.has_stated_sigma for item in self.data) or not self.contradicts_sigma:
             return (None,) * len(self.data)
-        per_freedom = sum(n_rows for _, _, n_rows in self._row_counts) / self.degrees_of_freedom
-        squares = [residual_of(item, self.chain, self.instruments) ** 2 for item in self.inliers]
-        return tuple(float(np.sqrt(per_freedom * np.mean(each))) if each.size else None for each in squares)
+        n_rows = [item.residual_dim * w.sum() for item, w in zip(self.data, self.weights, strict=True)]
+        share = self.degrees_of_freedom / sum(n_rows)
+        return tuple(
+            float(np.sqrt(squares / (share * count))) if count else None
+            for squares, count in zip(self._squared_residuals, n_rows, strict=True)
+        )
 
     @cached_property
     def _sigma_scale(self) -> float:
@@ -318,7 +327,8 @@ class FittedModel:
         # A noise scale from few rows is uncertain itself: ±1.96 of the standard deviations contain 95 % of a
         # t distribution.
         if all(item.has_stated_sigma for item in self.data):
-            if not self.contradicts_sigma:
+            freedom = self.degrees_of_freedom
+            if not freedom or not _exceeds_one(self.unit_weight_std**2, freedom):
                 return 1.0
             return self.unit_weight_std * _student_ratio(self.degrees_of_freedom)
         return self.unit_weight_std * _student_ratio(self.noise_degrees_of_freedom)
@@ -565,6 +575,11 @@ class FittedModel:
 def take_samples(data: Sequence[Measurement], masks: Sequence[Array]) -> list[Measurement]:
     """Take some samples of each measurement; measurements without any are left out."""
     return [item.take(mask) for item, mask in zip(data, masks, strict=True) if mask.any()]
+
+
+def _exceeds_one(variance: float, freedom: float) -> bool:
+    """Return whether the variance of whitened residuals is significantly larger than 1."""
+    return variance > 1 + CONTRADICTION_SIGMAS * np.sqrt(2 / freedom)
 
 
 def _student_ratio(degrees_of_freedom: float) -> float:

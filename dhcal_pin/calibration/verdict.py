@@ -85,7 +85,7 @@ MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 MAX_FITTED_SHARE = 0.1
 # Largest error of the zero of a servo that needs no caution [rad].
 MAX_ZERO = np.deg2rad(40.0)
-# Largest share of outliers of a measurement that needs no caution.
+# Smaller shares of outliers of a measurement need no caution.
 MAX_OUTLIER_SHARE = 0.1
 # Smallest error of a measurement that may contradict others, as a fraction of that of the nominal robot.
 MIN_CONTRADICTION = 1e-3
@@ -667,7 +667,9 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
         return []
     is_stated = all(item.has_stated_sigma for item in fit.data)
     is_known = is_stated and not fit.contradicts_sigma
-    limit = MIN_STATED_ROWS_PER_DIRECTION if is_known else MIN_ROWS_PER_DIRECTION
+    # Joint errors can explain outliers, too.
+    has_families = bool(fit.extension and fit.extension.families)
+    limit = MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
     if fit.rows_per_direction >= limit:
         is_searched = not is_known and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
         hidden = fit.hidden_majority if is_searched else None
@@ -718,7 +720,7 @@ def _outliers(fit: Evidence) -> list[Finding]:
     if is_explained:
         return []
     run = _consecutive_outliers(fit)
-    if n_outliers <= MAX_OUTLIER_SHARE * fit.n_samples:
+    if n_outliers < MAX_OUTLIER_SHARE * fit.n_samples:
         return [Finding("caution", run)] if run else []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
     text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers{_outlying_images(fit)}"

@@ -287,6 +287,29 @@ def test_few_samples_are_the_first_reason_of_a_correction_that_is_too_large():
     assert "Check the robot" in second
 
 
+@pytest.mark.parametrize(("arm", "seed"), [("panda", 7050), ("panda", 7054), ("xarm7", 7171)])
+def test_joint_errors_that_explain_outliers_do_not_hide_them(arm, seed):
+    """Three of 20 positions are wrong by 1.5 mm; joint errors or correlated residuals explain them, too."""
+    simulation = Simulation(arm, 20, seed)
+    data = simulation.measure(Position)
+    wrong = seed % 1000 % 15 + np.arange(3)
+    data = shifted(data, wrong, [1.5e-3 * simulation.direction() for _ in wrong])
+    fit = calibrate(simulation.chain, Position(data.q, data.positions(), 5e-5))
+    assert fit.extension
+    assert fit.extension.families or fit.extension.temperature > 1
+    assert fit.verdict.status == "caution"
+    assert "So few samples do not reveal outliers" in fit.verdict.reasons[0]
+
+
+def test_few_samples_of_which_a_tenth_are_outliers_need_caution():
+    simulation = Simulation("ur10", 20, 30)
+    data = simulation.measure(Position)
+    data = shifted(data, [4, 11], [0.01 * simulation.direction() for _ in range(2)])
+    fit = calibrate(simulation.chain, Position(data.q, data.positions(), 5e-5))
+    assert fit.n_outliers == 2
+    assert fit.verdict.reasons == ("2 of 20 samples (10 %) are outliers. Check the measurements.",)
+
+
 @pytest.mark.parametrize(("n_poses", "seed"), [(9, 901), (10, 2054)])
 def test_fewer_rows_than_the_unknowns_of_two_robots_do_not_show_two(n_poses, seed):
     simulation = Simulation("ur10", n_poses, seed)
