@@ -13,6 +13,7 @@ from .frames import FRAMES_WARNING as FRAMES_WARNING
 from .frames import fit_frames as fit_frames
 from .frames import frames_differ as frames_differ
 from .input_checks import find_input_warnings as find_input_warnings
+from .input_checks import find_unstated_conditions as find_unstated_conditions
 from .input_checks import find_value_warnings as find_value_warnings
 from .input_checks import poorly_fitted_files as poorly_fitted_files
 from .inspection import ColumnSummary as ColumnSummary

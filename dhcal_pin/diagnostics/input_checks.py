@@ -18,12 +18,13 @@ from ..estimation.initialization import align
 from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, known_conditions
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
+from ..robot.conditions import CONDITIONS
 from ..units import ANGLES, LENGTHS
 from .reachability import reach_sphere
 
@@ -72,6 +73,17 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         # Implausible values explain why measurements do not fit the robot; copied rows do not.
         return values
     return [*_check_fit(chain, file), *repeated]
+
+
+def find_unstated_conditions(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Name the joint errors of a robot whose condition a file does not state."""
+    known = known_conditions([file.data])
+    return [
+        f"the {CONDITIONS[family.condition].description} is not stated, on which the {family.description} "
+        "of the robot depends"
+        for family in chain.error_families
+        if family.condition and family.condition not in known
+    ]
 
 
 def _check_fit(chain: Chain, file: MeasurementFile) -> list[str]:

@@ -41,7 +41,7 @@ from ..estimation.initialization import make_problem
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity
-from ..measurements.base import Measurement, Noise, instrument_values
+from ..measurements.base import Measurement, Noise, instrument_values, residual_of
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from .causes import Block, Cause, Constant
@@ -240,29 +240,57 @@ class _CheckModel:
         return next(block for block in self.layout.blocks if block.kind == kind)
 
     def _root(self, uncertainty: Uncertainty | None) -> Array:
-        """Return the root of the whitened covariance that the calibration leaves, (n, ·)."""
-        if uncertainty is None:
-            return np.zeros((self.is_row.sum(), 1))
+        """Return the root of the whitened covariance of what calibration and samples leave open, (n, ·)."""
+        shared, own = [], []
+        for item in self.data:
+            # Unknown directions, and errors that the model lacks, differ from sample to sample.
+            parts = [self._unknown_directions(item)]
+            if uncertainty is not None:
+                common, model = self._uncertain_rows(item, uncertainty)
+                shared.append(common)
+                parts.append(model)
+            own += list(np.concatenate(parts, 2))
+        return np.concatenate(
+            [*([np.concatenate(shared)] if shared else []), np.asarray(block_diag(*own))], 1
+        )
+
+    def _uncertain_rows(self, item: Measurement, uncertainty: Uncertainty) -> tuple[Array, Array]:
+        """Return the whitened effects of uncertain parameters, (m·k, ·), and of model errors, (m, k, 6)."""
         directions = np.concatenate(
             [uncertainty.sqrt_covariance, UNDETERMINED_SIZE * uncertainty.unbounded_directions], 1
         )
+        frames, m = self.chain.forward_kinematics(item.conditions()), len(item.rows)
+        u = instrument_values(item, self.problem.instruments(self.x))
+        observation = item.observation_matrix(frames, u, item.residual(frames, u))
+
+        def whitened(motions: Array) -> Array:
+            out = np.zeros((len(motions), item.residual_dim, motions.shape[2]))
+            apply_observation_matrix(np.ascontiguousarray(motions), observation, out)
+            return out.transpose(2, 1, 0)
+
+        motions = uncertainty.tool_twists(frames, directions).transpose(2, 1, 0)
         model_std = np.diag(np.repeat(uncertainty.model_std, 3))
-        values, shared, own = self.problem.instruments(self.x), [], []
-        for item in self.data:
-            frames, m = self.chain.forward_kinematics(item.conditions()), len(item.rows)
-            u = instrument_values(item, values)
-            observation = item.observation_matrix(frames, u, item.residual(frames, u))
+        return whitened(motions).reshape(-1, len(motions)), whitened(np.tile(model_std[..., None], m))
 
-            def whitened(motions: Array, item=item, observation=observation) -> Array:
-                out = np.zeros((len(motions), item.residual_dim, motions.shape[2]))
-                apply_observation_matrix(np.ascontiguousarray(motions), observation, out)
-                return out.transpose(2, 1, 0)
+    def _unknown_directions(self, item: Measurement) -> Array:
+        """Return the whitened effects of the backlash of joints whose direction is unknown, (m, k, n)."""
+        if not self.has_backlash:
+            return np.zeros((len(item.rows), item.residual_dim, 0))
+        known = item.recorded or Conditions(item.q)
+        approach = np.zeros(item.q.shape) if known.approach is None else known.approach
 
-            motions = uncertainty.tool_twists(frames, directions).transpose(2, 1, 0)
-            shared.append(whitened(motions).reshape(-1, len(motions)))
-            # Errors that the model lacks differ from sample to sample.
-            own += list(whitened(np.tile(model_std[..., None], m)))
-        return np.concatenate([np.concatenate(shared), np.asarray(block_diag(*own))], 1)
+        def residual(directions: Array) -> Array:
+            other = item.replace(recorded=replace(known, approach=directions))
+            return residual_of(other, self.chain, self.problem.instruments(self.x))
+
+        joints = np.eye(self.chain.n_joints)
+        moved = [residual(np.where(approach == 0, joint, approach)) for joint in joints]
+        return (np.stack(moved, 2) - residual(approach)[..., None]).swapaxes(0, 1)
+
+    @property
+    def has_backlash(self) -> bool:
+        """Whether the positions of the robot depend on the directions in which its joints moved."""
+        return any(family.condition == "approach" for family in self.chain.error_families)
 
     # ------------------------------------------------------------------------------------------- hypotheses
     @cached_property
@@ -327,10 +355,10 @@ class _CheckModel:
         ratios -= _log_means(nothing[:, None])
         return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
 
-    def estimate(self, block: Block) -> tuple[Array, Array, Array]:
+    def estimate(self, block: Block, start: Array | None = None) -> tuple[Array, Array, Array]:
         """Estimate a change; return its coefficients, and columns and residual linearized there."""
-        changes = np.zeros(self.layout.n_columns)
-        rows, sizes = self.rows, block.sizes
+        changes = np.zeros(self.layout.n_columns) if start is None else start
+        rows, sizes = self._linearize(changes), block.sizes
         for _ in range(MAX_ITERATIONS):
             scaled = self._scaled(rows, self.usual_noise)
             a = scaled[:, block.columns] * sizes
@@ -345,6 +373,23 @@ class _CheckModel:
         columns = rows[:, block.columns]
         return values, columns * sizes, rows[:, -1] + columns @ values
 
+    def _estimate_robot(self, robot: Block, parts: Sequence[Block], estimates: Sequence[Any]) -> Any:
+        """Estimate a change of all parts, from nothing and from large changes of base and tool."""
+        found = [self.estimate(robot)]
+        for block, (values, *_) in zip(parts, estimates, strict=True):
+            if block.kind != "joint":
+                start = np.zeros(self.layout.n_columns)
+                start[block.columns] = values
+                found.append(self.estimate(robot, start))
+        return min(found, key=lambda each: self._cost(robot, each))
+
+    def _cost(self, block: Block, estimate: tuple[Array, Array, Array]) -> float:
+        """Return the squared residuals and prior of an estimate."""
+        values, columns, undone = estimate
+        scaled = np.divide(values, block.sizes, out=np.zeros_like(values), where=block.sizes > 0)
+        left = self._scaled((undone - columns @ scaled)[:, None], self.usual_noise)
+        return float(np.sum(left**2) + np.sum((scaled / WIDTHS[-1]) ** 2))
+
     def _advanced(self, changes: Array, block: Block, step: Array) -> Array:
         """Return the changes after a step (c,) of a block."""
         full = np.zeros_like(changes)
@@ -358,7 +403,9 @@ class _CheckModel:
     def judged(self) -> tuple[list[Hypothesis], float, float]:
         """Return all hypotheses, the most likely one first, the log ratio for any change, and its limit."""
         blocks, count = self.blocks, self.numbers[-1] + 1
-        estimates = [self.estimate(block) for block in blocks]
+        *parts, robot = blocks
+        estimates = [self.estimate(block) for block in parts]
+        estimates.append(self._estimate_robot(robot, parts, estimates))
         samples = [np.eye(len(self.numbers))[:, self.numbers == i] / self._sigma[i] for i in range(count)]
         priors = [ROBOT_PRIOR if block.kind == "robot" else 1.0 for block in blocks] + [1 / count] * count
         log_priors = np.log(np.array(priors) / np.sum(priors))

@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 
-from dhcal_pin import Result, calibrate
+from dhcal_pin import Result, calibrate, select_parameters
 from dhcal_pin.cli.main import main
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_urdf
@@ -210,6 +210,57 @@ def test_command(tmp_path: Path, capsys):
     (tmp_path / "cal.calibration.toml").unlink()
     assert main(args) == 2
     assert "no sidecar" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arm", ["ur10", "panda"])
+def test_a_new_base_does_not_hide_a_changed_zero(arm):
+    """The instrument was set up anew, and the zero of a joint is off by 5 mrad."""
+    sim, fit, q = calibrated(arm, 7, Position)
+    new = pin.SE3(pin.exp3(np.array([0.4, -0.8, 0.5])), np.array([0.6, -0.7, 0.3]))
+    for joint in range(1, 4):
+        zeros = 5e-3 * np.eye(sim.chain.n_joints)[joint]
+        data = measured(sim, q, Position, True, base=new, zeros=zeros)
+        result = recheck(fit.chain, [data], fit.uncertainty)
+        assert (result.verdict, result.what) == ("changed", "robot"), joint
+    result = recheck(fit.chain, [measured(sim, q, Position, True, base=new)], fit.uncertainty)
+    assert result.what == "base"
+
+
+@pytest.mark.parametrize("n_known", [0, 9, 10])
+def test_backlash_counts_as_uncertainty_where_directions_are_unknown(n_known):
+    """An arm whose directions of motion are known in all ten samples, in all but the first, or in none."""
+    sim, fit, q = calibrated("ur10", 7, Position)
+    sizes = 6e-4 * np.isin(np.arange(6), [1, 2, 3])
+    backlash = select_parameters(fit.chain, "backlash").at(sizes)
+    directions = sim.rng.choice([-1.0, 1.0], q.shape)
+    shift = -0.5 * sizes * directions
+    data = measured(sim, q + shift, Position, True).resample(q)
+    if n_known:
+        data = data.with_conditions(approach=np.where(np.arange(10)[:, None] < 10 - n_known, 0, directions))
+    found = recheck(backlash, [data], fit.uncertainty)
+    assert found.verdict == "ok"
+    assert found.residual_rms < 2 * found.expected_rms
+    changed_zero = recheck(backlash, [data.resample(q + 5e-3 * np.eye(6)[2])], fit.uncertainty)
+    assert changed_zero.verdict == "changed"
+
+
+def test_mistakes_in_files_are_named_beside_the_answer(tmp_path: Path, capsys):
+    sim, fit, q = calibrated("ur10", 7, Position)
+    robot, file = tmp_path / "cal.urdf", tmp_path / "check.csv"
+    write_urdf(fit, robot)
+    text = measurement_text(measured(sim, q, Position, True), fit.chain, [])
+    args = ["recheck", str(robot), str(file), "--tip"]
+    file.write_text(text)
+    assert main([*args, "ee_link"]) == 2
+    assert "tip ee_link; expected --tip tool0" in capsys.readouterr().err
+    file.write_text(measurement_text(fit.data[0], fit.chain, []))
+    assert main([*args, "tool0", "--json", "-"]) == 0
+    assert "60 of 60 rows were fitted" in json.loads(capsys.readouterr().out)["warnings"][0]
+    assert "x[m],y[m],z[m]" in text
+    file.write_text(text.replace("x[m],y[m],z[m]", "y[m],x[m],z[m]"))
+    assert main([*args, "tool0", "--json", "-"]) == 1
+    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
+    assert "The measuring frame is mirrored" in warning
 
 
 @pytest.mark.parametrize("kind", [Position, Pose])

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from ... import io, report, session
+from ... import diagnostics, io, report, session
 from ...exceptions import InvalidArgumentError
 from .. import options, screens
 from ..output_table import Makers, Output
+from .validate import fitted_warning
+
+if TYPE_CHECKING:
+    from ...robot import Chain
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
@@ -64,6 +69,10 @@ def run(args: Namespace) -> int:
             f"{args.robot}: no sidecar; expected a calibrated robot, which `dhcal calibrate` writes with its "
             "NAME.calibration.toml"
         )
+    if (tip := io.read_tip(sidecar) or chain.tip) != chain.tip:
+        raise InvalidArgumentError(
+            f"{args.robot}: tip {chain.tip}; expected --tip {tip}, on which the tool of {sidecar} is"
+        )
     servos = io.read_servos(args.servos) if args.servos else None
     for path in args.data:
         if has_image_coordinates(path, chain, args.columns, servos, args.sheet):
@@ -76,8 +85,15 @@ def run(args: Namespace) -> int:
     result = session.recheck(
         chain, data, io.read_uncertainty(sidecar, chain), known=known, noise=noise, size=size
     )
+    warnings = _warnings(chain, files, result, io.read_fitted(sidecar))
+    notes = [
+        f"{file.source}: {text}"
+        for file in files
+        for text in (*file.notes, *diagnostics.find_unstated_conditions(chain, file))
+    ]
     now = Check.of(result, args.robot, args.data)
     document: dict[str, Any] = result.to_dict() | {
+        "warnings": [*notes, *(f"{path}: {text}" for path, texts in warnings.items() for text in texts)],
         "time": now.time,
         "robot": args.robot,
         "files": paths_by_name(outputs),
@@ -90,6 +106,18 @@ def run(args: Namespace) -> int:
     }
     contents = file_contents(outputs, makers)
     write_outputs(contents, args.json, document)
-    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
-    screens.show(screens.recheck_screen(result, notes, contents), args.verbosity)
+    screens.show(screens.recheck_screen(result, notes, warnings, contents), args.verbosity)
     return STATUS[result.verdict]
+
+
+def _warnings(
+    chain: Chain, files: Sequence[io.MeasurementFile], result: session.Recheck, fitted: io.Fitted
+) -> dict[str, list[str]]:
+    """List the mistakes in each file that look like a change, and the rows that the calibration fitted."""
+    digests = report.file_digests([file.source for file in files])
+    warnings = {}
+    for file in files:
+        mistakes = [] if result.verdict == "ok" else diagnostics.find_input_warnings(chain, file)
+        fitted_rows = fitted_warning(file.data, digests.get(file.source, ""), fitted)
+        warnings[file.source] = [*mistakes, *fitted_rows]
+    return warnings

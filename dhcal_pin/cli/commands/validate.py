@@ -108,7 +108,11 @@ def run(args: Namespace) -> int:
         points = [file.iso_points for file in given.files]
         characteristics = iso9283.pose_characteristics(judged.chain, data, points, judged.known)
     warnings = _input_warnings(args, given, judged, sidecar)
-    notes = [f"{file.source}: {text}" for file in given.files for text in file.notes]
+    notes = [
+        f"{file.source}: {text}"
+        for file in given.files
+        for text in (*file.notes, *diagnostics.find_unstated_conditions(given.chain, file))
+    ]
     extrapolation = given.region and diagnostics.find_extrapolation(
         given.region, judged.chain, data, judged.known
     )
@@ -318,7 +322,7 @@ def _input_warnings(
         warnings[file.source] = [
             *diagnostics.find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
-            *_fitted_warning(file.data, digests.get(file.source, ""), fitted),
+            *fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
     if (tip := given.calibrated_tip) != given.chain.tip:
         warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
@@ -327,7 +331,7 @@ def _input_warnings(
     return warnings
 
 
-def _fitted_warning(item: Measurement, digest: str, fitted: io.Fitted) -> list[str]:
+def fitted_warning(item: Measurement, digest: str, fitted: io.Fitted) -> list[str]:
     """Return a warning about a file with rows that the calibration fitted."""
     from ...io.measurement_files.fitted_rows import count_fitted_rows  # lazy import: loads Pinocchio
 

@@ -357,7 +357,9 @@ MIN_SHOWN_SHARE = 0.01
 VERDICT_STYLES = {"ok": "green", "changed": "red", "cannot say": "yellow"}
 
 
-def recheck_screen(result: Recheck, notes: Sequence[str], files: Iterable[object]) -> Screen:
+def recheck_screen(
+    result: Recheck, notes: Sequence[str], warnings: Mapping[str, Sequence[str]], files: Iterable[object]
+) -> Screen:
     """Describe whether a robot is still calibrated."""
     rows = [
         [
@@ -382,6 +384,7 @@ def recheck_screen(result: Recheck, notes: Sequence[str], files: Iterable[object
             ),
             Block([residual]),
             notes_block(notes),
+            warnings_block(warnings),
             files_block(files),
             Block(
                 [f"{result.verdict}: {result.reasons[0]}", *result.reasons[1:]],
