@@ -40,7 +40,6 @@ from ..robot.dh import CONVENTIONS, Convention, DHTable
 from ..units import ANGLES, LENGTHS
 from . import toml_table as toml
 from .robot_format import ConvertedRobot, RobotSource
-from .sidecar import existing_sidecar
 from .tables import Column, DataTable, TextLayout, read_table
 from .tabular import csv_text, parse_number, require_usable_names
 from .toml_table import Key, TomlTable
@@ -305,6 +304,4 @@ def convert_to_dh(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     if robot.table is not None and robot.convention in (None, robot.table.convention):
         return ConvertedRobot(dh_text(robot.table, path))
     extraction = extract_dh_table(robot.chain, robot.convention or "standard")
-    sidecar = existing_sidecar(robot.path)
-    notes = [f"base, tool and joints in {sidecar} do not go to the table"] if sidecar else []
-    return ConvertedRobot(dh_text(extraction.table, path), [*extraction.notes, *notes])
+    return ConvertedRobot(dh_text(extraction.table, path), extraction.notes)

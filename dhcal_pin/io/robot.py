@@ -70,9 +70,7 @@ def _mjcf_needs_template(robot: RobotSource, path: PathLike) -> ConvertedRobot:
 
 def _copy(source: PathLike, target: PathLike, urdf: Urdf) -> ConvertedRobot:
     """Copy a URDF or an MJCF, or translate an MJCF to a URDF; no single deepest tip is needed."""
-    notes = _notes_beside(target)
-    if sidecar := existing_sidecar(source):
-        notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
+    notes = [*_notes_beside(target), *_notes_on_sidecar(source)]
     if not is_mjcf_path(target):
         if isinstance(urdf, Mjcf):
             notes.append(
@@ -88,6 +86,12 @@ def _notes_beside(path: PathLike) -> list[str]:
     """Note a sidecar beside a URDF that is to be written."""
     sidecar = existing_sidecar(path)
     return [f"{sidecar} lies beside it and is read with it"] if sidecar else []
+
+
+def _notes_on_sidecar(source: PathLike) -> list[str]:
+    """Note the sidecar of a robot that is written to another file."""
+    sidecar = existing_sidecar(source)
+    return [f"{sidecar} is not copied; it holds base, tool and joint errors"] if sidecar else []
 
 
 # The formats that robots are read from and written to. An ending selects its row; the longest one wins.
@@ -241,7 +245,9 @@ def convert_robot(
     elif template is not None:
         raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
     chain, table = _read(source, tip, None)
-    return robot_format.convert(RobotSource(os.fspath(source), chain.urdf_alone, table, convention), target)
+    robot = RobotSource(os.fspath(source), chain.urdf_alone, table, convention)
+    converted = robot_format.convert(robot, target)
+    return ConvertedRobot(converted.text, [*converted.notes, *_notes_on_sidecar(source)])
 
 
 def _with_template(
@@ -279,9 +285,7 @@ def _with_template(
             "off; choose a --template-tip behind a fixed joint, or a site"
         )
     require_agreement(parsed, nominal_chain, target)
-    if sidecar := existing_sidecar(source):
-        notes.append(f"{sidecar} is not copied; it holds base, tool and joint errors")
-    return ConvertedRobot(data.decode(), notes)
+    return ConvertedRobot(data.decode(), [*notes, *_notes_on_sidecar(source)])
 
 
 def _random_positions(n_joints: int) -> Array:

@@ -22,6 +22,8 @@ from .timeline import Place, Timeline
 MIN_ANGLE_RATIO = 10.0
 # Largest change of a scale that is stated and can be undone: beyond it another mistake imitates a scale.
 MAX_SCALE_CHANGE = 0.5
+# Larger scales of all axes are those of another robot.
+MAX_INSTRUMENT_SCALE = 0.1
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,8 @@ class Scale:
         """What to do."""
         if self.axis:
             return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
+        if abs(self.factor - 1) > MAX_INSTRUMENT_SCALE:
+            return "No instrument is so wrong: the robot file is probably that of a robot of another size."
         key = f"--mend scale:{self.factor:.6g}"
         mends = " ".join(f"{key}@{file}" for file in self.files) or key
         return (

@@ -60,7 +60,9 @@ def test_convert_copies_a_robot_by_name(run, tmp_path, monkeypatch):
     # A robot with many tips, and a sidecar that a copy leaves behind.
     stdout_of(run("convert", "example:pr2", "pr2.urdf"))
     Path("ur10.calibration.toml").write_text("[base]\nxyz_m = [1.0, 0.0, 0.0]\n")
-    assert "note: ur10.calibration.toml is not copied" in run("convert", "ur10.urdf", "two.urdf")[2]
+    for target in ("two.urdf", "two.dh.toml", "two.origins.csv", "two.yaml"):
+        command = ("convert", "ur10.urdf", target, *(() if target == "two.urdf" else ("--tip", "tool0")))
+        assert "note: ur10.calibration.toml is not copied" in run(*command)[2]
     status, _, err = run("convert", "ur10.urdf", "three.urdf", "--convention", "modified")
     assert (status, "no DH convention" in err, Path("three.urdf").exists()) == (2, True, False)
 

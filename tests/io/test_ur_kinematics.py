@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,15 @@ from robots import DATA, paper, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
-from dhcal_pin.exceptions import DhcalError
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.io import dh_text, read_robot
 from dhcal_pin.io.makers.ur_kinematics import (
+    convert_to_ur_kinematics,
     read_ur_kinematics,
     ur_kinematics,
     ur_kinematics_text,
 )
+from dhcal_pin.io.robot_format import RobotSource
 from dhcal_pin.io.tabular import yaml_number
 from dhcal_pin.robot import Chain, DHTable
 
@@ -188,3 +191,25 @@ def test_convert_writes_and_reads_ur_kinematics(tmp_path):
     assert main(["convert", yaml_file, urdf]) == 0
     q = np.random.default_rng(1).uniform(-2, 2, (30, 6))
     np.testing.assert_allclose(read_robot(urdf).poses(q), ur10(factory()).poses(q), atol=1e-9)
+
+
+@pytest.mark.parametrize(("offset", "is_held"), [(5e-5, True), (1e-3, False)])
+def test_small_offsets_of_the_tip_from_the_last_axis_are_left_out(tmp_path, offset, is_held):
+    """A URDF whose joint errors are in its sidecar has small offsets, which the file cannot hold."""
+    chain = Chain.from_dh(ur10(factory()))
+    motion = se3.exp6(np.array([offset, 0, 0, 0, offset, 0]))
+    moved = replace(chain, origins=np.concatenate([chain.origins[:-1], [chain.origins[-1] @ motion]]))
+    robot = RobotSource("arm.urdf", moved, None, None)
+    if not is_held:
+        with pytest.raises(InvalidArgumentError, match="end on the axis of wrist_3"):
+            convert_to_ur_kinematics(robot, tmp_path / "k.yaml")
+        return
+    converted = convert_to_ur_kinematics(robot, tmp_path / "k.yaml")
+    assert converted.notes == [
+        "the offset of the tip from the axis of wrist_3, 0.05 mm and 0.05 mrad, is left out"
+    ]
+    path = tmp_path / "k.yaml"
+    path.write_text(converted.text)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
+    difference = read_ur_kinematics(path).poses(q) - moved.poses(q)
+    assert 0.5 * offset < np.abs(difference).max() <= 1.01 * offset

@@ -688,6 +688,10 @@ def test_a_scale_is_stated_in_percent():
     assert Scale(0.985, 1e-4, "", ("a.csv", "b.csv")).consequence.endswith(
         "add --mend scale:0.985@a.csv --mend scale:0.985@b.csv."
     )
+    # A UR10 measured with the model of a UR5: undoing the scale would make both wrong.
+    assert Scale(1.448, 1e-3, "").consequence == (
+        "No instrument is so wrong: the robot file is probably that of a robot of another size."
+    )
 
 
 @pytest.mark.parametrize("n_outliers", [0, 6])

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from ... import se3
-from ..._typing import PathLike
+from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError, InvalidArgumentError
 from ...messages import quote
 from ...robot.chain import Chain, extract_dh_table
@@ -36,8 +36,9 @@ UR_JOINTS = {
     "wrist_2_joint": "wrist_2",
     "wrist_3_joint": "wrist_3",
 }
-# Largest distance of the tip from the axis of the last joint [m or rad, entries of a pose].
-_MAX_TIP_ERROR = 1e-9
+# Largest offset of the tip from the axis of the last joint that is left out, and the largest one that is a
+# rounding error [m or rad, entries of a pose].
+_MAX_TIP_OFFSET, _MAX_TIP_ERROR = 2e-4, 1e-9
 # Largest size of a file [byte]; PyYAML reads about 100 kB per second.
 _MAX_BYTES = 1 << 17
 # Number of hexadecimal digits of the hash.
@@ -56,20 +57,26 @@ def ur_kinematics(chain: Chain) -> dict[str, dict[str, float]]:
         )
     table = extract_dh_table(chain, "modified").table
     origins = table.origins()
-    # Rotation about and shift along the last axis, which the last origin takes up.
-    angle = np.arctan2(table.tool[1, 0], table.tool[0, 0])
-    along_axis = se3.transform(se3.exp3([0.0, 0.0, angle]), [0.0, 0.0, table.tool[2, 3]])
-    tip_error = np.abs(se3.inverse(along_axis) @ table.tool - np.eye(4)).max()
-    if tip_error > _MAX_TIP_ERROR:
+    along_axis, offset = _split_tip(table)
+    tip_error = np.abs(offset - np.eye(4)).max()
+    if tip_error > _MAX_TIP_OFFSET:
         raise InvalidArgumentError(
             f"UR's kinematics end on the axis of wrist_3, and the tip {chain.tip!r} is {tip_error:.2g} off; "
             "choose --tip tool0 or flange, and calibrate with tool rather than with the last row"
         )
+    # The last origin takes up the motion along the last axis.
     origins[-2] = origins[-2] @ along_axis
     return {
         name: dict(zip(ORIGIN_KEYS, se3.to_xyz_rpy(origin), strict=True))
         for name, origin in zip(UR_JOINTS.values(), origins[:-1], strict=True)
     }
+
+
+def _split_tip(table: DHTable) -> tuple[Array, Array]:
+    """Split the pose of the tip into a motion along and about the last axis, and the offset from that."""
+    angle = np.arctan2(table.tool[1, 0], table.tool[0, 0])
+    along_axis = se3.transform(se3.exp3([0.0, 0.0, angle]), [0.0, 0.0, table.tool[2, 3]])
+    return along_axis, se3.inverse(along_axis) @ table.tool
 
 
 def ur_kinematics_text(chain: Chain) -> str:
@@ -125,4 +132,12 @@ def _origin_number(value: Any, where: str) -> float:
 
 def convert_to_ur_kinematics(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     """Convert a robot to a UR kinematics file."""
-    return ConvertedRobot(ur_kinematics_text(robot.chain))
+    text = ur_kinematics_text(robot.chain)
+    offset = se3.log6(_split_tip(extract_dh_table(robot.chain, "modified").table)[1])
+    if np.abs(offset).max() <= _MAX_TIP_ERROR:
+        return ConvertedRobot(text)
+    length, angle = (1e3 * float(np.linalg.norm(part)) for part in np.split(offset, 2))
+    note = (
+        f"the offset of the tip from the axis of wrist_3, {length:.2g} mm and {angle:.2g} mrad, is left out"
+    )
+    return ConvertedRobot(text, [note])
