@@ -250,6 +250,9 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
                 f"{second.source}: another robot: its {name}: {values[1]}; expected those of {first.source}: "
                 f"{values[0]}"
             )
+    if first.uncertainty is None and second.uncertainty is not None:
+        # The measured point, which a nominal robot does not state.
+        a = replace(a, tool=b.tool)
     everywhere = draw_joint_space(a)
     q_all, q_region = everywhere[:N_COMPARED], _common_region(first, second)
     lever = se3.rms_radius(a.poses(q_all)[:, :3, 3]) or 1.0

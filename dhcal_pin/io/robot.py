@@ -245,7 +245,7 @@ def convert_robot(
     elif template is not None:
         raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
     chain, table = _read(source, tip, None)
-    robot = RobotSource(os.fspath(source), chain.urdf_alone, table, convention)
+    robot = RobotSource(chain.urdf_alone, table, convention)
     converted = robot_format.convert(robot, target)
     return ConvertedRobot(converted.text, [*converted.notes, *_notes_on_sidecar(source)])
 

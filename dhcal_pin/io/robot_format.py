@@ -22,7 +22,6 @@ from ..robot.urdf import Urdf
 class RobotSource:
     """Robot that is to be written in another format."""
 
-    path: str  #: File that the robot was read from.
     chain: Chain  #: The robot with base, tool and joint errors from its sidecar.
     table: DHTable | None  #: DH table of the file; None if the format holds none.
     convention: Convention | None  #: Convention requested for a DH table; None if any will do.

@@ -78,7 +78,12 @@ def test_a_calibrated_robot_differs_from_the_nominal_one(arm):
     found = compare(Calibrated(sim.chain), fit)
     assert found.verdict == "different"
     assert found.everywhere.expected is not None
-    assert found.everywhere.expected < 5 * NOISE < STATISTICS["rms"](found.everywhere.position)
+    rms = STATISTICS["rms"](found.everywhere.position)
+    assert found.everywhere.expected < 5 * NOISE < rms
+    # The measured point is compared in both orders.
+    exchanged = compare(fit, Calibrated(sim.chain)).everywhere
+    assert STATISTICS["rms"](exchanged.position) == pytest.approx(rms, rel=0.01)
+    assert exchanged.expected == pytest.approx(found.everywhere.expected, rel=0.01)
 
 
 # Reduced chi-square of robots that the model describes.

@@ -199,7 +199,7 @@ def test_small_offsets_of_the_tip_from_the_last_axis_are_left_out(tmp_path, offs
     chain = Chain.from_dh(ur10(factory()))
     motion = se3.exp6(np.array([offset, 0, 0, 0, offset, 0]))
     moved = replace(chain, origins=np.concatenate([chain.origins[:-1], [chain.origins[-1] @ motion]]))
-    robot = RobotSource("arm.urdf", moved, None, None)
+    robot = RobotSource(moved, None, None)
     if not is_held:
         with pytest.raises(InvalidArgumentError, match="end on the axis of wrist_3"):
             convert_to_ur_kinematics(robot, tmp_path / "k.yaml")
