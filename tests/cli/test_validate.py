@@ -121,6 +121,13 @@ def test_nominal_and_calibrated_robot_side_by_side(run, robot_folder):
     assert document["after"]["position_rms_m"] > 1
     assert "the frames (base, tool) differ: run again with --fit-frames" in err
     assert any("--fit-frames" in text for text in document["warnings"])
+    assert "exchange them" not in err
+    status, _, err = run("validate", "arm.dh.toml", "new.csv", "--nominal", "out.urdf", "--fit-frames")
+    assert status == 0
+    assert (
+        "out.calibration.toml is that of a calibrated robot, and arm.dh.toml has none: exchange"
+        in unfolded(err)
+    )
 
 
 def test_frames_of_the_nominal_robot_are_fitted_if_those_of_the_calibrated_one_were(run, robot_folder):

@@ -324,6 +324,10 @@ def _input_warnings(
             *(f"line {item.row}: {item.reason}" for item in unreachable),
             *fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
+    if args.nominal and not sidecar and (other := io.existing_sidecar(args.nominal)):
+        warnings[args.nominal] = [
+            f"{other} is that of a calibrated robot, and {args.robot} has none: exchange them"
+        ]
     if (tip := given.calibrated_tip) != given.chain.tip:
         warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
     elif not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
