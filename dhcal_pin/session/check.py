@@ -356,9 +356,9 @@ class _CheckModel:
         return float(np.quantile(_log_sums(ratios + log_priors[:, None]), 1 - MAX_FALSE_ALARMS))
 
     def estimate(self, block: Block, start: Array | None = None) -> tuple[Array, Array, Array]:
-        """Estimate a change; return its coefficients, and columns and residual linearized there."""
+        """Estimate a change, from zero or a start (p,); return coefficients, columns and residual there."""
         changes = np.zeros(self.layout.n_columns) if start is None else start
-        rows, sizes = self._linearize(changes), block.sizes
+        rows, sizes = self.rows if start is None else self._linearize(start), block.sizes
         for _ in range(MAX_ITERATIONS):
             scaled = self._scaled(rows, self.usual_noise)
             a = scaled[:, block.columns] * sizes
@@ -373,7 +373,9 @@ class _CheckModel:
         columns = rows[:, block.columns]
         return values, columns * sizes, rows[:, -1] + columns @ values
 
-    def _estimate_robot(self, robot: Block, parts: Sequence[Block], estimates: Sequence[Any]) -> Any:
+    def _estimate_robot(
+        self, robot: Block, parts: Sequence[Block], estimates: Sequence[tuple[Array, Array, Array]]
+    ) -> tuple[Array, Array, Array]:
         """Estimate a change of all parts, from nothing and from large changes of base and tool."""
         found = [self.estimate(robot)]
         for block, (values, *_) in zip(parts, estimates, strict=True):

@@ -39,8 +39,8 @@ from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_files, mesh_r
 GRID = 8000
 # Coarser grids, which are tried one after the other for meshes that are simplified.
 COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)
-# Of the trees of bounding volumes that Coal builds for each mesh, these take the least time of those whose
-# meshes have vertices in Python. The trees are not used.
+# Coal builds a tree of bounding volumes for each mesh, which is not used here. This type takes the least time
+# among those whose meshes have vertices in Python.
 _MESH_LOADER = coal.MeshLoader(coal.BV_OBB)
 # Largest number of missing meshes that a note names.
 MAX_NAMED = 3
