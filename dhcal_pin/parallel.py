@@ -1,4 +1,4 @@
-"""Executors for independent tasks: this process, local processes, or a Dask cluster.
+"""Executors for independent tasks: this process, local processes, or a Dask cluster; threads of BLAS.
 
 The order of the results is the order of the tasks for every executor, so that sums over results do not
 depend on the executor and neither does any digit of a calibration.
@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from .exceptions import InvalidArgumentError
@@ -21,12 +22,35 @@ from .exceptions import InvalidArgumentError
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from threadpoolctl import ThreadpoolController
+
 _Task = TypeVar("_Task")
 _Output = TypeVar("_Output")
 # Seconds that a worker without its parent may take to save files.
 _SAVING_TIMEOUT_S = 60
 # Seconds to wait for a Dask scheduler.
 _CONNECT_TIMEOUT_S = 3
+# Environment variables that set the number of threads of BLAS.
+BLAS_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread, unless the environment sets the number of its threads."""
+    # The matrices are small: further threads mostly wait, and a calibration takes twice as long.
+    if any(name in os.environ for name in BLAS_VARIABLES):
+        yield
+    else:
+        with _blas_libraries().limit(limits=1):
+            yield
+
+
+@cache
+def _blas_libraries() -> ThreadpoolController:
+    """Find the BLAS libraries of NumPy and SciPy in this process."""
+    from threadpoolctl import ThreadpoolController  # lazy import: not needed by the command line
+
+    return ThreadpoolController().select(user_api="blas")
 
 
 @dataclass(frozen=True)

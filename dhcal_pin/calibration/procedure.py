@@ -50,7 +50,7 @@ from ..formatting import join_names
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..measurements.camera import with_shown_entries
-from ..parallel import SERIAL, TaskExecutor
+from ..parallel import SERIAL, TaskExecutor, one_blas_thread
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import has_enough_rows
@@ -87,6 +87,7 @@ AUTO = robust.LOSSES["auto"].stages
 SessionOption = Literal["auto", "unordered", "off"]
 
 
+@one_blas_thread()
 def calibrate(
     chain: Chain,
     data: Measurement | Sequence[Measurement],

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 from ..exceptions import DhcalError
 from ..messages import message_line
+from ..parallel import BLAS_VARIABLES
 from .options import VERBOSITY_OPTIONS, CommandParser, HelpFormatter, add_options
 
 # Commands with their help. A word on the command line is the name of a module of `cli.commands`.
@@ -160,7 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 outputs.forget_written_files()
             args = build_parser().parse_args(argv)
             # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
-            for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            for name in BLAS_VARIABLES:
                 os.environ.setdefault(name, "1")
             return args.run(args)
     except (Exception, KeyboardInterrupt) as error:

@@ -75,12 +75,12 @@ def _check_kernels() -> InstallationCheck:
 
 def _check_blas() -> InstallationCheck:
     blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
-    threads = os.environ.get("OMP_NUM_THREADS", "")
+    threads = os.environ.get("OMP_NUM_THREADS", "1")
     text = f"{blas['name']} {blas['version']}, {os.cpu_count()} processors"
     if threads == "1":
         return InstallationCheck("BLAS", "ok", f"{text}, one thread")
-    limit = f"OMP_NUM_THREADS={threads}" if threads else "no limit of threads"
-    return InstallationCheck("BLAS", "note", f"{text}, {limit}; one thread is fastest: OMP_NUM_THREADS=1")
+    text = f"{text}, OMP_NUM_THREADS={threads}"
+    return InstallationCheck("BLAS", "note", f"{text}; one thread is fastest: OMP_NUM_THREADS=1")
 
 
 def _check_browser() -> InstallationCheck:
