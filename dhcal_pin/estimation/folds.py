@@ -60,6 +60,7 @@ class FoldSystems:
     fitted: TriangularSystem  # System of the fitted rows
     held_out: TriangularSystem  # System of the held-out rows
     n_rows: int  # Number of held-out rows
+    whole: NormalEquations | None = None  # Normal equations of both, where both are given by theirs
 
     @property
     def is_unobserved(self) -> Array:
@@ -82,10 +83,11 @@ class FoldSystems:
         known = columns & ~self.is_unobserved
         if not known.any():
             return 0.0
+        if known.all() and self.whole is not None:
+            assert isinstance(self.fitted, NormalEquations)
+            return float(np.sqrt(self.whole.variance_of_others(self.fitted, weights) / self.n_rows))
         root, unbounded = self.fitted.select(known).sqrt_covariance(weights[known])
         own = self._own_unknowns(columns)
-        if known.all() and not unbounded.size:
-            return float(np.sqrt(self.held_out.predicted_variance(root) / self.n_rows))
         rows = self.held_out.r[:, known]
         rows = rows - own @ (own.T @ rows) if own.size else rows
         if np.linalg.norm(rows @ unbounded) > _UNBOUNDED_TOL * np.linalg.norm(rows):
@@ -131,12 +133,12 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Itera
         # The last label is that of samples in no fold.
         labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
         equations = normal_equations_by_part(problem, x, labels)
-        total = reduce(np.add, (one.products for one in equations))
+        whole = NormalEquations(reduce(np.add, (one.products for one in equations)))
         for fold, one in zip(folds, equations, strict=False):
             n_rows = sum(
                 item.residual_dim * int(mask.sum()) for item, mask in zip(problem.data, fold, strict=True)
             )
-            yield FoldSystems(NormalEquations(total - one.products), one, n_rows)
+            yield FoldSystems(NormalEquations(whole.products - one.products), one, n_rows, whole)
         return
     rest = tuple(~np.any(masks, 0) for masks in zip(*folds, strict=True))
     parts = [

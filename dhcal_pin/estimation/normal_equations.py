@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from .._typing import Array
-from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors
+from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors, sum_of_squares
 from .solver_rules import EPS_MODEL
 
 # Added to the diagonal of a matrix of unit diagonal that rounding errors make indefinite, and the smallest
@@ -29,7 +29,7 @@ from .solver_rules import EPS_MODEL
 _DIAGONAL_SHIFT = _MIN_PIVOT = 1e-12
 # Attributes of normal equations that do not depend on the residuals.
 _OF_JACOBIAN = ("_decomposition", "_inverse_root")
-# Half the size of a triangular matrix below which LAPACK inverts it.
+# Half the size of a triangular matrix below which BLAS divides by it at once.
 _SMALL = 100
 # Largest number of refinements of a step, the relative change that ends them, and the largest ratio of two
 # successive changes with which they go on.
@@ -122,8 +122,7 @@ class NormalEquations(TriangularSystem):
         """Compute a root of the covariance of data and priors; positive weights determine all directions."""
         root, scale = self._decompose(weights)
         if "_inverse_root" not in vars(self):
-            vars(self)["_inverse_root"] = _inverse(root)
-            vars(self)["_inverse_root"] *= 1 / scale[:, None]
+            vars(self)["_inverse_root"] = _quotient(np.diag(1 / scale).T, root)
         return vars(self)["_inverse_root"], np.empty((len(weights), 0))
 
     def covariance(self, weights: Array) -> Array:
@@ -169,6 +168,13 @@ class NormalEquations(TriangularSystem):
         # The products are symmetric. Both arrays are then read in the order of memory.
         products = self.products[:-1, :-1].T
         return 2 * float(np.einsum("ij,ij->", products, upper)) - float(np.diag(products) @ np.diag(upper))
+
+    def variance_of_others(self, part: NormalEquations, weights: Array) -> float:
+        """Compute the variance of all rows but those of a part that a fit of the part with priors causes."""
+        # With A = P + W² of this system and B of the part, it is trace(B⁻¹·(A - B)) = ‖S·R⁻¹‖² - p for the
+        # decompositions A = SᵀS and B = RᵀR.
+        (upper, scale), (root, part_scale) = self._decompose(weights), part._decompose(weights)
+        return sum_of_squares(_quotient(upper * (scale / part_scale), root).T) - len(root)
 
 
 class DeterminedSystem(TriangularSystem):
@@ -258,13 +264,16 @@ class DeterminedSystem(TriangularSystem):
         return lapack.dtrtrs(root, self.z)[0] / scale
 
 
-def _inverse(root: Array) -> Array:
-    """Invert an upper triangular matrix in the order of Fortran. Products of parts are faster than LAPACK."""
+def _quotient(upper: Array, root: Array) -> Array:
+    """Compute upper·root⁻¹ of upper triangular matrices in the order of Fortran."""
+    # Products of parts are faster than LAPACK, which does not use that the first matrix is triangular.
     half = len(root) // 2
     if half < _SMALL:
-        return lapack.dtrtri(root)[0]
+        return blas.dtrsm(1.0, root, upper, side=1)
+    first, last = slice(None, half), slice(half, None)
     out = np.zeros_like(root)
-    out[:half, :half], out[half:, half:] = _inverse(root[:half, :half]), _inverse(root[half:, half:])
-    beside = blas.dtrmm(1.0, out[half:, half:], root[:half, half:], side=1)
-    out[:half, half:] = blas.dtrmm(-1.0, out[:half, :half], beside, overwrite_b=1)
+    out[first, first] = _quotient(upper[first, first], root[first, first])
+    out[last, last] = _quotient(upper[last, last], root[last, last])
+    beside = upper[first, last] - blas.dtrmm(1.0, out[first, first], root[first, last])
+    out[first, last] = blas.dtrsm(1.0, root[last, last], beside, side=1, overwrite_b=1)
     return out

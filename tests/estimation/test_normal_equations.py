@@ -138,6 +138,13 @@ def test_folds_are_those_of_problems_with_some_of_the_samples(m):
             assert isinstance(found, NormalEquations)
             np.testing.assert_allclose(found.products, expected, atol=1e-9 * np.abs(expected).max())
         assert systems.n_rows == 6 * fold[0].sum()
+        rest, held_out = (
+            linearize_and_factor(problem.with_data([problem.data[0].take(mask)]), x, small_angle=False)
+            for mask in (~fold[0], fold[0])
+        )
+        expected = held_out.predicted_variance(rest.sqrt_covariance(problem.weights)[0]) / systems.n_rows
+        found = systems.prediction_std(problem.weights, np.ones(len(x), bool))
+        assert found == pytest.approx(expected**0.5, rel=1e-7)
 
 
 def test_samples_that_determine_few_unknowns():
