@@ -263,11 +263,14 @@ class Evidence(FittedModel):
 
     @cached_property
     def position_std(self) -> float:
-        """Predicted RMS position error in the measured region with the best base and tool [m]."""
+        """Predicted RMS position error in the measured region with the best base and tool [m].
+
+        The configurations are within the measured ranges of the joints.
+        """
         q, _ = different_configurations(self.inliers)
         if (region := self.measured_region) is not None:
-            drawn = region.draw(np.random.default_rng(0), N_PREDICTED)
-            q = np.clip(drawn, self.chain.lower, self.chain.upper)
+            # The errors of joints grow beyond their measured ranges, whatever is measured.
+            q = np.clip(region.draw(np.random.default_rng(0), N_PREDICTED), region.lower, region.upper)
         return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
 
     @cached_property

@@ -89,14 +89,16 @@ def fit_session(
         return SessionFit(fit, holdout, found)
     changed, changed_holdout = found.applied(data, holdout)
     chain, errors = fit.problem.errors.chain, models.errors
+    held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
+    refit = models.start(changed, held)
+    if not (found.has_two_robots or _confirm_changes(found, fit, models.reweighted(refit), models.extended)):
+        found, refit, changed_holdout = without_changes(found), fit, holdout
+    if found.changes.is_empty and not found.causes:
+        return SessionFit(fit, holdout, found)
     is_likely, diagnosis = _compare_with_mistakes(found, chain, data, changed, models.sets, progress)
     if not is_likely:
         return SessionFit(fit, holdout, Session(found.timeline, found.chain, found.is_ordered), diagnosis)
-    held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
-    refit = models.start(changed, held)
-    if found.has_two_robots or _confirm_changes(found, fit, models.reweighted(refit), models.extended):
-        return SessionFit(refit, changed_holdout, found, diagnosis)
-    return SessionFit(fit, holdout, without_changes(found))
+    return SessionFit(refit, changed_holdout, found, diagnosis)
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:

@@ -12,8 +12,16 @@ import pytest
 from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
-from dhcal_pin import calibrate
-from dhcal_pin.measurements import Inclination, Pose, Position, PositionComponents, SphereContact
+from dhcal_pin import calibrate, read_robot
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import (
+    Inclination,
+    Noise,
+    Pose,
+    Position,
+    PositionComponents,
+    SphereContact,
+)
 
 REASON = "The measurements show only a part of the position: errors of positions of about"
 
@@ -104,6 +112,21 @@ def test_predicted_errors_contain_those_that_the_minimal_set_leaves_out(arm):
         fit = calibrate(simulation.chain, inclinations(simulation), parameters, extend="none", session="off")
         found.append(fit.position_std)
     assert found[0] == pytest.approx(found[1], rel=0.01)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(4), {0}))
+def test_poses_of_an_arm_with_correction_curves_show_the_whole_position(seed):
+    """Beyond the measured ranges of the joints, curves are unknown, whatever is measured."""
+    chain, rng = read_robot("example:ur10", "tool0"), np.random.default_rng(seed)
+    errors = select_parameters(chain, "minimal,base,tool,harmonics,compliance,curves")
+    x = rng.standard_normal(len(errors.parameters)) * np.minimum(errors.priors, 0.1)
+    q, test_q = (rng.uniform(-2.5, 2.5, (m, 6)) for m in (400, 1000))
+    truth = errors.at(x).with_current_loads()
+    fit = calibrate(chain, Pose.simulate(truth, q, Noise(5e-5, 1e-4), rng), session="off")
+    assert "curves" in fit.extension.families
+    assert (fit.verdict.status, fit.verdict.reasons) == ("ok", ())
+    true = truth.poses(test_q)[:, :3, 3] - fit.chain.poses(test_q)[:, :3, 3]
+    assert 0.5 < fit.position_std / np.sqrt(np.mean(np.sum(true**2, 1))) < 2.0
 
 
 @pytest.mark.slow
