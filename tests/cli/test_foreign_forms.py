@@ -322,6 +322,15 @@ def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected
     assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
 
 
+def test_no_map_is_proposed_for_the_file_of_a_robot_with_more_joints(run, expected):
+    head = ",".join(f"axis{i}[deg]" for i in range(4))
+    write("data.csv", f"{head},x[mm],y[mm],z[mm]\n" + "1,2,3,4,500,600,700\n" * 9)
+    status, _, err = run(*CALIBRATE)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "state the robot of this file" in err
+    assert "order" not in err
+
+
 # --- files that cannot be read ---------------------------------------------------------------------
 
 
@@ -333,6 +342,7 @@ def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected
         ("data.parquet", TEXT.encode(), ["data.parquet: not a Parquet file"]),
         ("data.xls", b"\xd0\xcf\x11\xe0", ["data.xls: .xls files cannot be read; save it as .xlsx"]),
         ("data.bag", b"#ROSBAG V2.0\n", ["data.bag: .bag files cannot be read", "dhcal convert"]),
+        ("a.urdf", b"<robot/>", ["a.urdf: .urdf files cannot be read; expected a table of measurements"]),
     ],
 )
 def test_files_that_are_no_tables(assert_refused, run, robot_folder, name, content, words):

@@ -259,7 +259,7 @@ def unknown_column_error(
     remedy = (
         f"did you mean {suggestions[0]!r}?"
         if suggestions
-        else f"remove it; the joints are {', '.join(joint_names)}"
+        else f"remove it, or state the robot of this file; the joints are {', '.join(joint_names)}"
     )
     return UnknownNameError(
         f"{where}: column {name!r} is neither a joint of this robot nor a known measurement column; {remedy}"

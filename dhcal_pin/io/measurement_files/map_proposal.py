@@ -20,7 +20,7 @@ from ...messages import quote
 from ...robot.chain import Chain
 from ...units import ANGLES, LENGTHS
 from ..tables import DataTable
-from .columns import EULER_NOTATIONS, KAWASAKI, euler_columns, joint_units
+from .columns import EULER_NOTATIONS, KAWASAKI, VALUE_COLUMNS, euler_columns, joint_units
 
 # Joint positions beyond this are degrees [rad]; lengths beyond this are millimetres [m].
 _MAX_RADIANS, _MAX_METRES = 2 * np.pi + 0.1, 20.0
@@ -72,6 +72,9 @@ def _choose_joints(table: DataTable, chain: Chain, columns: Mapping[int, Array])
     if named.keys() >= set(chain.joint_names):
         return [named[name].index for name in chain.joint_names]
     indices, n = list(columns), chain.n_joints
+    angles = [one for name, one in named.items() if one.unit in ANGLES and name not in VALUE_COLUMNS]
+    if len(angles) > n:
+        return []  # The file has the joints of another robot.
     # A counter of the rows is no joint.
     if len(indices) > n + 3 and _counts_rows(columns[indices[0]]):
         del indices[0]
@@ -163,7 +166,7 @@ def header_problem(table: DataTable, chain: Chain) -> str:
     expected = f"a joint of this robot ({', '.join(chain.joint_names)})"
     if set(chain.joint_names) & set(table.columns):
         expected = "a measured value, such as x[mm]"
-    return f"{where}: no column is {expected}; the columns are {listed}; rename them"
+    return f"{where}: no column is {expected}; the columns are {listed}; state the robot of this file, or rename them"
 
 
 def _suffixed_joint(table: DataTable, chain: Chain) -> tuple[str, str] | None:

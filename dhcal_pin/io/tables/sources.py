@@ -38,6 +38,7 @@ _UNREADABLE = {
     ".bag": "convert it with `dhcal convert`",
     ".db3": "convert its folder with `dhcal convert`",
     ".mcap": "convert it with `dhcal convert`",
+    **dict.fromkeys((".urdf", ".xacro", ".xml"), "expected a table of measurements"),
 }
 
 
