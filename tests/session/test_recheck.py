@@ -258,9 +258,13 @@ def test_mistakes_in_files_are_named_beside_the_answer(tmp_path: Path, capsys):
     assert "60 of 60 rows were fitted" in json.loads(capsys.readouterr().out)["warnings"][0]
     assert "x[m],y[m],z[m]" in text
     file.write_text(text.replace("x[m],y[m],z[m]", "y[m],x[m],z[m]"))
-    assert main([*args, "tool0", "--json", "-"]) == 1
-    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
-    assert "The measuring frame is mirrored" in warning
+    assert main([*args, "tool0", "--json", "-"]) == 2
+    found = json.loads(capsys.readouterr().out)
+    assert "The measuring frame is mirrored" in found["warnings"][0]
+    assert (found["verdict"], found["changes"]) == ("cannot say", [])
+    assert found["reasons"] == [
+        "The measurements contain a mistake, see the warning: correct them, and check again."
+    ]
 
 
 @pytest.mark.parametrize("kind", [Position, Pose])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ... import diagnostics, io, report, session
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
+# Reason of the verdict if a mistake in a file is the likely reason for the residuals.
+_MISTAKE = "The measurements contain a mistake, see the warning: correct them, and check again."
 # Exit status of each verdict.
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
@@ -85,7 +88,11 @@ def run(args: Namespace) -> int:
     result = session.recheck(
         chain, data, io.read_uncertainty(sidecar, chain), known=known, noise=noise, size=size
     )
-    warnings = _warnings(chain, files, result, io.read_fitted(sidecar))
+    mistakes = {} if result.verdict == "ok" else _find_mistakes(chain, files)
+    if any(mistakes.values()) and any(change.kind == "robot" for change in result.changes):
+        # Wrong units and the like change all parts of the robot at once.
+        result = replace(result, verdict="cannot say", reasons=(_MISTAKE,), changes=())
+    warnings = _with_fitted_rows(mistakes, files, io.read_fitted(sidecar))
     notes = [
         f"{file.source}: {text}"
         for file in files
@@ -110,14 +117,20 @@ def run(args: Namespace) -> int:
     return STATUS[result.verdict]
 
 
-def _warnings(
-    chain: Chain, files: Sequence[io.MeasurementFile], result: session.Recheck, fitted: io.Fitted
+def _find_mistakes(chain: Chain, files: Sequence[io.MeasurementFile]) -> dict[str, list[str]]:
+    """List the mistakes in each file, which look like a change of the robot."""
+    return {file.source: diagnostics.find_input_warnings(chain, file) for file in files}
+
+
+def _with_fitted_rows(
+    mistakes: Mapping[str, list[str]], files: Sequence[io.MeasurementFile], fitted: io.Fitted
 ) -> dict[str, list[str]]:
-    """List the mistakes in each file that look like a change, and the rows that the calibration fitted."""
+    """Add warnings about the rows that the calibration fitted to the mistakes in each file."""
     digests = report.file_digests([file.source for file in files])
-    warnings = {}
-    for file in files:
-        mistakes = [] if result.verdict == "ok" else diagnostics.find_input_warnings(chain, file)
-        fitted_rows = fitted_warning(file.data, digests.get(file.source, ""), fitted)
-        warnings[file.source] = [*mistakes, *fitted_rows]
-    return warnings
+    return {
+        file.source: [
+            *mistakes.get(file.source, ()),
+            *fitted_warning(file.data, digests.get(file.source, ""), fitted),
+        ]
+        for file in files
+    }

@@ -166,7 +166,8 @@ def header_problem(table: DataTable, chain: Chain) -> str:
     expected = f"a joint of this robot ({', '.join(chain.joint_names)})"
     if set(chain.joint_names) & set(table.columns):
         expected = "a measured value, such as x[mm]"
-    return f"{where}: no column is {expected}; the columns are {listed}; state the robot of this file, or rename them"
+    problem = f"{where}: no column is {expected}; the columns are {listed}"
+    return f"{problem}; state the robot of this file, or rename them"
 
 
 def _suffixed_joint(table: DataTable, chain: Chain) -> tuple[str, str] | None:
