@@ -415,6 +415,13 @@ def _with_families(
     return replace(problem, errors=errors, weights=weights, bounds=bounds), x, family
 
 
+def with_low_order(problem: Problem, x: Array, families: Sequence[str]) -> tuple[Problem, Array]:
+    """Add the parameters of families without correction curves to a problem at x; return it with x."""
+    low_order = [name for name in families if not FAMILIES[name].is_curve]
+    extended, start, _ = _with_families(problem, x, _missing_parameters(problem, low_order))
+    return extended, start
+
+
 def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tuple[list[FamilyTrial], Model]:
     """Select families one after the other."""
     remaining, chosen = list(names), list[FamilyTrial]()

@@ -185,6 +185,7 @@ def calibrate(
     if setup.finds_session and can_have_session((*setup.data, *setup.holdout)):
         models = SessionModels(
             setup.errors,
+            lambda fit: extended(reweighted(fit, AUTO), setup.families)[1].families if setup.families else (),
             partial(_first_fit, setup),
             lambda fit: reweighted(fit, AUTO),
             lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS)[0],

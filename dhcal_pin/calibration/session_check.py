@@ -6,8 +6,9 @@ the measurements as they were read. They are dropped if a mistake explains the m
 robot fits with them.
 
 Errors that the geometry leaves, such as gear errors, differ between configurations. If the configurations at
-the begin of a session differ from those at its end, such errors look like a change. The changes are therefore
-kept only if the measurements support them beside all families of joint errors, too.
+the begin of a session differ from those at its end, such errors look like a change; and they hide small
+changes. Changes are therefore looked for with the families of joint errors of low order that the measurements
+support without changes. They are kept only if the measurements support them beside all families, too.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 
 from .._typing import Array, Progress
 from ..estimation.error_model import ErrorModel
+from ..estimation.problem import Problem
 from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
@@ -29,8 +31,8 @@ from ..robot.chain import Chain
 from ..session import Session, find_session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
-from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE
-from .model_selection import outlier_weights
+from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
+from .model_selection import outlier_weights, with_low_order
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
 
@@ -66,6 +68,8 @@ class SessionModels:
     """Fits that are compared to decide whether changes are believed."""
 
     errors: ErrorModel  # Errors of the robot that are unknown
+    # Names of the families of joint errors that a first fit supports, without changes.
+    families: Callable[[Fit], Sequence[str]]
     # Fit measurements for the first time, with given errors that are unknown.
     start: Callable[[tuple[Measurement, ...], ErrorModel], Fit]
     reweighted: Callable[[Fit], Fit]  # Fit with robust weights, from a first fit
@@ -83,8 +87,7 @@ def fit_session(
     progress: Progress | None,
 ) -> SessionFit:
     """Find what happened during a session, and fit the measurements of a first fit again with it."""
-    unweighted = replace(fit.problem, data=fit.data)
-    found = find_session(unweighted, fit.solution.x, holdout, is_ordered)
+    found = find_session(*_with_joint_errors(fit, models.families(fit)), holdout, is_ordered)
     if found.changes.is_empty:
         return SessionFit(fit, holdout, found)
     changed, changed_holdout = found.applied(data, holdout)
@@ -99,6 +102,14 @@ def fit_session(
     if not is_likely:
         return SessionFit(fit, holdout, Session(found.timeline, found.chain, found.is_ordered), diagnosis)
     return SessionFit(refit, changed_holdout, found, diagnosis)
+
+
+def _with_joint_errors(fit: Fit, families: Sequence[str]) -> tuple[Problem, Array]:
+    """Return the problem of a fit without robust weights, with families of joint errors, and its start."""
+    # Without them, their residuals hide small changes, and look like changes between groups of configurations.
+    problem, x = replace(fit.problem, data=fit.data), fit.solution.x
+    extended, start = with_low_order(problem, x, families)
+    return (extended, start) if has_enough_rows(extended) else (problem, x)
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:

@@ -709,13 +709,18 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
     return all(item.shows_changes for item in data)
 
 
+def has_enough_rows(problem: Problem) -> bool:
+    """Return whether there are enough rows to show more than the unknowns."""
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    return n_rows >= MIN_ROWS_PER_UNKNOWN * len(problem.weights)
+
+
 def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_ordered: bool) -> Session:
     """Find what happened during a session, from an approximate solution x (p,) with base and tool."""
     # Held-out measurements only count for the timeline. Without an order only files may differ.
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(timeline, chain, is_ordered)
-    n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
-    if n_rows < MIN_ROWS_PER_UNKNOWN * len(problem.weights):
+    if not has_enough_rows(replace(problem, data=timeline.thinned(MAX_SAMPLES).data)):
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):
         return nothing
