@@ -1,0 +1,82 @@
+"""Changes during a session of an arm with gear errors and elastic joints are found, and none are invented."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sessions import nominal_arm
+from slow_cases import some_slow
+
+from dhcal_pin import calibrate, se3
+from dhcal_pin.estimation import select_parameters
+from dhcal_pin.measurements import Pose, Position
+
+SETS = "minimal,base,tool,harmonics,compliance"
+NOISE, ANGLE_NOISE = 5e-5, 1e-4
+# Standard deviations of harmonics [rad], compliance [rad/(N·m)], lengths [m] and angles [rad].
+HARMONIC, COMPLIANCE, LENGTH, ANGLE = 3e-4, 1e-5, 5e-4, 1e-3
+
+
+def arm_with_joint_errors(rng):
+    """Return a nominal UR10 and a true one."""
+    chain = nominal_arm("ur10")
+    errors = select_parameters(chain, SETS)
+    sizes = [
+        COMPLIANCE if "compliance" in p.name
+        else HARMONIC if ".sin" in p.name or ".cos" in p.name
+        else LENGTH if p.unit == "m" else ANGLE
+        for p in errors.parameters
+    ]  # fmt: skip
+    return chain, errors.at(sizes * rng.standard_normal(len(sizes))).with_current_loads()
+
+
+def measured(kind, q, poses, rng):
+    """Return measurements of poses with noise."""
+    poses = poses.copy()
+    poses[:, :3, 3] += NOISE * rng.standard_normal((len(q), 3))
+    if kind is Position:
+        return Position(q, poses[:, :3, 3], NOISE)
+    turns = se3.exp3(ANGLE_NOISE * rng.standard_normal((len(q), 3)))
+    poses[:, :3, :3] = turns @ poses[:, :3, :3]
+    return Pose(q, poses, NOISE, ANGLE_NOISE)
+
+
+def rms_error(chain, truth, q):
+    """Return the RMS distance of the tool from the true one [m]."""
+    difference = chain.poses(q)[:, :3, 3] - truth.poses(q)[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum(difference**2, 1))))
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "drift"),
+    some_slow([(k, s, d) for d in (1e-3, 4e-4) for k in (Pose, Position) for s in range(4)], {0}),
+)
+def test_a_slow_motion_of_the_base_is_found_beside_joint_errors(kind, seed, drift):
+    """The result is the arm at the end. Any fixed base leaves 0.3 times the drift."""
+    rng = np.random.default_rng(seed)
+    chain, truth = arm_with_joint_errors(rng)
+    q, test_q = (rng.uniform(-1.9, 1.9, (m, 6)) for m in (150, 300))
+    poses = truth.poses(q)
+    poses[:, 2, 3] += drift * np.linspace(1, 0, len(q))
+    fit = calibrate(chain, measured(kind, q, poses, rng))
+    (found,) = fit.session.drifts
+    assert (found.kind, found.size) == ("base", pytest.approx(drift, rel=0.15))
+    assert fit.verdict.status == "caution"
+    assert rms_error(fit.chain, truth, test_q) < 6e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), some_slow([(kind, seed) for kind in (Position, Pose) for seed in range(6)], {0})
+)
+def test_groups_of_neighbouring_configurations_show_no_scale_and_no_change(kind, seed):
+    """Ten groups, in mixed order for positions and one after the other for poses."""
+    rng = np.random.default_rng(seed)
+    chain, truth = arm_with_joint_errors(rng)
+    centres = rng.uniform(-1.9, 1.9, (10, 1, 6))
+    q = (centres + 0.02 * rng.standard_normal((10, 10, 6))).reshape(-1, 6)
+    q = q[rng.permutation(100)] if kind is Position else q
+    fit = calibrate(chain, measured(kind, q, truth.poses(q), rng))
+    assert not (fit.session.events)
+    assert not (fit.session.drifts)
+    assert not (fit.session.scales)
+    assert rms_error(fit.chain, truth, q) < 6e-5
