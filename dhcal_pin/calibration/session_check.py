@@ -106,7 +106,7 @@ def fit_session(
 
 def _with_joint_errors(fit: Fit, families: Sequence[str]) -> tuple[Problem, Array]:
     """Return the problem of a fit without robust weights, with families of joint errors, and its start."""
-    # Without them, their residuals hide small changes, and look like changes between groups of configurations.
+    # Without them, their residuals hide small changes, and look like changes between configurations.
     problem, x = replace(fit.problem, data=fit.data), fit.solution.x
     extended, start = with_low_order(problem, x, families)
     return (extended, start) if has_enough_rows(extended) else (problem, x)

@@ -66,8 +66,15 @@ MAX_FRAME_RATIO = 1 / 3
 # Positions are wrong by more than the residuals suggest if the predicted error exceeds these by this factor.
 # The ratio is at most 0.8 if positions, poses or enough lengths in several directions are measured.
 MAX_HIDDEN_RATIO = 2.0
-# Reason for such errors.
-PART_OF_POSITION = "the measurements show only a part of the position"
+# Reasons for such errors, each with what to measure.
+PART_OF_POSITION = (
+    "the measurements show only a part of the position",
+    "measure the position of the tool in a fixed frame, too",
+)
+FEW_CONFIGURATIONS = (
+    "the measured configurations do not determine the errors between them",
+    "measure more poses, in random configurations",
+)
 # Largest number of iterations of such a fit.
 MAX_FRAME_ITERATIONS = 20
 # Largest number of further iterations that are tried where a fit did not converge.
@@ -563,10 +570,8 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
     std, shown = fit.position_std, _shown_position_error(fit)
     if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
         return []
-    statement, advice = unknown or (
-        PART_OF_POSITION,
-        "measure the position of the tool in a fixed frame, too",
-    )
+    is_measured = all(len(item.positions()) == len(item.rows) for item in fit.data)
+    statement, advice = unknown or (FEW_CONFIGURATIONS if is_measured else PART_OF_POSITION)
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]

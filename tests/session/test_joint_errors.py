@@ -1,6 +1,8 @@
-"""Changes during a session of an arm with gear errors and elastic joints are found, and none are invented."""
+"""Sessions of an arm with gear errors and elastic joints: changes are found, and none are invented."""
 
 from __future__ import annotations
+
+from itertools import product
 
 import numpy as np
 import pytest
@@ -80,3 +82,26 @@ def test_groups_of_neighbouring_configurations_show_no_scale_and_no_change(kind,
     assert not (fit.session.drifts)
     assert not (fit.session.scales)
     assert rms_error(fit.chain, truth, q) < 6e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), some_slow([(kind, seed) for kind in (Position, Pose) for seed in range(6)], {0})
+)
+def test_two_values_per_joint_do_not_determine_joint_errors_and_random_configurations_do(kind, seed):
+    rng = np.random.default_rng(seed)
+    chain, truth = arm_with_joint_errors(rng)
+    lattice = np.array(list(product((-1.2, 1.0), repeat=6))) + rng.uniform(-0.3, 0.3, 6)
+    fits = []
+    for q in (lattice, np.concatenate([lattice, rng.uniform(-1.5, 1.3, (10, 6))])):
+        fits.append(calibrate(chain, measured(kind, q, truth.poses(q), np.random.default_rng(seed))))
+        reason = "The measured configurations do not determine the errors between them"
+        statement = next((each for each in fits[-1].verdict.reasons if reason in each), "")
+        assert (fits[-1].verdict.status == "caution") == bool(statement)
+    region = fits[0].measured_region
+    test_q = np.clip(region.draw(rng, 300), region.lower, region.upper)
+    errors = [rms_error(fit.chain, truth, test_q) for fit in fits]
+    if fits[0].verdict.status == "caution":
+        assert 1 / 3 < fits[0].position_std / errors[0] < 3
+    # The advice of the first one was followed.
+    assert errors[1] < 0.5 * errors[0]
+    assert fits[1].verdict.status == "ok"
