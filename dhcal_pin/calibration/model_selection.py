@@ -415,11 +415,20 @@ def _with_families(
     return replace(problem, errors=errors, weights=weights, bounds=bounds), x, family
 
 
-def with_low_order(problem: Problem, x: Array, families: Sequence[str]) -> tuple[Problem, Array]:
-    """Add the parameters of families without correction curves to a problem at x; return it with x."""
-    low_order = [name for name in families if not FAMILIES[name].is_curve]
-    extended, start, _ = _with_families(problem, x, _missing_parameters(problem, low_order))
-    return extended, start
+def with_joint_errors(
+    problem: Problem, x: Array, extended: Fit, families: Sequence[str]
+) -> tuple[Problem, Array]:
+    """Add families to a problem at x: correction curves as an extended fit has them, others as unknowns."""
+    low_order, curves = (
+        _missing_parameters(problem, [name for name in families if FAMILIES[name].is_curve == is_curve])
+        for is_curve in (False, True)
+    )
+    known = [parameter for parameters in curves.values() for parameter in parameters]
+    model = ErrorModel(problem.errors.chain, ()).with_parameters(known)
+    fitted = dict(zip(_unknown_names(extended.problem), extended.solution.x, strict=True))
+    chain = model.at(np.array([fitted[p.name] for p in model.parameters]))
+    problem = replace(problem, errors=replace(problem.errors, chain=chain))
+    return _with_families(problem, x, low_order)[:2]
 
 
 def _select(candidates: _Candidates, names: Sequence[str], model: Model) -> tuple[list[FamilyTrial], Model]:

@@ -185,10 +185,14 @@ def calibrate(
     if setup.finds_session and can_have_session((*setup.data, *setup.holdout)):
         models = SessionModels(
             setup.errors,
-            lambda fit: extended(reweighted(fit, AUTO), setup.families)[1].families if setup.families else (),
             partial(_first_fit, setup),
             lambda fit: reweighted(fit, AUTO),
-            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS)[0],
+            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS),
+            lambda fit: (
+                extended(reweighted(fit, AUTO), setup.families)
+                if setup.families
+                else (fit, model_selection.Extension())
+            ),
             HAND_BUILT if setup.signs else MANUFACTURED,
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)

@@ -7,8 +7,8 @@ robot fits with them.
 
 Errors that the geometry leaves, such as gear errors, differ between configurations. If the configurations at
 the begin of a session differ from those at its end, such errors look like a change; and they hide small
-changes. Changes are therefore looked for with the families of joint errors of low order that the measurements
-support without changes. They are kept only if the measurements support them beside all families, too.
+changes. Changes are therefore looked for with the families of joint errors that the measurements support
+without changes. They are kept only if the measurements support them beside all families, too.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ..session import Session, find_session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
-from .model_selection import outlier_weights, with_low_order
+from .model_selection import Extension, outlier_weights, with_joint_errors
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
 
@@ -53,6 +53,10 @@ SAME_ZERO = np.deg2rad(3.0)
 MAX_WIDTH = 8.0
 
 
+# Function that adds the families of joint errors that the measurements support to a fit.
+Extend = Callable[[Fit], tuple[Fit, Extension]]
+
+
 @dataclass(frozen=True)
 class SessionFit:
     """First fit of measurements, with what happened during the session."""
@@ -68,13 +72,13 @@ class SessionModels:
     """Fits that are compared to decide whether changes are believed."""
 
     errors: ErrorModel  # Errors of the robot that are unknown
-    # Names of the families of joint errors that a first fit supports, without changes.
-    families: Callable[[Fit], Sequence[str]]
     # Fit measurements for the first time, with given errors that are unknown.
     start: Callable[[tuple[Measurement, ...], ErrorModel], Fit]
     reweighted: Callable[[Fit], Fit]  # Fit with robust weights, from a first fit
-    # Fit with robust weights and all families of joint errors, from a first fit.
-    extended: Callable[[Fit], Fit]
+    # Fit with robust weights and the families of joint errors that are supported among all of them, and among
+    # those of the options, from a first fit.
+    extended: Extend
+    supported: Extend
     sets: str  # Name of the widths of ordinary errors in `plausibility.evidence`
 
 
@@ -87,11 +91,12 @@ def fit_session(
     progress: Progress | None,
 ) -> SessionFit:
     """Find what happened during a session, and fit the measurements of a first fit again with it."""
-    found = find_session(*_with_joint_errors(fit, models.families(fit)), holdout, is_ordered)
+    chain, errors = fit.problem.errors.chain, models.errors
+    searched = _with_joint_errors(fit, *models.supported(fit))
+    found = replace(find_session(*searched, holdout, is_ordered), chain=chain)
     if found.changes.is_empty:
         return SessionFit(fit, holdout, found)
     changed, changed_holdout = found.applied(data, holdout)
-    chain, errors = fit.problem.errors.chain, models.errors
     held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
     refit = models.start(changed, held)
     if not (found.has_two_robots or _confirm_changes(found, fit, models.reweighted(refit), models.extended)):
@@ -104,12 +109,12 @@ def fit_session(
     return SessionFit(refit, changed_holdout, found, diagnosis)
 
 
-def _with_joint_errors(fit: Fit, families: Sequence[str]) -> tuple[Problem, Array]:
-    """Return the problem of a fit without robust weights, with families of joint errors, and its start."""
+def _with_joint_errors(fit: Fit, extended: Fit, extension: Extension) -> tuple[Problem, Array]:
+    """Return the problem of a fit without robust weights, with its joint errors if there are enough rows."""
     # Without them, their residuals hide small changes, and look like changes between configurations.
     problem, x = replace(fit.problem, data=fit.data), fit.solution.x
-    extended, start = with_low_order(problem, x, families)
-    return (extended, start) if has_enough_rows(extended) else (problem, x)
+    with_all, start = with_joint_errors(problem, x, extended, extension.families)
+    return (with_all, start) if has_enough_rows(with_all) else (problem, x)
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
@@ -153,7 +158,9 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
     return any(abs(abs(each[j]) - size) < SAME_ZERO for each in offsets for j, size in sizes if j in each)
 
 
-def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], Fit]) -> bool:
+def _confirm_changes(
+    session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], tuple[Fit, Extension]]
+) -> bool:
     """Return whether changes explain measurements beside all families of joint errors, in first fits."""
     # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
     # families that the measurements support without the changes.
@@ -165,7 +172,7 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Callabl
     sizes = [_sizes(residuals_of(each), 1 - share / 2) for each in (without, fit)]
     if max(np.max(a / b) for a, b in zip(*sizes, strict=True)) > MIN_GROSS_RATIO:
         return True
-    unchanged = extended(without)
+    unchanged, _ = extended(without)
     residuals = [residuals_of(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
     noise = [1.4826 * size for size in _sizes(residuals[1], 0.5)]
     costs = [

@@ -123,6 +123,7 @@ def test_poses_of_an_arm_with_correction_curves_show_the_whole_position(seed):
     q, test_q = (rng.uniform(-2.5, 2.5, (m, 6)) for m in (400, 1000))
     truth = errors.at(x).with_current_loads()
     fit = calibrate(chain, Pose.simulate(truth, q, Noise(5e-5, 1e-4), rng), session="off")
+    assert fit.extension
     assert "curves" in fit.extension.families
     assert (fit.verdict.status, fit.verdict.reasons) == ("ok", ())
     true = truth.poses(test_q)[:, :3, 3] - fit.chain.poses(test_q)[:, :3, 3]
