@@ -5,7 +5,8 @@
 1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`). Before that, decide
    which joints of a low-cost arm turn the other way (`plausibility.signs`).
 2. Initialize unknown base and tool frames and instrument parameters (`estimation.initialization`).
-   Find what happened during the measurement, such as a base that moved, and account for it (`session`).
+   Find what happened during the measurement, such as a base that moved, and account for it (`session`). The
+   joint errors of stage 6 are known before: they hide small changes.
 3. Minimize the cost (`estimation.minimize`)
 
        C(x) = Σ ‖r_i(x)‖² + ‖W·x‖²,
