@@ -5,8 +5,8 @@
 1. Select the parameters x of the robot that are unknown (`estimation.select_parameters`). Before that, decide
    which joints of a low-cost arm turn the other way (`plausibility.signs`).
 2. Initialize unknown base and tool frames and instrument parameters (`estimation.initialization`).
-   Find what happened during the measurement, such as a base that moved, and account for it (`session`). The
-   joint errors of stage 6 are known before: they hide small changes.
+   Find what happened during the measurement, such as a base that moved, and account for it (`session`). It
+   is looked for with the joint errors of stage 6, as these would hide small changes otherwise.
 3. Minimize the cost (`estimation.minimize`)
 
        C(x) = Σ ‖r_i(x)‖² + ‖W·x‖²,

@@ -32,6 +32,7 @@ from ..session import Session, find_session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
+from ..session.timeline import order_samples
 from .model_selection import Extension, outlier_weights, with_joint_errors
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
@@ -51,7 +52,6 @@ MAX_ZERO_STEP, MAX_ZERO_DRIFT = np.deg2rad((30.0, 10.0))
 SAME_ZERO = np.deg2rad(3.0)
 # Largest errors of a robot that is not compared with mistakes, in default standard deviations.
 MAX_WIDTH = 8.0
-
 
 # Function that adds the families of joint errors that the measurements support to a fit.
 Extend = Callable[[Fit], tuple[Fit, Extension]]
@@ -114,7 +114,8 @@ def _with_joint_errors(fit: Fit, extended: Fit, extension: Extension) -> tuple[P
     # Without them, their residuals hide small changes, and look like changes between configurations.
     problem, x = replace(fit.problem, data=fit.data), fit.solution.x
     with_all, start = with_joint_errors(problem, x, extended, extension.families)
-    return (with_all, start) if has_enough_rows(with_all) else (problem, x)
+    is_searched = has_enough_rows(with_all, order_samples(fit.data, ()))
+    return (with_all, start) if is_searched else (problem, x)
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
@@ -158,9 +159,7 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
     return any(abs(abs(each[j]) - size) < SAME_ZERO for each in offsets for j, size in sizes if j in each)
 
 
-def _confirm_changes(
-    session: Session, without: Fit, fit: Fit, extended: Callable[[Fit], tuple[Fit, Extension]]
-) -> bool:
+def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend) -> bool:
     """Return whether changes explain measurements beside all families of joint errors, in first fits."""
     # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
     # families that the measurements support without the changes.

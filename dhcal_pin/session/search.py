@@ -641,7 +641,7 @@ class _Search:
         """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
         rows = self.linearize()
         one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
-        geometric = [c for c in self.layout.model if c < len(names)]
+        geometric = [c for c in self.layout.model if c < len(names) and names[c].coefficient_index is None]
         # The prior is that of one robot, see `solve`.
         sizes = np.array([names[c].prior for c in geometric])
         block = Block("robot", "", np.array(geometric), sizes)
@@ -709,9 +709,9 @@ def can_have_session(data: Sequence[Measurement]) -> bool:
     return all(item.shows_changes for item in data)
 
 
-def has_enough_rows(problem: Problem) -> bool:
-    """Return whether there are enough rows to show more than the unknowns."""
-    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+def has_enough_rows(problem: Problem, timeline: Timeline) -> bool:
+    """Return whether the samples that are searched have enough rows to show more than the unknowns."""
+    n_rows = sum(item.residual_dim * len(item.rows) for item in timeline.thinned(MAX_SAMPLES).data)
     return n_rows >= MIN_ROWS_PER_UNKNOWN * len(problem.weights)
 
 
@@ -720,7 +720,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     # Held-out measurements only count for the timeline. Without an order only files may differ.
     timeline, chain = order_samples(problem.data, holdout), problem.errors.chain
     nothing = Session(timeline, chain, is_ordered)
-    if not has_enough_rows(replace(problem, data=timeline.thinned(MAX_SAMPLES).data)):
+    if not has_enough_rows(problem, timeline):
         return nothing
     if not _is_suspicious(problem, x, timeline, is_ordered):
         return nothing

@@ -68,6 +68,19 @@ def test_a_slow_motion_of_the_base_is_found_beside_joint_errors(kind, seed, drif
     assert rms_error(fit.chain, truth, test_q) < 6e-5
 
 
+def test_repeated_configurations_are_searched_without_joint_errors_if_they_are_too_few():
+    """Thirty configurations, three times each; the base moves before the second half."""
+    rng = np.random.default_rng(0)
+    chain, truth = arm_with_joint_errors(rng)
+    q = np.repeat(rng.uniform(-1.9, 1.9, (30, 6)), 3, 0)
+    poses = truth.poses(q)
+    poses[:45, :3, 3] += [1e-3, 0, 5e-4]
+    fit = calibrate(chain, measured(Position, q, poses, rng))
+    assert fit.session
+    (found,) = fit.session.events
+    assert found.kind == "base"
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"), some_slow([(kind, seed) for kind in (Position, Pose) for seed in range(6)], {0})
 )
