@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -51,6 +51,8 @@ MAX_LEAVE_ONE_OUT = 10
 N_PREDICTED = 300
 # More samples are not examined for repeated configurations.
 MAX_EXAMINED = 1000
+# Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
+MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 
 
 def count_geometric_directions(fit: FittedModel, r: Array) -> int:
@@ -218,6 +220,16 @@ class Evidence(FittedModel):
         return PairedErrors.from_errors(before, after, configuration_groups(self.holdout)).without_outliers()
 
     @cached_property
+    def noise_factors(self) -> dict[tuple[str, bool, str], float]:
+        """Noise over standard deviations, by kind, whether these are stated, and residual group."""
+        freedom = self.degrees_of_freedom
+        if not freedom:
+            return {}
+        per_freedom = sum(count for _, _, count in self._row_counts) / freedom
+        squares = _mean_squares(self, self.counted)
+        return {key: float(np.sqrt(per_freedom * square)) for key, square in squares.items()}
+
+    @cached_property
     def holdout_chi_square(self) -> tuple[float, float] | None:
         """Reduced chi-square of the hold-out samples, and the probability of one at least as large by chance.
 
@@ -225,25 +237,24 @@ class Evidence(FittedModel):
         uncertain parameters, I + A·Aᵀ in standard deviations of the noise. None without hold-out samples, or
         if the uncertainty of the model contains its errors (correlated residuals).
         """
-        groups = _mean_squares(self, self.counted)
         matched = [item.matched_to(self.instruments).mounted(self.chain) for item in self.counted_holdout]
         holdout = [
             item
             for item in matched
             if all(p.name in self.instruments and not p.is_local for p in item.instrument_parameters)
-            and {(item.kind, name) for name in item.residual_groups} <= set(groups)
+            and {(item.kind, item.has_stated_sigma, name) for name in item.residual_groups}
+            <= set(self.noise_factors)
         ]
         freedom = self.degrees_of_freedom
         if not holdout or not freedom or self.problem.temperature > 1 or self.shrinkage_factor < 1:
             return None
-        per_freedom = sum(count for _, _, count in self._row_counts) / freedom
         root, unbounded = self._scaled_sqrt_covariance
         # The unknowns are those of the fitted samples.
         linearization, blocks = self.problem.linearize(self.x), []
         for chunk in self.problem.with_data(holdout).chunks:
             rows = linearization.rows(chunk)
             for name, group in chunk.data.residual_groups.items():
-                noise = np.sqrt(per_freedom * groups[chunk.data.kind, name])
+                noise = self.noise_factors[chunk.data.kind, chunk.data.has_stated_sigma, name]
                 blocks.append(rows[:, group.rows].reshape(len(rows), -1).T / noise)
         rows = np.concatenate(blocks)
         if unbounded.size or not (np.isfinite(root).all() and np.isfinite(rows).all()):
@@ -255,6 +266,22 @@ class Evidence(FittedModel):
 
         reduced = chi_square / len(r)
         return reduced, float(fdtrc(len(r), freedom, reduced))
+
+    @property
+    def is_holdout_unexplained(self) -> bool:
+        """Whether noise and uncertainty do not explain the errors of the hold-out samples."""
+        found = self.holdout_chi_square
+        return found is not None and found[0] >= MIN_UNEXPLAINED and found[1] <= MAX_UNEXPLAINED_CHANCE
+
+    @cached_property
+    def holdout_mistake(self) -> Diagnosis | None:
+        """Mistake in hold-out samples whose errors are not explained; None without one."""
+        if not self.is_holdout_unexplained:
+            return None
+        found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self))
+        sources = {item.source for item in self.holdout}
+        source = found.source or (sources.pop() if len(sources) == 1 else "")
+        return replace(found, source=source) if found.hypotheses else None
 
     @cached_property
     def generalization(self) -> Generalization:
@@ -312,12 +339,13 @@ def _usual_errors(fit: Evidence) -> str:
     return HAND_BUILT if fit.signs else MANUFACTURED
 
 
-def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, str], float]:
-    """Return the mean squared residual of each kind of measurement and residual group."""
-    parts: dict[tuple[str, str], list[Array]] = {}
+def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, bool, str], float]:
+    """Return the mean squared residuals, by kind, whether sigma is stated, and residual group."""
+    parts: dict[tuple[str, bool, str], list[Array]] = {}
     for item in data:
         residual = residual_of(item, fit.chain, fit.problem.instruments(fit.x))
         for name, group in item.residual_groups.items():
-            parts.setdefault((item.kind, name), []).append(residual[group.rows].ravel())
+            key = item.kind, item.has_stated_sigma, name
+            parts.setdefault(key, []).append(residual[group.rows].ravel())
     squares = {key: float(np.mean(np.concatenate(each) ** 2)) for key, each in parts.items()}
     return {key: value for key, value in squares.items() if value > 0}

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .._typing import Array
-from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import fold_harmonics
 from ..estimation.qr import TriangularSystem
 from ..formatting import SMALL_UNITS, Quantity, Table, format_count
@@ -22,6 +22,9 @@ from ..measurements.groups import ERROR_GROUPS
 from .cross_validation import Generalization
 from .estimates import Estimate
 from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
+
+if TYPE_CHECKING:
+    from .evidence import Evidence
 
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
 MIN_SHOWN_SHARE = 0.01
@@ -237,9 +240,9 @@ def format_share(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def regressions(errors: ErrorModel, comparisons: Sequence[Comparison]) -> list[str]:
+def regressions(fit: Evidence, comparisons: Sequence[Comparison]) -> list[str]:
     """List the comparisons in which the calibrated robot is worse than the nominal one."""
-    if not errors.has_arm:
+    if not fit.errors.has_arm or fit.holdout_mistake:
         return []
     return [
         f"The calibrated robot is worse than the nominal one {describe_samples(c)}. Keep the nominal robot, "

@@ -35,6 +35,9 @@ from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
+from ..session.check import Recheck, recheck
+from ..session.linear_model import measures_positions
+from ..session.search import can_have_session
 from . import cameras
 from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions, diagnose_joint_values
@@ -86,8 +89,8 @@ MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 MAX_CHANCE = 0.025
 # Outliers spoil a fit if the error without them is smaller by this factor.
 MAX_SPOILED_RATIO = 1.5
-# Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
-MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
+# Largest number of hold-out samples with which is checked what changed before them.
+MAX_CHECKED = 60
 # Largest share of hold-out samples that may be equal to fitted ones.
 MAX_FITTED_SHARE = 0.1
 # Largest error of the zero of a servo that needs no caution [rad].
@@ -592,7 +595,7 @@ def _shown_position_error(fit: Evidence) -> float:
 def _held_out_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that is worse than the nominal one; keep the nominal one if there is no difference."""
     paired = fit.held_out_errors
-    if paired is None or not (fit.shrinkage_factor and fit.errors.has_arm):
+    if paired is None or fit.holdout_mistake or not (fit.shrinkage_factor and fit.errors.has_arm):
         return []
     head = fit.comparisons[0]
     group, after = next(iter(head.after.groups.items()))
@@ -627,16 +630,58 @@ def _fitted_holdout(fit: Evidence) -> list[Finding]:
 
 def _unexplained_holdout(fit: Evidence) -> list[Finding]:
     """Advise caution if noise and uncertainty do not explain the errors of hold-out samples."""
-    found = fit.holdout_chi_square
-    if found is None or found[0] < MIN_UNEXPLAINED or found[1] > MAX_UNEXPLAINED_CHANCE:
+    if not fit.is_holdout_unexplained:
         return []
-    text = (
-        f"The model does not explain the arm: hold-out samples have {np.sqrt(found[0]):.1f} times the errors"
+    if mistake := fit.holdout_mistake:
+        text = f"The hold-out samples contain a mistake. {mistake.sentence} {mistake.remedy}"
+        return [Finding("caution", text)]
+    assert fit.holdout_chi_square is not None
+    figures = (
+        f"hold-out samples have {np.sqrt(fit.holdout_chi_square[0]):.1f} times the errors that the noise of "
+        "the fitted ones and the uncertainty of the parameters explain."
     )
-    text += " that the noise of the fitted ones and the uncertainty of the parameters explain."
+    change = _change_before_holdout(fit)
+    if change and change.verdict == "changed":
+        text = f"Something changed between the fitted and the hold-out samples: {figures}"
+        if change.changes[0].kind == "robot":
+            remedy = (
+                "More than one part of the robot changed, as by another payload or temperature: state these "
+                "for each sample (columns payload[kg] and temperature[degC]), or calibrate again."
+            )
+        else:
+            remedy = f"{change.reasons[0]} Calibrate with both together: the change is then estimated, too."
+        return [Finding("caution", f"{text} {remedy}")]
     remedy = "Measure all regions of joint space"
     remedy += ", and allow joint errors (--extend auto)." if fit.extension is None else "."
-    return [Finding("caution", f"{text} {remedy}")]
+    return [Finding("caution", f"The model does not explain the arm: {figures} {remedy}")]
+
+
+def _change_before_holdout(fit: Evidence) -> Recheck | None:
+    """Check what changed between the fitted and the hold-out samples; None if they do not show it."""
+    holdout, step = fit.holdout, -(-sum(len(item.rows) for item in fit.holdout) // MAX_CHECKED)
+    is_drawn = any(_alternate(item, other) for item in holdout for other in fit.data)
+    if is_drawn or not can_have_session(holdout) or not measures_positions(holdout):
+        return None
+    data = [_with_noise(fit, item.take(np.arange(0, len(item.rows), step))) for item in holdout]
+    return recheck(fit.chain, data, fit.uncertainty, known=fit.instruments)
+
+
+def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
+    """Return positions or poses with the noise that the fitted samples show."""
+    fields = {"position": "sigma", "orientation": "rotation_sigma"}
+    values = {
+        field: fit.noise_factors.get((item.kind, item.has_stated_sigma, group), 1.0) * getattr(item, field)
+        for group, field in fields.items()
+        if group in item.residual_groups
+    }
+    return item.replace(**values, has_stated_sigma=True)
+
+
+def _alternate(item: Measurement, other: Measurement) -> bool:
+    """Return whether samples of one file were measured between those of the other part of it."""
+    if item.source != other.source or np.intersect1d(item.rows, other.rows).size:
+        return False
+    return bool(item.rows.min() < other.rows.max() and other.rows.min() < item.rows.max())
 
 
 def _regional_errors(fit: Evidence) -> list[Finding]:

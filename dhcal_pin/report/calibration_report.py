@@ -113,7 +113,7 @@ def _details(head: Headline) -> list[tuple[str, str, str]]:
 def _warnings(context: ReportContext) -> list[str]:
     """Return what a reader must know before relying on the report."""
     fit, texts = context.fit, []
-    texts += summary.regressions(fit.errors, context.comparisons)
+    texts += summary.regressions(fit, context.comparisons)
     if not np.isfinite(fit.unit_weight_std):
         texts.append(
             f"{fit.sample_count} determine {fit.rank} directions in parameter space and leave no "
