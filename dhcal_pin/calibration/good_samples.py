@@ -59,6 +59,8 @@ from ..measurements.measured_region import MIN_SPREAD
 # Smallest number of rows per unknown, and of samples of each measurement, with which the search may be
 # skipped. The rows of one configuration count once.
 MIN_ROWS_PER_UNKNOWN, MIN_TESTED_SAMPLES = 30, 100
+# Singular values of the rows of one configuration below this share of the largest are those of repetitions.
+SAME_ROWS = 1e-2
 # Largest number of samples that take part in the search.
 MAX_SAMPLES = 200
 # Largest number of coordinates; the matrices of the search take 8·b·u² bytes.
@@ -224,7 +226,8 @@ def independent_rows(rows: LinearizedRows, groups: Array) -> int:
         for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
             k = item.shape[1]
             if count > 1:
-                k = int(np.linalg.matrix_rank(item[:-1, :, labels == label].reshape(len(item) - 1, -1)))
+                same = item[:-1, :, labels == label].reshape(len(item) - 1, -1)
+                k = int(np.linalg.matrix_rank(same, SAME_ROWS * np.linalg.norm(same, 2)))
             total += k
     return max(total, 1)
 

@@ -5,7 +5,9 @@ samples depend on each other and therefore always go to the same part:
 
 - Samples of one configuration, for example several targets, corners or repetitions measured while the robot
   stands still. They share the same joint values and the same error of the robot. This holds for most of the
-  error also where the direction of approach, the temperature or the payload differs.
+  error also where the direction of approach, the temperature or the payload differs. The joint values of a
+  taught pose that the robot visits again differ by the resolution of its encoders and the error of its
+  controller.
 - In `blocked_folds`, samples that touch the same unknown point, plane or sphere, or points joined by a known
   distance. A fitted sample would reveal where the held-out one must be.
 
@@ -31,6 +33,12 @@ from ..measurements.base import Measurement
 
 # Joint values that differ by less are the same configuration [rad or m].
 CONFIGURATION_TOL = 1e-6
+# Joint values that differ by less are visits of one configuration if all of them are within an extent
+# [rad or m]. Samples of a path are not. Both are at most these fractions of the range of the joint values.
+VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
+VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
+# Largest number of pairs of rows that are compared for visits.
+MAX_COMPARED = 10_000_000
 # Fraction of the samples that a blocked fold holds out at either end of a principal direction.
 BLOCK_FRACTION = 0.25
 # Principal directions whose spread is below this fraction of the largest one's are ignored.
@@ -40,10 +48,11 @@ _MIN_RELATIVE_SPREAD = 1e-6
 def group_by_configuration(q: Array) -> Array:
     """Label rows of joint values (m, n), equal rows by the same label, in the order of first appearance.
 
-    Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`. Equality is transitive: rows
-    that are connected by a chain of equal rows get the same label.
+    Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`, and also if they are visits of
+    one configuration, see `VISIT_TOL`. Equality is transitive: rows that are connected by a chain of equal
+    rows get the same label.
 
-    >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-9]]))
+    >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-4]]))
     array([0, 1, 0])
     """
     m, n = q.shape
@@ -55,30 +64,43 @@ def group_by_configuration(q: Array) -> Array:
     is_new = np.ones(m, bool)
     is_new[1:] = np.any(q[order[1:]] != q[order[:-1]], 1)
     rows, projection = q[order[is_new]], projection[order[is_new]]
-    first, second = [], []
-    for offset in range(1, len(rows)):
-        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= CONFIGURATION_TOL * (1 + 1e-6))
-        if not near.size:
-            break
-        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= CONFIGURATION_TOL]
-        first.append(near)
-        second.append(near + offset)
-    if len(rows) == m and not any(map(len, first)):
+    span = float(np.ptp(rows, axis=0).max(initial=0.0)) if len(rows) else 0.0
+    tol, extent = min(VISIT_TOL, VISIT_FRACTION * span), min(VISIT_EXTENT, EXTENT_FRACTION * span)
+    near = _links(rows, projection, tol, MAX_COMPARED // max(m, 1))
+    same = _links(rows, projection, CONFIGURATION_TOL, m)
+    if len(rows) == m and not len(near[0]) and not len(same[0]):
         return np.arange(m)
+    visits, equal = _connect(len(rows), *near), _connect(len(rows), *same)
+    by_visit = np.argsort(visits, kind="stable")
+    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
+    extents = [bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum)]
+    is_visited = np.max(extents[0] - extents[1], axis=1) <= extent
     labels = np.empty(m, int)
-    labels[order] = _connect(len(rows), first, second)[np.cumsum(is_new) - 1]
+    labels[order] = np.where(is_visited[visits], visits, len(rows) + equal)[np.cumsum(is_new) - 1]
     return _by_first_appearance(labels)
 
 
-def _connect(count: int, first: Sequence[Array], second: Sequence[Array]) -> Array:
+def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple[Array, Array]:
+    """Return the pairs of rows, sorted by their projection, whose joint values differ by at most tol."""
+    first, second = [np.empty(0, int)], [np.empty(0, int)]
+    for offset in range(1, min(len(rows), max_offset + 1)):
+        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tol * (1 + 1e-6))
+        if not near.size:
+            break
+        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tol]
+        first.append(near)
+        second.append(near + offset)
+    return np.concatenate(first), np.concatenate(second)
+
+
+def _connect(count: int, first: Array, second: Array) -> Array:
     """Label nodes (count,), those that links from `first` to `second` connect by the same label."""
-    ends = [np.concatenate([*nodes, np.empty(0, int)]) for nodes in (first, second)]
-    if not len(ends[0]):
+    if not len(first):
         return np.arange(count)
     from scipy.sparse import coo_array  # lazy import: slow, and few data need it
     from scipy.sparse.csgraph import connected_components
 
-    links = coo_array((np.ones(len(ends[0])), (ends[0], ends[1])), shape=(count, count))
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     return connected_components(links, directed=False)[1]
 
 
