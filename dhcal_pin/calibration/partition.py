@@ -30,86 +30,12 @@ from ..estimation.problem import Problem, merge_instrument_parameters
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
+from ..measurements.configurations import connect_nodes, group_by_configuration, label_by_appearance
 
-# Joint values that differ by less are the same configuration [rad or m].
-CONFIGURATION_TOL = 1e-6
-# Joint values that differ by less are visits of one configuration if all of them are within an extent
-# [rad or m]. Samples of a path are not. Both are at most these fractions of the range of the joint values.
-VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
-VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
-# Largest number of pairs of rows that are compared for visits.
-MAX_COMPARED = 10_000_000
 # Fraction of the samples that a blocked fold holds out at either end of a principal direction.
 BLOCK_FRACTION = 0.25
 # Principal directions whose spread is below this fraction of the largest one's are ignored.
 _MIN_RELATIVE_SPREAD = 1e-6
-
-
-def group_by_configuration(q: Array) -> Array:
-    """Label rows of joint values (m, n), equal rows by the same label, in the order of first appearance.
-
-    Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`, and also if they are visits of
-    one configuration, see `VISIT_TOL`. Equality is transitive: rows that are connected by a chain of equal
-    rows get the same label.
-
-    >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-4]]))
-    array([0, 1, 0])
-    """
-    m, n = q.shape
-    # Equal rows are close in their projection on any direction: only neighbours along one are compared. The
-    # direction is irrational, so that rows of a regular grid do not coincide; its weights sum to 1.
-    direction = np.modf(np.arange(1, n + 1) * (1 + np.sqrt(5)) / 2)[0]
-    projection = q @ (direction / direction.sum())
-    order = np.argsort(projection, kind="stable")
-    is_new = np.ones(m, bool)
-    is_new[1:] = np.any(q[order[1:]] != q[order[:-1]], 1)
-    rows, projection = q[order[is_new]], projection[order[is_new]]
-    span = float(np.ptp(rows, axis=0).max(initial=0.0)) if len(rows) else 0.0
-    tol, extent = min(VISIT_TOL, VISIT_FRACTION * span), min(VISIT_EXTENT, EXTENT_FRACTION * span)
-    near = _links(rows, projection, tol, MAX_COMPARED // max(m, 1))
-    same = _links(rows, projection, CONFIGURATION_TOL, m)
-    if len(rows) == m and not len(near[0]) and not len(same[0]):
-        return np.arange(m)
-    visits, equal = _connect(len(rows), *near), _connect(len(rows), *same)
-    by_visit = np.argsort(visits, kind="stable")
-    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
-    extents = [bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum)]
-    is_visited = np.max(extents[0] - extents[1], axis=1) <= extent
-    labels = np.empty(m, int)
-    labels[order] = np.where(is_visited[visits], visits, len(rows) + equal)[np.cumsum(is_new) - 1]
-    return _by_first_appearance(labels)
-
-
-def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple[Array, Array]:
-    """Return the pairs of rows, sorted by their projection, whose joint values differ by at most tol."""
-    first, second = [np.empty(0, int)], [np.empty(0, int)]
-    for offset in range(1, min(len(rows), max_offset + 1)):
-        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tol * (1 + 1e-6))
-        if not near.size:
-            break
-        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tol]
-        first.append(near)
-        second.append(near + offset)
-    return np.concatenate(first), np.concatenate(second)
-
-
-def _connect(count: int, first: Array, second: Array) -> Array:
-    """Label nodes (count,), those that links from `first` to `second` connect by the same label."""
-    if not len(first):
-        return np.arange(count)
-    from scipy.sparse import coo_array  # lazy import: slow, and few data need it
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-    return connected_components(links, directed=False)[1]
-
-
-def _by_first_appearance(labels: Array) -> Array:
-    """Number labels (m,) from 0 in the order of their first appearance."""
-    if np.array_equal(labels, np.arange(len(labels))):
-        return labels
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse]
 
 
 def _merge_groups(labels: Array, others: Array) -> Array:
@@ -147,7 +73,7 @@ def configuration_groups(data: Sequence[Measurement]) -> Array:
         labels[samples] = samples[np.flatnonzero(is_first)[groups]]
     if len(labels):
         order = _order_of_joint_values(data)
-        labels[order] = _by_first_appearance(labels[order])
+        labels[order] = label_by_appearance(labels[order])
     return labels
 
 
@@ -366,7 +292,7 @@ def contact_groups(problem: Problem, x: Array) -> Array:
     chain = problem.chain(x)
     node = {parameter.name: i for i, parameter in enumerate(merge_instrument_parameters(problem.data))}
     # Nodes of the graph: instrument parameters, then samples; a contact links a sample to its parameters.
-    start, samples, parameters = len(node), [], []
+    start, samples, parameters = len(node), [np.empty(0, int)], [np.empty(0, int)]
     for item in problem.data:
         if (item.is_contact or not item.configurations_per_row) and len(item.rows):
             frames = chain.forward_kinematics(item.conditions())
@@ -377,7 +303,7 @@ def contact_groups(problem: Problem, x: Array) -> Array:
             samples.append(start + sample)
             parameters.append(nodes[depends])
         start += len(item.rows)
-    return _connect(start, samples, parameters)[len(node) :]
+    return connect_nodes(start, np.concatenate(samples), np.concatenate(parameters))[len(node) :]
 
 
 def _by_measurement(data: Sequence[Measurement], values: Array) -> Fold:

@@ -12,6 +12,7 @@ import numpy as np
 
 from .._typing import Array
 from ..measurements.base import Measurement
+from ..measurements.configurations import group_by_configuration
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Timeline:
         numbers = self.fitted_numbers
         order = np.argsort(numbers, kind="stable")
         q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
-        order = order[np.concatenate([[True], np.any(q[1:] != q[:-1], 1)])]
+        order = order[np.diff(group_by_configuration(q), prepend=-1) != 0]
         kept = np.zeros(len(numbers), bool)
         kept[order[:: max(1, -(-len(order) // count))]] = True
         ends = np.cumsum([len(each) for each in self.numbers[: self.n_fitted]])[:-1]

@@ -20,13 +20,12 @@ from dhcal_pin.calibration import (
     split,
 )
 from dhcal_pin.calibration.partition import (
-    CONFIGURATION_TOL,
     configuration_groups,
     contact_groups,
-    group_by_configuration,
 )
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.measurements import Measurement, PointContact, PointDistance, Position, RelativePose
+from dhcal_pin.measurements.configurations import CONFIGURATION_TOL, group_by_configuration
 from dhcal_pin.robot import Chain
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
@@ -177,6 +176,23 @@ def test_groups_match_a_comparison_of_all_pairs(seed):
         linked = linked @ linked
     groups = group_by_configuration(q)
     np.testing.assert_array_equal(groups[:, None] == groups[None], linked)
+
+
+@pytest.mark.parametrize("jitter", [1e-5, 1e-4, 1e-3])
+def test_visits_of_taught_poses_are_one_configuration(jitter):
+    rng = np.random.default_rng(0)
+    poses = rng.uniform(-3, 3, (8, N_JOINTS))
+    number = rng.permutation(np.repeat(np.arange(8), 20))
+    groups = group_by_configuration(poses[number] + jitter * rng.standard_normal((160, N_JOINTS)))
+    np.testing.assert_array_equal(groups[:, None] == groups[None], number[:, None] == number[None])
+
+
+@pytest.mark.parametrize("step", [1e-4, 1e-3, 1e-2])
+def test_samples_of_a_path_and_random_ones_are_different_configurations(step):
+    rng = np.random.default_rng(0)
+    path = np.cumsum(step * rng.uniform(0.3, 1, (400, N_JOINTS)), 0)
+    for q in (path, rng.uniform(-2, 2, (400, N_JOINTS)), np.linspace(0, 2, 400)[:, None]):
+        np.testing.assert_array_equal(group_by_configuration(q), np.arange(400))
 
 
 def test_a_sample_of_two_configurations_is_compared_by_both():

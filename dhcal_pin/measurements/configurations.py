@@ -1,0 +1,91 @@
+"""Configurations of samples: which samples share the joint values, and so the error of the robot.
+
+The joint values of a taught pose that the robot visits again differ by the resolution of its encoders and the
+error of its controller. Such visits are one configuration: they show the noise, but not the model errors at
+other joint values. Neighbouring samples of a path are different configurations.
+
+Shapes: m rows of joint values of n joints.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._typing import Array
+
+# Joint values that differ by less are the same configuration [rad or m].
+CONFIGURATION_TOL = 1e-6
+# Joint values that differ by less are visits of one configuration if all of them are within an extent
+# [rad or m]. Samples of a path are not. Both are at most these fractions of the range of the joint values.
+VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
+VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
+# Largest number of pairs of rows that are compared for visits.
+MAX_COMPARED = 10_000_000
+
+
+def group_by_configuration(q: Array) -> Array:
+    """Label rows of joint values (m, n), equal rows by the same label, in the order of first appearance.
+
+    Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`, and also if they are visits of
+    one configuration, see `VISIT_TOL`. Equality is transitive: rows that are connected by a chain of equal
+    rows get the same label.
+
+    >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-4]]))
+    array([0, 1, 0])
+    """
+    m, n = q.shape
+    # Equal rows are close in their projection on any direction: only neighbours along one are compared. The
+    # direction is irrational, so that rows of a regular grid do not coincide; its weights sum to 1.
+    direction = np.modf(np.arange(1, n + 1) * (1 + np.sqrt(5)) / 2)[0]
+    projection = q @ (direction / direction.sum())
+    order = np.argsort(projection, kind="stable")
+    is_new = np.ones(m, bool)
+    is_new[1:] = np.any(q[order[1:]] != q[order[:-1]], 1)
+    rows, projection = q[order[is_new]], projection[order[is_new]]
+    span = float(np.ptp(rows, axis=0).max(initial=0.0)) if len(rows) else 0.0
+    tol = max(CONFIGURATION_TOL, min(VISIT_TOL, VISIT_FRACTION * span))
+    extent = min(VISIT_EXTENT, EXTENT_FRACTION * span)
+    near = _links(rows, projection, tol, MAX_COMPARED // max(m, 1))
+    same = _links(rows, projection, CONFIGURATION_TOL, m)
+    if len(rows) == m and not len(near[0]) and not len(same[0]):
+        return np.arange(m)
+    visits, equal = connect_nodes(len(rows), *near), connect_nodes(len(rows), *same)
+    by_visit = np.argsort(visits, kind="stable")
+    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
+    extents = [bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum)]
+    is_visited = np.max(extents[0] - extents[1], axis=1) <= extent
+    labels = np.empty(m, int)
+    labels[order] = np.where(is_visited[visits], visits, len(rows) + equal)[np.cumsum(is_new) - 1]
+    return label_by_appearance(labels)
+
+
+def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple[Array, Array]:
+    """Return the pairs of rows, sorted by their projection, whose joint values differ by at most tol."""
+    first, second = [np.empty(0, int)], [np.empty(0, int)]
+    for offset in range(1, min(len(rows), max_offset + 1)):
+        (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tol * (1 + 1e-6))
+        if not near.size:
+            break
+        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tol]
+        first.append(near)
+        second.append(near + offset)
+    return np.concatenate(first), np.concatenate(second)
+
+
+def connect_nodes(count: int, first: Array, second: Array) -> Array:
+    """Label nodes (count,), those that links from `first` to `second` connect by the same label."""
+    if not len(first):
+        return np.arange(count)
+    from scipy.sparse import coo_array  # lazy import: slow, and few data need it
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    return connected_components(links, directed=False)[1]
+
+
+def label_by_appearance(labels: Array) -> Array:
+    """Number labels (m,) from 0 in the order of their first appearance."""
+    if np.array_equal(labels, np.arange(len(labels))):
+        return labels
+    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
