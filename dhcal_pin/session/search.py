@@ -34,6 +34,7 @@ from .. import se3
 from .._typing import Array
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, residual_of
+from ..measurements.configurations import group_by_configuration
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
 from .file_bases import place_files
@@ -95,6 +96,8 @@ MIN_ROBOT_GAIN = 0.3
 MAX_ARM_PRIOR = 1.0
 # Fewer rows for each unknown show nothing but the unknowns.
 MIN_ROWS_PER_UNKNOWN = 1.5
+# The same for rows of different configurations with which scales and a lag are looked for.
+MIN_DIFFERENT_ROWS_PER_UNKNOWN = 2.0
 # Fewest samples on either side of a step.
 MIN_SIDE = 3
 
@@ -137,6 +140,11 @@ class _Search:
         self.groups = self._noise_groups()
         can_lag = is_ordered and sum(map(len, timeline.numbers)) <= MAX_PATH_SAMPLES
         self.paths = JointPaths(timeline) if can_lag else None
+        # Repetitions show a change over time, but not one that is the same for all samples.
+        n_different = sum(
+            item.residual_dim * len(np.unique(group_by_configuration(item.q))) for item in self.part.data
+        )
+        self.has_different_rows = n_different >= MIN_DIFFERENT_ROWS_PER_UNKNOWN * len(problem.weights)
         self.rows = self.linearize()
         self.layout = self.layout.restricted_to(self.rows)
         self.first_fit = self.solve(self.rows, [])
@@ -330,7 +338,7 @@ class _Search:
     def _shapes(self, block: Block) -> list[list[Shape]]:
         """Return the functions of time that are tested for a block; those of one list are equally likely."""
         if block.is_constant:
-            if block.kind == "lag" and self.paths is None:
+            if not self.has_different_rows or (block.kind == "lag" and self.paths is None):
                 return []
             return [] if (block, Constant) in self.rejected else [[Constant()]]
         steps: list[Shape] = []
