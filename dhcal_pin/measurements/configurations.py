@@ -20,7 +20,7 @@ CONFIGURATION_TOL = 1e-6
 VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
 VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
 # Largest number of pairs of rows that are compared for visits.
-MAX_COMPARED = 10_000_000
+MAX_COMPARED = 1_000_000
 
 
 def group_by_configuration(q: Array) -> Array:
