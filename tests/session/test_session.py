@@ -317,8 +317,9 @@ def test_paths_of_joints_are_those_of_each_file():
             inner = slice(40 * i + 5, 40 * i + 35)
             np.testing.assert_allclose(each[inner, 1], 2 * f(t[5:35] + lag), atol=1e-4)
     assert RobotChanges().is_empty
-    # Times are no numbers of samples.
-    np.testing.assert_array_equal(timeline.thinned(100).fitted_numbers, numbers)
+    # Times are no numbers of samples. The arm hardly moves where it turns back.
+    kept = timeline.thinned(100).fitted_numbers
+    np.testing.assert_array_equal(np.setdiff1d(numbers, kept), [16, 63])
 
 
 def test_a_thinned_timeline_has_samples_of_all_measurements():
