@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._kernels import apply_observation_matrix, factor_jacobian
+from .._kernels import apply_observation_matrix, factor_jacobian, r_factor
 from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
@@ -232,8 +232,11 @@ class Linearization:
     def r_factor(self, chunk: Chunk, small_angle: bool) -> Array:
         """Compute the R factor of a chunk's whitened rows [J | r]."""
         n_rows = chunk.data.residual_dim * len(chunk.data.rows)
-        if MANY_COLUMNS < self._n_columns > n_rows and not small_angle:
-            return self.rows(chunk).reshape(self._n_columns, -1).T
+        if MANY_COLUMNS < self._n_columns and not small_angle:
+            if self._n_columns > n_rows:
+                return self.rows(chunk).reshape(self._n_columns, -1).T
+            if _is_structured(chunk.data):
+                return r_factor(self.rows(chunk))
         data, frames = chunk.data, chunk.frames(self.chain)
         # The kernel computes the columns of geometric errors while it factors them; they are never stored.
         # All other columns, and all columns of measurements that are normalized by scale, are filled before.
@@ -270,6 +273,8 @@ class Linearization:
 
     def rows(self, chunk: Chunk) -> Array:
         """Compute the whitened rows [J | r] of a chunk."""
+        if MANY_COLUMNS < self._n_columns and _is_structured(chunk.data):
+            return self.structured_rows(chunk).multiplied_out()
         out = np.empty((self._n_columns, chunk.data.residual_dim, len(chunk.data.rows)))
         self._fill(out, chunk, chunk.frames(self.chain), False)
         return out
@@ -342,6 +347,16 @@ class StructuredRows:
         """Return the rows of some samples, given by a mask or an index."""
         parts = (self.dense[..., index], self.joint_rows[..., index], self.terms[:, index])
         return StructuredRows(*parts, self.blocks, self.columns)
+
+    def multiplied_out(self) -> Array:
+        """Compute all columns of [J | r], shape (c+e, k, m)."""
+        n_dense = len(self.dense)
+        out = np.empty((len(self.columns), *self.dense.shape[1:]))
+        out[self.columns[:n_dense]] = self.dense
+        for joint, block in self.blocks:
+            for column, term in zip(self.columns[n_dense:][block], self.terms[block], strict=True):
+                np.multiply(self.joint_rows[joint], term, out=out[column])
+        return out
 
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
