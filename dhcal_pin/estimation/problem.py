@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._kernels import apply_observation_matrix, factor_jacobian, r_factor
+from .._kernels import apply_observation_matrix, factor_jacobian
 from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
 from .._kernels.work_arrays import UnbufferedRows, work_array
 from .._typing import Array
@@ -40,7 +40,7 @@ from ..robot.chain import Chain
 from ..robot.conditions import SampleState
 from .error_model import ErrorModel, ErrorParameter
 from .normal_equations import NormalEquations
-from .qr import TriangularSystem, combine_r_factors, sum_of_squares
+from .qr import TriangularSystem, blocked_r_factor, combine_r_factors, sum_of_squares
 from .scale_gauge import ScaleGauge, normalize_by_scale
 
 # Largest number of samples in a chunk.
@@ -236,7 +236,7 @@ class Linearization:
             if self._n_columns > n_rows:
                 return self.rows(chunk).reshape(self._n_columns, -1).T
             if _is_structured(chunk.data):
-                return r_factor(self.rows(chunk))
+                return blocked_r_factor(self.rows(chunk))
         data, frames = chunk.data, chunk.frames(self.chain)
         # The kernel computes the columns of geometric errors while it factors them; they are never stored.
         # All other columns, and all columns of measurements that are normalized by scale, are filled before.

@@ -42,6 +42,17 @@ RANK_RTOL = 1e-9
 # A triangular matrix whose reciprocal condition number exceeds this value has no singular value near
 # RANK_RTOL: the estimated condition may be wrong by a factor of the matrix size.
 WELL_CONDITIONED = 1e3 * RANK_RTOL
+# Number of columns that LAPACK eliminates together.
+_BLOCK_COLUMNS = 64
+
+
+def blocked_r_factor(rows: Array) -> Array:
+    """Compute the R factor of hundreds of columns (c, k, m), which are overwritten."""
+    # LAPACK's products of blocks are faster than the kernels for so many columns.
+    c = len(rows)
+    r = np.zeros((c, c), order="F")
+    r = lapack.dtpqrt(0, _BLOCK_COLUMNS, r, rows.reshape(c, -1).T, overwrite_a=1, overwrite_b=1)[0]
+    return np.ascontiguousarray(r)
 
 
 def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
