@@ -35,9 +35,9 @@ class FrameBatch:
     # `point_jacobian`, shape (k+1, 7, 3, m) [1, m]. The z axis of body frame j is the axis of joint j.
     columns: Array
     tool: Array  # Columns x, y, z, p of the tool frame, shape (4, 3, m) [1, m]
-    # Transmission terms of the independent joints, shape (t, n, m); None if the chain has no transmission.
+    # Transmission terms of the independent joints, shape (t, n, m); None without transmission errors.
     terms: Array | None = None
-    conditions: Any = None  # Conditions of the samples that the terms were evaluated at; None without terms
+    conditions: Any = None  # Conditions of the samples; None if they are not known
 
     @property
     def bodies(self) -> Array:

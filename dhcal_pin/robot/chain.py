@@ -390,7 +390,7 @@ class Chain:
 
         They have shape (n, m). Transmission terms follow, shape (t, n, m), or None for ideal joints.
         """
-        if self.transmission is None:
+        if self.transmission is None or self.transmission.is_zero:
             return np.ascontiguousarray(conditions.q.T), None
         terms = self.transmission.terms(conditions)
         return terms[0] + self.transmission.errors(terms), terms
@@ -666,9 +666,8 @@ class Chain:
             The number of the motion that each coefficient scales, see `motions`, and its factor, (m,) each.
         """
         assert self.transmission is not None
-        assert frames.terms is not None
         terms, transmission = frames.terms, self.transmission.evaluating(entries)
-        if transmission is not self.transmission:
+        if terms is None or transmission is not self.transmission:
             terms = transmission.terms(frames.conditions)
         joints, numbers, sources = (indices.tolist() for indices in transmission.locate(entries))
         return joints, [terms[term, source] for term, source in zip(numbers, sources, strict=True)]

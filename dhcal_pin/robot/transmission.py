@@ -171,6 +171,11 @@ class Transmission:
         return bool(self.compliance.any())
 
     @cached_property
+    def is_zero(self) -> bool:
+        """Whether all coefficients are zero."""
+        return not self.coefficients.any()
+
+    @cached_property
     def _parts(self) -> CoefficientParts:
         """Views of the coefficients."""
         return split_coefficients(self.coefficients, self.loads.n_joints)
