@@ -362,7 +362,7 @@ def packed_scene(page: str) -> str:
     """Compress the page of a scene, with the script that moves its arm to selected samples."""
     script = SCENE_LINK.read_text("utf-8")
     linked = f"<script>\n{script}</script>\n</body>".join(page.rsplit("</body>", 1))
-    return base64.b64encode(zlib.compress(linked.encode(errors="backslashreplace"), 9)).decode()
+    return base64.b64encode(zlib.compress(linked.encode(errors="backslashreplace"))).decode()
 
 
 def scene_magnification(context: ReportContext) -> float:
