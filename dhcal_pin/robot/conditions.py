@@ -153,6 +153,11 @@ class Conditions:
         """The conditions of the arm alone, as if base and tool had not moved."""
         return replace(self, base_motion=None, tool_motion=None)
 
+    @property
+    def of_joints(self) -> Conditions:
+        """The conditions that joint errors depend on."""
+        return Conditions(self.q, approach=self.approach, temperature=self.temperature, payload=self.payload)
+
     def at(self, q: Array) -> Conditions:
         """Return the same conditions at other joint positions (c·m, n), all samples of each configuration."""
         count = len(q) // max(len(self.q), 1)

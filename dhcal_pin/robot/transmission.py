@@ -116,9 +116,8 @@ class GravityLoads:
         if key not in self._cache:
             data = model.createData()
             columns = [model.joints[model.getJointId(name)].idx_v for name in self.moving_joints]
-            torques = np.empty((q.shape[1], len(columns)))
-            for row, configuration in zip(torques, self.configurations(q), strict=True):
-                row[:] = pin.computeGeneralizedGravity(model, data, configuration)[columns]
+            rows = [pin.computeGeneralizedGravity(model, data, each) for each in self.configurations(q)]
+            torques = np.array(rows).reshape(-1, model.nv)[:, columns]
             if len(self._cache) >= MAX_CACHED_TORQUES:
                 self._cache.clear()
             self._cache[key] = self.mimic_matrix.T @ torques.T
@@ -196,11 +195,11 @@ class Transmission:
         # They do not depend on the coefficients. Each thread keeps those that it evaluated last.
         last = vars(_last_terms)
         is_same = last and last["loads"] is self.loads and last["order"] == self.order
-        if not is_same or not last["conditions"].equals(conditions):
+        if not is_same or not last["conditions"].equals(conditions.of_joints):
             last.update(
                 loads=self.loads,
                 order=self.order,
-                conditions=conditions.copy(),
+                conditions=conditions.of_joints.copy(),
                 terms=self._terms(conditions),
             )
         return last["terms"]
