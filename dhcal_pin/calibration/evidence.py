@@ -11,9 +11,8 @@ import numpy as np
 from .. import plausibility
 from .._typing import Array, Progress
 from ..estimation.frame_gauge import best_frames_std
-from ..estimation.problem import linearize_and_factor
-from ..estimation.qr import rank
-from ..estimation.trimmed_squares import linearize_rows
+from ..estimation.problem import CHUNK_SIZE
+from ..estimation.qr import TriangularSystem, rank
 from ..estimation.uncertainty import Uncertainty
 from ..measurements.base import Measurement, residual_of
 from ..measurements.measured_region import MeasuredRegion
@@ -49,15 +48,20 @@ N_FOLDS = 5
 MAX_LEAVE_ONE_OUT = 10
 # Configurations of the measured region at which errors are predicted.
 N_PREDICTED = 300
-# More samples are not examined for repeated configurations.
+# Of more configurations, each counts as one sample.
 MAX_EXAMINED = 1000
 # Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 
 
+def _is_geometric(fit: FittedModel) -> Array:
+    """Return which unknowns (p,) are no joint errors."""
+    return np.array([getattr(p, "coefficient_index", None) is None for p in fit.parameters], bool)
+
+
 def count_geometric_directions(fit: FittedModel, r: Array) -> int:
     """Count the directions of the geometry that an R factor of its parameters determines; at least 1."""
-    return max(rank(r[:, [getattr(p, "coefficient_index", None) is None for p in fit.parameters]]), 1)
+    return max(rank(r[:, _is_geometric(fit)]), 1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,14 +102,26 @@ class Evidence(FittedModel):
         Repeated rows of one configuration show the noise, but no outlier that they share. Joint errors that
         were added to the geometry do not count: outliers were found before.
         """
-        data, problem = self.data, self.problem
-        directions = count_geometric_directions(self, self.solution.system.r)
-        groups = configuration_groups(data)
-        if len(np.unique(groups)) < len(groups) and len(groups) <= MAX_EXAMINED:
-            system = linearize_and_factor(problem, self.solution.x, small_angle=False)
-            root = system.sqrt_covariance(problem.weights)[0]
-            return independent_rows(linearize_rows(problem, self.solution.x, root), groups) / directions
-        return sum(item.residual_dim * len(item.rows) for item in data) / directions
+        problem, groups = self.problem, configuration_groups(self.data)
+        is_geometric = _is_geometric(self)
+        # The R factor of the rows; normal equations do not show the rank.
+        system = TriangularSystem(self.solution.system.rows).select(is_geometric)
+        directions = max(system.rank, 1)
+        n_groups = len(np.unique(groups))
+        if n_groups == len(groups):
+            return sum(item.residual_dim * len(item.rows) for item in self.data) / directions
+        if n_groups > MAX_EXAMINED:
+            return n_groups * min(item.residual_dim for item in self.data) / directions
+        root = system.sqrt_covariance(problem.weights[is_geometric])[0]
+        linearization, chunks = problem.linearize(self.solution.x), iter(problem.chunks)
+        columns = []
+        for item in self.data:
+            parts = [
+                np.tensordot(root, linearization.rows(next(chunks))[:-1][is_geometric], (0, 0))
+                for _ in range(0, len(item.rows), CHUNK_SIZE)
+            ]
+            columns.append(np.concatenate([np.empty((root.shape[1], item.residual_dim, 0)), *parts], 2))
+        return independent_rows(columns, groups) / directions
 
     @cached_property
     def hidden_majority(self) -> tuple[int, float] | None:

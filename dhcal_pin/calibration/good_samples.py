@@ -104,7 +104,7 @@ def find_good_samples(
     if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
         return all_good
     rows = linearize_rows(part, solution.x, root)
-    redundancy = n_rows / independent_rows(rows, groups[drawn])
+    redundancy = n_rows / independent_rows([item[:-1] for item in rows.items], groups[drawn])
     if 2 * n_determined > n_rows / redundancy:
         return all_good
     was_good = np.concatenate([np.empty(0), *previous])[drawn] > robust.ZERO_WEIGHT
@@ -139,7 +139,7 @@ def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int
     if not 0 < root.shape[1] <= MAX_COORDINATES:
         return None
     rows = linearize_rows(problem, x, root)
-    redundancy = rows.counts.sum() / independent_rows(rows, groups)
+    redundancy = rows.counts.sum() / independent_rows([item[:-1] for item in rows.items], groups)
 
     def mean_square(is_good: Array, scales: Array) -> tuple[float, float]:
         squares = rows.residual_squares(rows.solve(is_good[None] * 1.0, scales[None]))[0]
@@ -217,16 +217,16 @@ def _are_regional(data: Sequence[Measurement], groups: Array, is_outlier: Array)
     return bool(np.mean(energies[1:] >= energies[0]) <= MAX_CHANCE)
 
 
-def independent_rows(rows: LinearizedRows, groups: Array) -> int:
-    """Count the rows that differ; repeated rows of a configuration do not strengthen a majority."""
+def independent_rows(columns: Sequence[Array], groups: Array) -> int:
+    """Count the rows (u, k, m) of items that differ; repetitions of a configuration do not."""
     total, first = 0, 0
-    for item in rows.items:
+    for item in columns:
         labels = groups[first : first + item.shape[2]]
         first += item.shape[2]
         for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
             k = item.shape[1]
             if count > 1:
-                same = item[:-1, :, labels == label].reshape(len(item) - 1, -1)
+                same = item[..., labels == label].reshape(len(item), -1)
                 k = int(np.linalg.matrix_rank(same, SAME_ROWS * np.linalg.norm(same, 2)))
             total += k
     return max(total, 1)
