@@ -28,7 +28,8 @@ def group_by_configuration(q: Array) -> Array:
 
     Rows are equal if no joint value differs by more than `CONFIGURATION_TOL`, and also if they are visits of
     one configuration, see `VISIT_TOL`. Equality is transitive: rows that are connected by a chain of equal
-    rows get the same label.
+    rows get the same label. Of very many rows, visits are only found among those next to each other in their
+    projection.
 
     >>> group_by_configuration(np.array([[0.5, 1.0], [0.0, 1.0], [0.5, 1.0 + 1e-4]]))
     array([0, 1, 0])
@@ -49,7 +50,8 @@ def group_by_configuration(q: Array) -> Array:
     same = _links(rows, projection, CONFIGURATION_TOL, m)
     if len(rows) == m and not len(near[0]) and not len(same[0]):
         return np.arange(m)
-    visits, equal = connect_nodes(len(rows), *near), connect_nodes(len(rows), *same)
+    visits = connect_nodes(len(rows), *map(np.concatenate, zip(near, same, strict=True)))
+    equal = connect_nodes(len(rows), *same)
     by_visit = np.argsort(visits, kind="stable")
     starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
     extents = [bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum)]
