@@ -27,6 +27,7 @@ from ..calibration.evaluation import compute_errors
 from ..exceptions import InvalidArgumentError
 from ..formatting import Quantity, Table
 from ..measurements.base import Measurement
+from ..measurements.configurations import group_by_configuration
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import Chain
@@ -178,8 +179,8 @@ def pose_characteristics(
     known: Mapping[str, float] | None = None,
 ) -> PoseCharacteristics:
     """Compute the characteristics of ISO 9283 from points and cycles such as ("P1", 12) of the samples."""
-    # The commanded poses are those of the chain at the joint positions of the samples. Without points, equal
-    # joint positions are one.
+    # The commanded poses are those of the chain at the joint positions of the samples. Without points, visits
+    # of one configuration are one.
     attained = np.concatenate([_positions(item) for item in data])
     errors = compute_errors(chain, data, known or {})
     q = np.concatenate([item.q for item in data])
@@ -188,9 +189,7 @@ def pose_characteristics(
     rotations = np.concatenate([each["orientation"] for each in errors]) if has_rotations else None
     samples = [sample for part in points for sample in part or ()]
     if any(part is None for part in points):
-        label = np.unique(q, axis=0, return_inverse=True)[1].reshape(-1)
-        order = list(dict.fromkeys(label.tolist()))
-        samples = [(f"P{order.index(each) + 1}", 0) for each in label.tolist()]
+        samples = [(f"P{label + 1}", 0) for label in group_by_configuration(q).tolist()]
     found = []
     for name in dict.fromkeys(name for name, _ in samples):
         index = np.array([i for i, (other, _) in enumerate(samples) if other == name])

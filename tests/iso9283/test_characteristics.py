@@ -86,6 +86,16 @@ def test_hand_example(gantry, is_named):
     assert overall["AD_m"] == pytest.approx(DISTANCE_ACCURACY, abs=1e-9)
 
 
+def test_visits_with_the_joint_values_of_encoders_are_one_point(gantry):
+    q, attained, _ = samples()
+    read = q + np.random.default_rng(0).uniform(-1e-4, 1e-4, q.shape)
+    found = pose_characteristics(gantry, [Position(read, attained)], [None]).to_dict()
+    for point in found["points"]:
+        assert point["cycles"] == 4
+        assert 1e3 * point["RP_l_m"] == pytest.approx(REPEATABILITY[point["point"]], abs=1e-9)
+        assert 1e3 * point["AP_p_m"] == pytest.approx(ACCURACY[point["point"]], abs=0.1)
+
+
 def test_orientations_of_the_hand_example(gantry):
     """P1 turns about z by 1, 3, 1, 3 mrad: mean 2, S = sqrt(4 / 3)."""
     q, attained, labels = samples()
