@@ -121,7 +121,8 @@ class Problem:
         size, rates = 1.0, np.zeros((n_robot, 4))
         if self.scale_gauge:
             size, rates = self.scale_gauge.size(model[0]), self.scale_gauge.rates(*model)
-        return Linearization(*model, self.instruments(x), columns, size, rates)
+        n_coefficients = self.errors.n_coefficients
+        return Linearization(*model, self.instruments(x), columns, size, rates, n_coefficients)
 
     @cached_property
     def scale_gauge(self) -> ScaleGauge | None:
@@ -228,15 +229,15 @@ class Linearization:
     instrument_columns: Mapping[str, int]  # Column of each unknown instrument parameter in J, by name
     arm_scale: float  # Size of the chain; see `scale_gauge`
     gauge_rates: Array  # Rates of growth and rotation per unit of each robot error, shape (p, 4)
+    n_coefficients: int  # Number of robot errors that are transmission coefficients
 
     def r_factor(self, chunk: Chunk, small_angle: bool) -> Array:
         """Compute the R factor of a chunk's whitened rows [J | r]."""
         n_rows = chunk.data.residual_dim * len(chunk.data.rows)
-        if MANY_COLUMNS < self._n_columns and not small_angle:
-            if self._n_columns > n_rows:
-                return self.rows(chunk).reshape(self._n_columns, -1).T
-            if _is_structured(chunk.data):
-                return blocked_r_factor(self.rows(chunk))
+        if MANY_COLUMNS < self._n_columns > n_rows and not small_angle:
+            return self.rows(chunk).reshape(self._n_columns, -1).T
+        if self._has_structure(chunk) and not small_angle:
+            return blocked_r_factor(self.rows(chunk))
         data, frames = chunk.data, chunk.frames(self.chain)
         # The kernel computes the columns of geometric errors while it factors them; they are never stored.
         # All other columns, and all columns of measurements that are normalized by scale, are filled before.
@@ -261,6 +262,7 @@ class Linearization:
             twists=self.twists[:first],
             instrument_columns=columns,
             gauge_rates=self.gauge_rates[:first],
+            n_coefficients=0,
         )
         residual_dim, m = chunk.data.residual_dim, len(chunk.data.rows)
         dense = np.empty((other._n_columns, residual_dim, m))
@@ -273,11 +275,16 @@ class Linearization:
 
     def rows(self, chunk: Chunk) -> Array:
         """Compute the whitened rows [J | r] of a chunk."""
-        if MANY_COLUMNS < self._n_columns and _is_structured(chunk.data):
+        if self._has_structure(chunk):
             return self.structured_rows(chunk).multiplied_out()
         out = np.empty((self._n_columns, chunk.data.residual_dim, len(chunk.data.rows)))
         self._fill(out, chunk, chunk.frames(self.chain), False)
         return out
+
+    def _has_structure(self, chunk: Chunk) -> bool:
+        """Check whether most columns of a chunk are those of joints times terms."""
+        is_large = self.n_coefficients > MANY_COLUMNS and not self.instrument_columns
+        return is_large and _is_structured(chunk.data)
 
     @property
     def _n_columns(self) -> int:
