@@ -59,6 +59,7 @@ def test_an_unstated_payload_of_the_hold_out_samples_is_proposed(seed):
 
     def bent(q, model=None):
         """Return the tip poses of elastic joints; the second half of the samples carries a payload."""
+        assert model is not None
         loaded = model.copy()
         inertia = pin.Inertia(kilograms, np.zeros(3), np.zeros((3, 3)))
         frame = loaded.frames[loaded.getFrameId(sim.chain.tip, pin.FrameType.BODY)]
