@@ -103,15 +103,14 @@ class Evidence(FittedModel):
         were added to the geometry do not count: outliers were found before.
         """
         problem, groups = self.problem, configuration_groups(self.data)
-        is_geometric = _is_geometric(self)
-        # The R factor of the rows; normal equations do not show the rank.
-        system = TriangularSystem(self.solution.system.rows).select(is_geometric)
-        directions = max(system.rank, 1)
+        directions = count_geometric_directions(self, self.solution.system.r)
         n_groups = len(np.unique(groups))
         if n_groups == len(groups):
             return sum(item.residual_dim * len(item.rows) for item in self.data) / directions
         if n_groups > MAX_EXAMINED:
             return n_groups * min(item.residual_dim for item in self.data) / directions
+        is_geometric = _is_geometric(self)
+        system = TriangularSystem(self.solution.system.rows).select(is_geometric)
         root = system.sqrt_covariance(problem.weights[is_geometric])[0]
         linearization, chunks = problem.linearize(self.solution.x), iter(problem.chunks)
         columns = []

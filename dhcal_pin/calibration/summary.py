@@ -242,12 +242,14 @@ def format_share(share: float) -> str:
 
 def regressions(fit: Evidence, comparisons: Sequence[Comparison]) -> list[str]:
     """List the comparisons in which the calibrated robot is worse than the nominal one."""
-    if not fit.errors.has_arm or fit.holdout_mistake:
+    if not fit.errors.has_arm:
         return []
+    # Hold-out samples with a mistake say nothing about the robot.
+    judged = [c for c in comparisons if c.title != "hold-out" or not fit.holdout_mistake]
     return [
         f"The calibrated robot is worse than the nominal one {describe_samples(c)}. Keep the nominal robot, "
         "measure more poses, or identify fewer parameters."
-        for c in comparisons
+        for c in judged
         if headline([c]).percent_reduction < 0
     ]
 

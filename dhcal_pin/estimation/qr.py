@@ -48,7 +48,7 @@ _BLOCK_COLUMNS = 64
 
 def blocked_r_factor(rows: Array) -> Array:
     """Compute the R factor of hundreds of columns (c, k, m), which are overwritten."""
-    # LAPACK's products of blocks are faster than the kernels for so many columns.
+    # LAPACK eliminates many columns at once by matrix products. The compiled kernel eliminates two at a time.
     c = len(rows)
     r = np.zeros((c, c), order="F")
     r = lapack.dtpqrt(0, _BLOCK_COLUMNS, r, rows.reshape(c, -1).T, overwrite_a=1, overwrite_b=1)[0]

@@ -42,7 +42,7 @@ ARGUMENTS: options.Options = {
     "or .html)",
     "--iso9283": "compute accuracy, repeatability and drift of poses as ISO 9283 defines them; the column "
     "iso_point names the point of each row and its cycle, such as P1:12, as `dhcal plan --iso9283` writes "
-    "it (default: rows with equal joint values are one point)",
+    "it (default: visits of one configuration are one point)",
     "--report R.html": "write a report (.html)",
     "--json": options.JSON,
 }
