@@ -12,7 +12,8 @@ satisfies, in units of the expected one,
 
 and is iterated together with x. If the errors of the robot are smaller than expected, both sums
 get EXPECTATION_COUNT additional parameters with σ = 1, and no prior becomes narrower than the narrowest
-expected one of its unit. Groups of other parameters state their own count and limits.
+expected one of its unit. None becomes wider than MAX_WIDENING times its expected one. Groups of other
+parameters state their own count and limits.
 
 References:
     D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
@@ -43,6 +44,9 @@ MIN_PRIOR_STD, MAX_PRIOR_STD = 1e-12, 1e6
 
 # Number of determined parameters that the expected standard deviation counts for against smaller errors.
 EXPECTATION_COUNT = 0.5
+# Largest estimated standard deviation as a multiple of the expected one. One error that the data hardly
+# determine would otherwise widen the priors of its group without limit, and grow with them.
+MAX_WIDENING = 10.0
 # Smallest positive number.
 _SMALLEST = np.finfo(float).tiny
 
@@ -107,7 +111,11 @@ def group_default_priors(errors: ErrorModel, expected: Array, default: Array) ->
         groups.setdefault((unit, float(expected[i])), []).append(i)
     return tuple(
         PriorGroup(
-            members, weight, 0.0, max(other for own, other in groups if own == unit), EXPECTATION_COUNT
+            members,
+            weight,
+            weight / MAX_WIDENING,
+            max(other for own, other in groups if own == unit),
+            EXPECTATION_COUNT,
         )
         for (unit, weight), members in groups.items()
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dhcal_pin.estimation import Problem, levenberg_marquardt, select_parameters
-from dhcal_pin.estimation.priors import group_default_priors, prior_weights, update_prior_scales
+from dhcal_pin.estimation.priors import MAX_WIDENING, group_default_priors, prior_weights, update_prior_scales
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import Noise, Pose
 
@@ -48,6 +48,15 @@ def test_priors_widen_to_the_errors_that_precise_data_show(sim_6dof, scale):
         rms = np.sqrt(np.mean(solution.x[group.members] ** 2))
         assert rms > 1 / group.expected_weight
         np.testing.assert_allclose(1 / weights[group.members], rms, rtol=0.06)
+
+
+def test_one_large_error_does_not_widen_the_priors_without_limit(sim_6dof):
+    problem, solution, groups = solved(sim_6dof, 1.0)
+    group = groups[0]
+    x = solution.x.copy()
+    x[group.members[0]] = 1000 / group.expected_weight
+    weights = update_prior_scales(problem, replace(solution, x=x), groups)
+    np.testing.assert_allclose(weights[group.members], group.expected_weight / MAX_WIDENING, rtol=1e-12)
 
 
 def test_groups_have_their_own_widths_and_limits(sim_6dof):

@@ -19,6 +19,7 @@ from dhcal_pin.io import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements import Noise, Wires
 from dhcal_pin.robot import Chain
+from dhcal_pin.robot.sampling import joint_range
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
@@ -172,3 +173,24 @@ def test_single_wire_accepts_one_length_per_sample(sim_6dof):
 def test_simulated_wires_have_three_numbered_columns(sim_6dof):
     data = Wires.simulate(sim_6dof, np.zeros((3, 6)), Noise(1e-4), np.random.default_rng(0))
     assert list(data.to_columns()) == ["L1", "L2", "L3", "sigma_L1", "sigma_L2", "sigma_L3"]
+
+
+def test_a_point_on_the_last_axis_does_not_tilt_that_axis():
+    """Lengths hardly determine the direction of the axis: with priors of any width it turns by 40°."""
+    chain = Chain.from_urdf(robot_file(UR10), "tool0")
+    errors = select_parameters(chain, "minimal,base,tool,harmonics,compliance")
+    names = [parameter.name for parameter in errors.parameters]
+    sizes = {"m": 5e-4, "rad": 1e-3, "rad/Nm": 1e-5}
+    scale = np.array([sizes[parameter.unit] for parameter in errors.parameters])
+    is_compliance = [name.endswith("compliance") for name in names]
+    scale[[".sin" in name or ".cos" in name for name in names]] = 3e-4
+    scale[[name.startswith(("base", "tool")) for name in names]] = 0
+    rng = np.random.default_rng(20)
+    x = scale * rng.standard_normal(len(scale))
+    x[is_compliance] = abs(x[is_compliance])
+    truth = errors.at(x).with_current_loads()
+    q = rng.uniform(*joint_range(chain), (100, 6))
+    fit = calibrate(chain, Wires.simulate(truth, q, Noise(5e-5), rng))
+    assert fit.verdict.status == "ok"
+    of_last = [p.name.startswith("wrist_3_joint.r") for p in fit.parameters]
+    assert abs(fit.x[of_last]).max() < np.deg2rad(2)
