@@ -216,7 +216,7 @@ def _positions(item: Measurement) -> Array:
 
 
 def _require_cycles(name: str, q: Array) -> None:
-    """Require several samples of a point with equal joint positions (m, n)."""
+    """Require several samples of a point, visits of one configuration with joint values (m, n)."""
     if len(q) < 2:
         raise InvalidArgumentError(
             f"--iso9283: point {name} has one cycle; expected at least 2 at each point (the standard has 30)"

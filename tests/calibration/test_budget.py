@@ -14,24 +14,27 @@ INSTRUMENT, ARM, MODEL = 5e-5, 1e-4, 2e-4
 N_CONFIGURATIONS, N_REPEATS = 80, 3
 
 
-def budget(sigma, repeats=N_REPEATS):
-    """Return the budget and the error of a calibration with simulated measurements."""
+def budget(sigma, repeats=N_REPEATS, spread=0.0):
+    """Return the budget and the error of a calibration; joint values of visits differ by a spread [rad]."""
     rng = np.random.default_rng(1)
     nominal, actual = (dh.Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))
     q = rng.uniform(-2, 2, (N_CONFIGURATIONS, 6))
     errors = MODEL * rng.standard_normal((N_CONFIGURATIONS, 3))
-    positions = np.repeat(actual.poses(q)[:, :3, 3] + errors, repeats, axis=0)
+    q = np.repeat(q, repeats, axis=0)
+    q += rng.uniform(-spread, spread, q.shape)
+    positions = actual.poses(q)[:, :3, 3] + np.repeat(errors, repeats, axis=0)
     for std in (ARM, INSTRUMENT):
         positions += std * rng.standard_normal(positions.shape)
-    data = dh.Position(np.repeat(q, repeats, axis=0), positions, sigma)
+    data = dh.Position(q, positions, sigma)
     fit = dh.calibrate(nominal, data, extend="none", session="off")
     found = UncertaintyBudget.from_fit(fit, fit.comparisons[0])
     assert found is not None
     return found, fit.comparisons[0]
 
 
-def test_contributions_are_those_of_the_simulation():
-    found, comparison = budget(INSTRUMENT)
+@pytest.mark.parametrize("spread", [0.0, 1e-4])
+def test_contributions_are_those_of_the_simulation(spread):
+    found, comparison = budget(INSTRUMENT, spread=spread)
     assert comparison.title == "cross-validated"
     assert found.instrument == pytest.approx(np.sqrt(3) * INSTRUMENT, rel=1e-9)
     # 160 degrees of freedom on three axes: the standard deviation of the scatter is 3 %.

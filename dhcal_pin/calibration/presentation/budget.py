@@ -4,7 +4,7 @@ Contributions are RMS distances [m]. Their squares add up to that of the error o
 certificate states, so that the model error follows from the others:
 
     instrument       √(mean of σ_x² + σ_y² + σ_z²), as stated
-    repeatability    √(s² - instrument²), s: pooled scatter of the samples with equal joint positions
+    repeatability    √(s² - instrument²), s: pooled scatter of the visits of one configuration
     parameters       √(mean variance of the tool position that follows from the covariance of the parameters)
     model error      √(error² - instrument² - repeatability² - parameters²)
 
@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ...formatting import Quantity, Table
-from ...measurements.base import label_stops
+from ...measurements.configurations import group_by_configuration
 from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...subsampling import evenly_spaced_indices
@@ -34,8 +34,8 @@ class UncertaintyBudget:
     """Contributions to the position error, RMS distances [m]; None for one that is not known apart."""
 
     instrument: float | None  #: Noise of the instrument; None if it is not stated.
-    #: Scatter of the arm at equal joint positions, with the noise of the instrument if that is not stated;
-    #: None without repeated samples.
+    #: Scatter of the arm between visits of one configuration, with the noise of the instrument if that is not
+    #: stated; None without repeated samples.
     repeatability: float | None
     parameters: float  #: Uncertainty of the estimated parameters.
     model: float  #: What remains, with the contributions that are not known apart.
@@ -101,7 +101,9 @@ def _repeat_variance(fit: FittedModel, data: list[Position | Pose]) -> float | N
     """Return the pooled variance of repeated samples, sum of the axes [m²]; None without any."""
     total, freedom = 0.0, 0
     for item, errors in zip(data, compute_errors(fit.chain, data, fit.instruments), strict=True):
-        labels = label_stops(item)
+        conditions = [] if item.recorded is None else [item.recorded.steps]
+        keys = np.column_stack([group_by_configuration(item.q), *conditions])
+        labels = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
         counts = np.bincount(labels)
         sums = np.zeros((len(counts), 3))
         np.add.at(sums, labels, errors["position"])
