@@ -241,16 +241,25 @@ def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measur
     return data.take(~np.isin(data.rows, [item.row for item in unreachable]))
 
 
-def _mended(chain: Chain, file: MeasurementFile, changes: Sequence[str]) -> MeasurementFile:
-    """Return a measurement file after the changes of --mend."""
-    # `KEY@FILE` changes one file only.
-    chosen = [change.partition("@") for change in changes]
-    keys = [key for key, _, source in chosen if source in ("", file.source)]
-    if not keys:
-        return file
-    data = file.data
-    for key in keys:
-        data = plausibility.mend(chain, data, key)
+def _mended(chain: Chain, files: list[MeasurementFile], changes: Sequence[str]) -> list[MeasurementFile]:
+    """Return measurement files after the changes of --mend."""
+    data = [file.data for file in files]
+    for key, _, source in (change.partition("@") for change in changes):
+        # `KEY@FILE` changes one file only, other keys all files to which they apply.
+        chosen = [i for i, file in enumerate(files) if source in ("", file.source)]
+        if not chosen:
+            known = ", ".join(dict.fromkeys(file.source for file in files))
+            raise InvalidArgumentError(f"--mend {key}@{source}: unknown file; choose from {known}")
+        mended = plausibility.mend_files(chain, [data[i] for i in chosen], key)
+        for i, item in zip(chosen, mended, strict=True):
+            data[i] = item
+    return [
+        file if item is file.data else _with_data(file, item) for file, item in zip(files, data, strict=True)
+    ]
+
+
+def _with_data(file: MeasurementFile, data: Measurement) -> MeasurementFile:
+    """Return a measurement file with other data of the same rows."""
     is_held_out = np.isin(data.rows, file.holdout.rows)
     return replace(file, data=data, fit=data.take(~is_held_out), holdout=data.take(is_held_out))
 
@@ -266,8 +275,9 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
     limited = plausibility.with_wide_limits(chain) if LOW_COST in chain.parameters else chain
-    for path in [*job.data, *filter(None, [holdout_file])]:
-        read = read_measurement_file(
+    paths = [*job.data, *filter(None, [holdout_file])]
+    files = [
+        read_measurement_file(
             path,
             chain,
             job.columns,
@@ -277,9 +287,11 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
             sheet=job.sheet,
             max_rows=MAX_FILE_ROWS,
         )
+        for path in paths
+    ]
+    for path, measured in zip(paths, _mended(chain, files, job.mend), strict=True):
         if not job.mend:
-            require_joint_units(chain, read)
-        measured = _mended(chain, read, job.mend)
+            require_joint_units(chain, measured)
         by_file[path] = measured.data
         notes[path] = list(measured.notes)
         # The values of a mended file are not those of its columns. The verdict looks for mixed-up columns.

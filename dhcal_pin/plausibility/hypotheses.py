@@ -446,20 +446,26 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
 
 def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
     """Undo a mistake in measurements, such as the wrong sign of a joint, or several with + between them."""
+    return mend_files(chain, [data], key)[0]
+
+
+def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Measurement]:
+    """Undo a mistake in all measurements to which it applies."""
     change = _change_of_size(key) or _change_of_zero(chain, key)
     if change is None:
-        by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, [data])}
+        by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, data)}
         if key not in by_key:
             for at in re.finditer(re.escape(_AND), key):
                 first, rest = key[: at.start()], key[at.end() :]
                 if first in by_key or _change_of_zero(chain, first):
-                    return mend(chain, mend(chain, data, first), rest)
+                    return mend_files(chain, mend_files(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
             raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
         change = by_key[key].change
-    changed = change.apply(data)
+    changed = Hypothesis(key, "", change).apply(data)
     if changed is None:
-        raise UnknownNameError(f"--mend {key!r}: does not apply to measurements of kind {data.kind}")
+        kinds = " and ".join(dict.fromkeys(item.kind for item in data))
+        raise UnknownNameError(f"--mend {key!r}: does not apply to measurements of kind {kinds}")
     return changed
 
 

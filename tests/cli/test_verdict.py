@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -346,3 +347,31 @@ def test_changes_that_do_not_apply_are_wrong_input(run, robot_folder, keys):
     assert (status, out) == (2, "")
     assert err.count("\n") == 1
     assert "--mend" in err
+
+
+def test_a_named_mistake_is_undone_in_the_files_that_have_it(run, robot_folder):
+    """Touches whose joint has the wrong sign, beside known distances, which have no joint values."""
+    for kind in ("point", "point_distance"):
+        words = ("-n", "60", "--errors", "1mm,0.3deg", "--kind", kind, "--seed", "4", "-o", f"{kind}.csv")
+        assert run("simulate", "arm.urdf", *words)[0] == 0
+    table = [line.split(",") for line in Path("point.csv").read_text().splitlines()]
+    column = next(i for row in table for i, cell in enumerate(row) if cell.startswith("joint_3"))
+    for row in table:
+        with suppress(ValueError, IndexError):
+            row[column] = repr(-float(row[column]))
+    Path("point.csv").write_text("\n".join(map(",".join, table)) + "\n")
+    files = ("point.csv", "point_distance.csv", "--parameters", "minimal,tool", "--extend", "none")
+    command = ("calibrate", "arm.urdf", *files, "-o", "out.urdf")
+    status, _, err = run(*command)
+    assert status == 3
+    # Another sign is equivalent for this arm.
+    keys = re.findall(r"--mend (\S+[^.\s])", unfolded(err))
+    key = "sign:joint_3"
+    assert key in keys
+    for each in keys:
+        assert run(*command, "--mend", each)[0] == 0
+    assert run(*command, "--mend", f"{key}@point.csv")[0] == 0
+    status, _, err = run(*command, "--mend", f"{key}@point_distance.csv")
+    assert (status, "does not apply to measurements of kind point_distance" in err) == (2, True)
+    status, _, err = run(*command, "--mend", f"{key}@points.csv")
+    assert (status, "unknown file; choose from point.csv, point_distance.csv" in err) == (2, True)
