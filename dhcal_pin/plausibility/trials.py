@@ -51,7 +51,9 @@ _MIN_PARTS = 2
 _MIN_SHIFTED_SHARE = 0.25
 # Smallest angle by which the zero of a joint is called wrong, and the steps in which the angle is searched
 # [deg]. Smaller ones are errors of the robot, which the calibration corrects.
-_MIN_ZERO, _ZERO_STEPS = 10.0, (20.0, 4.0, 1.0, 0.2)
+_MIN_ZERO, _ZERO_STEPS = 9.0, (20.0, 4.0, 1.0, 0.2)
+# Reach and step in which the angle of greatest evidence is searched [deg].
+_FINE_ZERO_STEPS = ((6.0, 2.0), (1.5, 0.5))
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
 _MIN_TURN_DIFFERENCE = 5.0
 # Phases of the progress.
@@ -137,7 +139,7 @@ def try_hypotheses(
     if not found.is_certain and sets == MANUFACTURED:
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         joints = [j for j in inner_revolute_joints(chain) if misfit or j in changed]
-        zeros = _measure_zeros(trial, joints)
+        zeros = _refine_zeros(trial, _near(trial, _measure_zeros(trial, joints)))
         measured = _decide(trial, [*scores, *_scores(trial, _near(trial, zeros), SINGLES)])
         is_refuted = changed and set(measured.hypotheses).isdisjoint(found.hypotheses)
         if measured.is_certain or is_refuted:
@@ -164,9 +166,26 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
             best, reach = angles[int(np.argmin(costs))], step
         zero = zero_hypothesis(trial.chain, joint, best)
         is_quarter_turn = abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
-        if abs(best) >= _MIN_ZERO and not is_quarter_turn:
+        if abs(best) >= _MIN_ZERO - _FINE_ZERO_STEPS[0][0] and not is_quarter_turn:
             out += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
     return out
+
+
+def _refine_zeros(trial: Trial, zeros: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return the zeros that are wrong, by the angles of greatest evidence."""
+    # The misfit of the nominal robot is smallest at another angle if the robot has errors.
+    refined = []
+    for (joint, offset), *_ in (each.hypothesis.offsets.items() for each in zeros):
+        best = float(-np.rad2deg(offset))
+        for reach, step in _FINE_ZERO_STEPS:
+            angles = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
+            changed = [zero_hypothesis(trial.chain, joint, angle).apply(trial.samples) for angle in angles]
+            evidence = [fit_evidence(trial.chain, each or trial.samples, trial.sets).log for each in changed]
+            best = angles[int(np.argmax(evidence))]
+        if abs(best) >= _MIN_ZERO:
+            zero = zero_hypothesis(trial.chain, joint, best)
+            refined += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
+    return refined
 
 
 def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
