@@ -24,6 +24,8 @@ MIN_ANGLE_RATIO = 10.0
 MAX_SCALE_CHANGE = 0.5
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
+# Sentence about a zero that a motion of the base imitates.
+_LIKE_BASE = " A motion of the base has the same effect."
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class Event:
     size: float  # Size of the change, in `unit`
     std: float  # Standard deviation of the size
     unit: str  # "m" or "rad"
+    is_like_base: bool = False  # Whether a motion of the base has the same effect
 
     def to_dict(self) -> dict[str, Any]:
         """Return the event for the JSON document."""
@@ -81,7 +84,7 @@ class Event:
         if self.kind == "robot":
             return "Calibrate each robot by itself."
         if self.kind == "joint":
-            return "The result is the arm after the change."
+            return "The result is the arm after the change." + _LIKE_BASE * self.is_like_base
         return f"Both parts were fitted with their own {self.of or self.kind} pose."
 
 
@@ -97,6 +100,7 @@ class SlowChange:
     shape: str  # "linear", "exponential" or "free"
     time_constant: float | None  # Time constant of an exponential; else None
     time_unit: str  # "row", "image" or "s"
+    is_like_base: bool = False  # Whether a motion of the base has the same effect
 
     def to_dict(self) -> dict[str, Any]:
         """Return the drift for the JSON document."""
@@ -123,7 +127,7 @@ class SlowChange:
         """What the calibration did."""
         if self.kind in ("base", "tool"):
             return "It was fitted with a pose that changes smoothly."
-        return "The result is the arm at the end."
+        return "The result is the arm at the end." + _LIKE_BASE * self.is_like_base
 
 
 @dataclass(frozen=True)
@@ -288,7 +292,8 @@ def describe_events(
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
         before, after = (timeline.place(shape.number + i) for i in (-1, 0))
-        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit))
+        is_like_base = _is_like_base(cause.block, chain)
+        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit, is_like_base))
     return tuple(events)
 
 
@@ -359,7 +364,14 @@ def describe_drifts(
                 law if isinstance(shape, Drift) else "free",
                 None if np.isinf(constant) else constant,
                 timeline.unit,
+                _is_like_base(cause.block, chain),
             )
+
+
+def _is_like_base(block: Block, chain: Chain) -> bool:
+    """Return whether the zero of a joint moves the arm like its base: the first one, or the first rails."""
+    is_first = block.index == 0 or bool(chain.is_prismatic[: block.index + 1].all())
+    return block.kind == "joint" and is_first
 
 
 def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timeline) -> tuple[float, float]:

@@ -831,3 +831,40 @@ def test_held_out_samples_without_a_file_belong_to_the_measurements_beside_them(
     assert _file_numbers([first, second], [first, apart, apart]) == [0, 1, 2, 1, 4]
     named = data.replace(source="a.csv")
     assert _file_numbers([named, first, named], [named, apart]) == [0, 1, 0, 0, 1]
+
+
+def gantry(tmp_path):
+    """Return an arm with two revolute joints on three rails."""
+    joints = [("x", "prismatic", "1 0 0"), ("y", "prismatic", "0 1 0"), ("z", "prismatic", "0 0 1")]
+    joints += [("turn", "revolute", "0 0 1"), ("tilt", "revolute", "0 1 0")]
+    text = '<robot name="gantry"><link name="link0"/>'
+    for i, (name, kind, axis) in enumerate(joints):
+        text += (
+            f'<link name="link{i + 1}"/><joint name="{name}" type="{kind}"><parent link="link{i}"/>'
+            f'<child link="link{i + 1}"/><origin xyz="0.1 0 0.2"/><axis xyz="{axis}"/>'
+            '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        )
+    path = tmp_path / "gantry.urdf"
+    path.write_text(text + "</robot>")
+    return Chain.from_urdf(path, "link5").with_base_and_tool(np.eye(4), se3.translation([0.1, 0.05, 0.2]))
+
+
+def test_the_zero_of_a_rail_changes_like_the_base(tmp_path):
+    """The base moves along a rail, which cannot be distinguished; the zero of a turned joint can."""
+    arm, rng = gantry(tmp_path), np.random.default_rng(1)
+    q = rng.uniform(-0.9, 0.9, (60, 5))
+    positions = arm.poses(q)[:, :3, 3] + 5e-5 * rng.standard_normal((60, 3))
+    positions[30:, 0] += 1e-3
+    fit = calibrate(arm, Position(q, positions, 5e-5))
+    assert fit.session
+    (event,) = fit.session.events
+    assert event.size == pytest.approx(1e-3, rel=0.1)
+    assert (event.kind, event.of) == ("joint", "x")
+    assert event.consequence.endswith("A motion of the base has the same effect.")
+    wrong = q.copy()
+    wrong[30:, 4] += 5e-3
+    fit = calibrate(arm, Position(wrong, arm.poses(q)[:, :3, 3] + 5e-5 * rng.standard_normal((60, 3)), 5e-5))
+    assert fit.session
+    (event,) = fit.session.events
+    assert (event.kind, event.of) == ("joint", "tilt")
+    assert "base" not in event.consequence
