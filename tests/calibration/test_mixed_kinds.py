@@ -395,3 +395,17 @@ def test_noise_of_images_without_a_displacement_fits_the_residuals_unless_it_is_
     # A fit may determine as many parameters as there are rows.
     alone = estimate_jitter(problem, x, [images], [is_used.astype(float)], residual.size)
     assert np.isfinite(alone.log_likelihood_ratio)
+
+
+def test_few_right_positions_beside_inclinations_are_not_called_outliers(sim_6dof):
+    """Five of eight right positions do not fit the others."""
+    rng, errors = np.random.default_rng(8), select_parameters(sim_6dof, "minimal")
+    sizes = np.array([{"m": 1e-3, "rad": 5e-3}[parameter.unit] for parameter in errors.parameters])
+    truth = errors.at(sizes * rng.standard_normal(len(sizes)))
+    few = KINDS["position"].simulate(truth, rng.uniform(-2, 2, (8, 6)), Noise(5e-5), rng)
+    many = KINDS["inclination"].simulate(truth, rng.uniform(-2, 2, (60, 6)), Noise(5e-5, 1e-4), rng)
+    reasons = " ".join(calibrate(sim_6dof, [few, many]).verdict.reasons)
+    assert "outliers" not in reasons
+    assert (
+        "So few samples do not show which are wrong, if any. Measure at least 12 different poses" in reasons
+    )
