@@ -101,8 +101,9 @@ MAX_OUTLIER_SHARE = 0.1
 MIN_CONTRADICTION = 1e-3
 # Largest share of outliers of one of several measurements that needs no caution.
 MAX_FILE_OUTLIER_SHARE = 0.5
-# Smallest number of samples of a measurement of which a part is called outliers. Of 8 right positions beside
-# 60 inclinations, 5 were in 2 of 15 simulated cases, of 10 in 1 of 21, of 12 in none of 21.
+# Smallest number of samples of a measurement for which most of them are called outliers. Beside 60
+# inclinations, right positions were called outliers in 2 of 15 simulated cases with 8 positions, in 1 of 21
+# with 10, and in none of 21 with 12.
 MIN_FILE_SAMPLES = 12
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3

@@ -175,12 +175,13 @@ def _refine_zeros(trial: Trial, zeros: Sequence[_Candidate]) -> list[_Candidate]
     """Return the zeros that are wrong, by the angles of greatest evidence."""
     # The misfit of the nominal robot is smallest at another angle if the robot has errors.
     refined = []
-    for (joint, offset), *_ in (each.hypothesis.offsets.items() for each in zeros):
+    for each in zeros:
+        ((joint, offset),) = each.hypothesis.offsets.items()
         best = float(-np.rad2deg(offset))
         for reach, step in _FINE_ZERO_STEPS:
             angles = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
             changed = [zero_hypothesis(trial.chain, joint, angle).apply(trial.samples) for angle in angles]
-            evidence = [fit_evidence(trial.chain, each or trial.samples, trial.sets).log for each in changed]
+            evidence = [fit_evidence(trial.chain, item or trial.samples, trial.sets).log for item in changed]
             best = angles[int(np.argmax(evidence))]
         if abs(best) >= _MIN_ZERO:
             zero = zero_hypothesis(trial.chain, joint, best)
