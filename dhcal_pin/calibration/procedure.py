@@ -203,10 +203,11 @@ def calibrate(
         result = _calibrate_images(setup, begun, groups)
     else:
         fit, found = reweighted(begun.fit, robust.LOSSES[loss].stages), begun.session
-        # A scale of one axis, which the fit does not contain, makes the robot longer or shorter, too.
-        if found and not found.scales and (scale := find_scale(fit.problem, fit.solution.x)):
-            found = replace(found, scales=(scale,))
         result = _calibrate_samples(setup, replace(begun, fit=fit), groups, extended)
+        # The scale of one axis and a zero far off make the robot longer or shorter, too.
+        if found and not found.scales and not result.diagnosis.zero:
+            scale = find_scale(fit.problem, fit.solution.x)
+            found = replace(found, scales=(scale,) if scale else ())
         result = replace(result, session=found)
     return replace(result, **settings)
 

@@ -569,6 +569,8 @@ def _plausible_cause(fit: Evidence) -> str:
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
         if fit.rank < len(fit.x) and not fit.problem.weights.any():
             return "Nothing holds the parameters that the measurements do not determine: --priors default."
+    if zero := fit.diagnosis.zero:
+        return f"{zero.sentence} {zero.remedy}"
     if fit.session and fit.session.scales:
         return fit.session.scales[0].finding
     if fit.diagnosis.fits_separately:

@@ -33,6 +33,8 @@ class Diagnosis:
     source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
     #: Whether each of several measurements fits the robot, but not all of them together.
     fits_separately: bool = False
+    #: Zero of a joint that explains the measurements, too; the calibration corrects its small angle.
+    zero: Diagnosis | None = None
     gain: float = 0.0  #: Logarithm of the ratio of the evidence with the first hypothesis to that before.
 
     @property

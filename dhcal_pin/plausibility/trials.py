@@ -49,11 +49,11 @@ _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 _MIN_PARTS = 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
-# Smallest angle by which the zero of a joint is called wrong, and the steps in which the angle is searched
-# [deg]. Smaller ones are errors of the robot, which the calibration corrects.
-_MIN_ZERO, _ZERO_STEPS = 9.0, (20.0, 4.0, 1.0, 0.2)
-# Reach and step in which the angle of greatest evidence is searched [deg].
-_FINE_ZERO_STEPS = ((6.0, 2.0), (1.5, 0.5))
+# Smallest angle by which the zero of a joint is called wrong [deg]. Smaller ones are errors of the robot,
+# which the calibration corrects; from the second angle on they are named if its correction is implausible.
+_MIN_ZERO, _MIN_LIKELY_ZERO = 9.0, 3.0
+# Steps in which the angle is searched, then reach and step around the angle of greatest evidence [deg].
+_ZERO_STEPS, _FINE_ZERO_STEPS = (20.0, 4.0, 1.0, 0.2), ((6.0, 2.0), (1.5, 0.5))
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
 _MIN_TURN_DIFFERENCE = 5.0
 # Phases of the progress.
@@ -140,11 +140,18 @@ def try_hypotheses(
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         joints = [j for j in inner_revolute_joints(chain) if misfit or j in changed]
         zeros = _refine_zeros(trial, _near(trial, _measure_zeros(trial, joints)))
-        measured = _decide(trial, [*scores, *_scores(trial, _near(trial, zeros), SINGLES)])
+        large = [zero for zero in zeros if abs(_angle(zero)) >= _MIN_ZERO]
+        scores += _scores(trial, _near(trial, large), SINGLES)
+        measured = _decide(trial, scores)
         is_refuted = changed and set(measured.hypotheses).isdisjoint(found.hypotheses)
         if measured.is_certain or is_refuted:
             # An angle that fits far better refutes other zeros, even if it is not certain itself.
             found = measured if measured.is_certain else Diagnosis(before)
+        if not found.is_certain:
+            small = [zero for zero in zeros if abs(_angle(zero)) < _MIN_ZERO]
+            likely = _decide(trial, [*scores, *_scores(trial, _near(trial, small), SINGLES)])
+            if likely.is_certain:
+                return Diagnosis(before, zero=likely), None
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
 
@@ -165,8 +172,8 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
             costs = _costs(trial, [zero.apply(trial.samples) or trial.samples for zero in zeros])
             best, reach = angles[int(np.argmin(costs))], step
         zero = zero_hypothesis(trial.chain, joint, best)
-        is_quarter_turn = abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
-        if abs(best) >= _MIN_ZERO - _FINE_ZERO_STEPS[0][0] and not is_quarter_turn:
+        is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
+        if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:
             out += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
     return out
 
@@ -176,17 +183,22 @@ def _refine_zeros(trial: Trial, zeros: Sequence[_Candidate]) -> list[_Candidate]
     # The misfit of the nominal robot is smallest at another angle if the robot has errors.
     refined = []
     for each in zeros:
-        ((joint, offset),) = each.hypothesis.offsets.items()
-        best = float(-np.rad2deg(offset))
+        (joint,), best = each.hypothesis.offsets, _angle(each)
         for reach, step in _FINE_ZERO_STEPS:
             angles = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
             changed = [zero_hypothesis(trial.chain, joint, angle).apply(trial.samples) for angle in angles]
             evidence = [fit_evidence(trial.chain, item or trial.samples, trial.sets).log for item in changed]
             best = angles[int(np.argmax(evidence))]
-        if abs(best) >= _MIN_ZERO:
+        if abs(best) >= _MIN_LIKELY_ZERO:
             zero = zero_hypothesis(trial.chain, joint, best)
             refined += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
     return refined
+
+
+def _angle(zero: _Candidate) -> float:
+    """Return the angle by which a hypothesis says that the zero of a joint is off [deg]."""
+    (offset,) = zero.hypothesis.offsets.values()
+    return float(-np.rad2deg(offset))
 
 
 def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:

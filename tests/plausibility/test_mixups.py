@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from measurement_files import frames, joint_positions, real_ur10
@@ -120,6 +122,33 @@ def test_errors_of_the_robot_do_not_hide_the_angle_of_a_zero(sim_3dof, seed):
     (hypothesis,) = found.hypotheses
     mended = mend(sim_3dof, wrong, hypothesis.key)
     np.testing.assert_allclose(np.rad2deg(mended.q - data.q), 0, atol=3)
+
+
+@pytest.mark.parametrize(
+    ("path", "tip", "joint"),
+    [
+        ("ur_description/urdf/ur3_robot.urdf", "tool0", 1),
+        # The correction makes this arm 1 % longer, which is no scale of the instrument.
+        ("ur_description/urdf/ur10_robot.urdf", "tool0", 1),
+        ("panda_description/urdf/panda.urdf", "panda_link8", 1),
+    ],
+)
+def test_a_zero_that_the_calibration_corrects_is_named_if_the_correction_is_large(path, tip, joint):
+    """The zero is off by 8.5°, the correction by as much; with the named change it is of ordinary size."""
+    arm = Chain.from_urdf(robot_file(path), tip)
+    rng, errors = np.random.default_rng(71), select_parameters(arm, "minimal,base,tool")
+    truth = errors.at(0.5 * np.minimum(errors.priors, 0.1) * rng.standard_normal(len(errors.parameters)))
+    q = rng.uniform(-2, 2, (50, len(arm.joint_names)))
+    data = Position.simulate(truth, q, Noise(5e-5), rng)
+    wrong = data.resample(data.q + np.deg2rad(8.5) * np.eye(q.shape[1])[joint])
+    found = calibrate(arm, wrong, "minimal,base,tool")
+    assert not found.diagnosis.hypotheses
+    (reason,) = found.verdict.reasons
+    (key,) = re.findall(r"add --mend (\S+)\.$", reason)
+    assert key.startswith(f"zero:{arm.joint_names[joint]}:-")
+    mended = mend(arm, wrong, key)
+    np.testing.assert_allclose(np.rad2deg(mended.q - data.q), 0, atol=1.0)
+    assert calibrate(arm, mended, "minimal,base,tool").verdict.status == "ok"
 
 
 def test_zeros_of_any_angle_are_mended_beside_other_mistakes(ur10):
