@@ -33,6 +33,7 @@ from ..measurements.euler_angles import (
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
+from ..robot.inverse_kinematics import tool_pose_and_jacobian
 from ..robot.joint_path import joint_path
 from ..session.facts import MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
@@ -45,6 +46,8 @@ JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
 _AND = "+"
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
+# Motion of the tool per unit of a joint that counts as none [m].
+_MIN_MOTION = 1e-3
 # Largest lag that can be undone [rows or s].
 MAX_LAG = 100.0
 # Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
@@ -375,11 +378,14 @@ class Hypothesis:
             return self.change.first.concerns_joints and self.change.second.concerns_joints
         return isinstance(self.change, JointChange | RowShift)
 
-    def log_jacobian(self, data: Sequence[Measurement]) -> float:
+    def log_jacobian(self, chain: Chain, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""
         if isinstance(self.change, BothChanges):
             first, second = self.change.first, self.change.second
-            return first.log_jacobian(data) + second.log_jacobian(first.apply(data) or data)
+            changed = first.apply(data) or data
+            return first.log_jacobian(chain, data) + second.log_jacobian(chain, changed)
+        if isinstance(self.change, JointChange):
+            return sum(_log_contact_jacobian(chain, item, self.change) for item in data if item.is_contact)
         if isinstance(self.change, AxisScale):
             n_values = sum(len(item.rows) for item in data if self.change.apply(item) is not None)
             return float(max(0, n_values - 1) * -np.log(self.change.factor))
@@ -388,6 +394,22 @@ class Hypothesis:
         n_lengths = sum(_count_lengths(item) for item in data if self.change.apply(item) is not None)
         # The places of instrument and target scale with the lengths.
         return float(max(0, n_lengths - N_PLACES) * np.log(self.change.factor))
+
+
+def _log_contact_jacobian(chain: Chain, item: Measurement, change: JointChange) -> float:
+    """Return the logarithm of the change of the joint values that hold the tool at touched points."""
+    # Joint values are what a contact measures: a small factor makes their noise small, too. The combinations
+    # of them that move the tool count, but for those that determine the points.
+    factors = np.array(change.factors)
+    if (factors == 1).all():
+        return 0.0
+    jacobian = tool_pose_and_jacobian(chain, item.configurations() * factors)[1][:, :3]
+    before, after = (
+        np.linalg.slogdet(each @ np.swapaxes(each, 1, 2) + _MIN_MOTION**2 * np.eye(3))[1]
+        for each in (jacobian, jacobian * factors)
+    )
+    share = 1 - len(item.instrument_parameters) / (item.residual_dim * len(item.rows))
+    return 0.5 * max(0.0, share) * float(np.sum(after - before))
 
 
 def _count_lengths(item: Measurement) -> int:

@@ -282,7 +282,8 @@ def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[
     for step, (hypothesis, changed, _) in enumerate(candidates, 1):
         trial.progress(phase, step, len(candidates))
         after = fit_evidence(trial.chain, changed, trial.sets)
-        log = after.log * _count(trial.samples) / _count(changed) + hypothesis.log_jacobian(trial.samples)
+        log = after.log * _count(trial.samples) / _count(changed)
+        log += hypothesis.log_jacobian(trial.chain, trial.samples)
         scored.append((log, hypothesis, after))
     return scored
 

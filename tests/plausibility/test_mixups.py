@@ -19,7 +19,7 @@ from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
 from dhcal_pin.plausibility.misfit import nominal_misfits
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, DHTable
 
 
 @pytest.fixture(scope="module")
@@ -360,6 +360,35 @@ def test_other_instruments_show_mixed_up_joints(ur10, kind):
     wrong = with_joints(data, flipped(2))
     assert "sign:elbow_joint" in [hypothesis.key for hypothesis in diagnose_mixups(ur10, [wrong]).hypotheses]
     assert not diagnose_mixups(ur10, [data]).hypotheses
+
+
+@pytest.mark.parametrize("seed", some_slow(list(range(10)), {2, 5}))
+def test_noise_of_a_joint_that_measures_a_contact_is_no_wrong_unit(seed):
+    """The lift of a SCARA alone determines the height of a point: in another unit it has no noise."""
+    rng = np.random.default_rng(seed)
+    lower, upper = np.array([-2.2, -2.2, 0, -3]), np.array([2.2, 2.2, 0.2, 3])
+    arm = Chain.from_dh(
+        DHTable(
+            "standard",
+            ("shoulder", "elbow", "lift", "wrist"),
+            np.array([False, False, True, False]),
+            np.zeros(4),
+            np.array([0.4, 0, 0, 0.1]),
+            np.array([0.35, 0.25, 0, 0]),
+            np.array([0, np.pi, 0, 0]),
+            np.zeros(4),
+            lower,
+            upper,
+        )
+    )
+    errors = select_parameters(arm, "placement,base,tool")
+    sizes = np.array([{"m": 1e-3, "rad": 5e-3}[parameter.unit] for parameter in errors.parameters])
+    truth = errors.at(sizes * rng.standard_normal(len(sizes)))
+    data = PointContact.simulate(truth, rng.uniform(lower, upper, (60, 4)), Noise(5e-5), rng)
+    assert not diagnose_mixups(arm, [data]).hypotheses
+    wrong = data.resample(data.q * [1, 1, 1e3, 1])
+    (hypothesis,) = diagnose_mixups(arm, [wrong]).hypotheses
+    assert hypothesis.key == "joint:lift:mm-not-m"
 
 
 @pytest.mark.parametrize("kind", [Pose, Position])
