@@ -102,6 +102,8 @@ from .reweighting import Fit, leverages, reweight, with_sigma_scales
 MIN_CORRELATED_NOISE = 0.02
 # Smallest rise of the log evidence for which a family is added: odds of 250 to 1.
 MIN_LOG_BAYES_FACTOR = 5.5
+# Largest number of selections; each but the first is without the outliers that the last one shows.
+MAX_SELECTIONS = 3
 # Number of random folds.
 N_FOLDS = 5
 # Smallest number of different configurations for a selection.
@@ -565,12 +567,20 @@ def extend(
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or no_progress
-    report(PHASE, 1, _N_STEPS)
-    trials, model, random_ratio, selected = select_families(judged, families)
-    report(PHASE, 2, _N_STEPS)
-    extended, noise = fit, _noise(judged)
-    if selected:
-        extended, noise = _fit_selected(fit, selected, model, max_iterations)
+    core, has_outliers = fit, False
+    for _ in range(MAX_SELECTIONS):
+        judged = core.without_rejected()
+        report(PHASE, 1, _N_STEPS)
+        trials, model, random_ratio, selected = select_families(judged, families)
+        report(PHASE, 2, _N_STEPS)
+        extended, noise = core, _noise(judged)
+        if selected:
+            extended, noise = _fit_selected(core, selected, model, max_iterations)
+        # Outliers that the errors of the joints hid hide further families.
+        is_new = any(np.any(new < old) for new, old in zip(extended.weights, core.weights, strict=True))
+        if not (is_new and _rejection_stage(extended) == robust.REJECTED):
+            break
+        core, has_outliers = core.solved_with_weights(extended.weights, max_iterations), True
     report(PHASE, 3, _N_STEPS)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if _are_residuals_correlated(extended, noise):
@@ -579,7 +589,7 @@ def extend(
     if not selected and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
     errors = _region_errors(extended.without_rejected().problem, extended.solution.x, noise, temperature)
-    geometry = _region_errors(judged.problem, fit.solution.x, _noise(judged), 1.0)
+    geometry = _region_errors(judged.problem, core.solution.x, _noise(judged), 1.0)
     if errors and geometry:
         region_ratio = errors.rms / geometry.rms
         if temperature > 1:
@@ -594,7 +604,7 @@ def extend(
     solution = minimize(problem, "lm", start.x, max_iterations, warm_start=start, loose=True)
     extended = replace(extended, problem=problem, solution=solution)
     # Outliers were found already: the last robust stage decides which of them are rejected.
-    stage = _rejection_stage(extended) if fit.stage == robust.REJECTED else fit.stage
+    stage = _rejection_stage(extended) if has_outliers or fit.stage == robust.REJECTED else fit.stage
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     return reweight(extended, (stage,), (), max_iterations, progress, leverages), extension

@@ -206,7 +206,7 @@ def calibrate(
         result = _calibrate_samples(setup, replace(begun, fit=fit), groups, extended)
         # The scale of one axis and a zero far off make the robot longer or shorter, too.
         if found and not found.scales and not result.diagnosis.zero:
-            scale = find_scale(fit.problem, fit.solution.x)
+            scale = find_scale(result.problem, result.x)
             found = replace(found, scales=(scale,) if scale else ())
         result = replace(result, session=found)
     return replace(result, **settings)

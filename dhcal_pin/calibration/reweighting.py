@@ -88,6 +88,14 @@ class Fit:
         solution = minimize(problem, "lm", self.solution.x, max_iterations, loose=True)
         return replace(self, problem=problem, solution=solution, previous_iterations=self.iterations)
 
+    def solved_with_weights(self, weights: tuple[Array, ...], max_iterations: int) -> Fit:
+        """Solve loosely again with other robust weights."""
+        ratios = zip(self.problem.data, weights, self.weights, strict=True)
+        problem = self.problem.with_data([item.with_weights(new / old) for item, new, old in ratios])
+        solution = minimize(problem, "lm", self.solution.x, max_iterations, loose=True)
+        solved = replace(self, problem=problem, solution=solution, previous_iterations=self.iterations)
+        return replace(solved, weights=weights)
+
     def without_rejected(self) -> Fit:
         """Return the fit without rejected samples, which are not evidence of the noise."""
         masks = [w > robust.ZERO_WEIGHT for w in self.weights]

@@ -125,6 +125,42 @@ def test_simulated_family_is_added(family):
     assert fit.validate(more)["position_rms_m"] < 0.5 * plain.validate(more)["position_rms_m"]
 
 
+@pytest.mark.parametrize("seed", some_slow(list(range(6)), {0, 1}))
+def test_outliers_that_joint_errors_hide_do_not_hide_other_families(seed):
+    """The sag of the joints is as large as the outliers; backlash and growth of links are smaller."""
+    rng = np.random.default_rng(seed)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select_parameters(arm, "minimal,base,tool,compliance,backlash,thermal")
+    sizes = {"compliance": 3e-5, "backlash": 4e-4, "thermal": 2e-5}
+    widths = np.minimum(errors.priors, 0.1)
+    values = rng.normal(size=len(widths)) * widths
+    for family, size in sizes.items():
+        names = {p.name for p in select_parameters(arm, family).parameters}
+        own = np.array([p.name in names for p in errors.parameters])
+        values[own] = size * rng.uniform(0.5, 1.5, own.sum())
+    truth = errors.at(values).with_current_loads()
+
+    def measured(m: int, noise: float) -> Position:
+        q = rng.uniform(-2.5, 2.5, (m, 6))
+        conditions = Conditions(
+            q, approach=rng.choice([-1.0, 1.0], q.shape), temperature=rng.uniform(18, 32, m)
+        )
+        return Position.simulate(truth, conditions, Noise(noise), rng)
+
+    data, more = measured(105, 5e-5), measured(200, 1e-9)
+    wrong, errors_of_them = data.values.copy(), rng.normal(size=(3, 3))
+    wrong[[10, 50, 90]] += 5e-3 * errors_of_them / np.linalg.norm(errors_of_them, axis=1, keepdims=True)
+    fit, clean = calibrate(arm, data.replace(values=wrong)), calibrate(arm, data)
+    assert fit.extension is not None
+    assert {"compliance", "backlash", "thermal"} <= set(fit.extension.supported)
+    outliers = set(np.flatnonzero(fit.weights[0] < 0.5))
+    # One good sample in four thousand is rejected beside them.
+    assert outliers >= {10, 50, 90}
+    assert len(outliers) <= 4
+    rms = [one.validate(more)["position_rms_m"] for one in (fit, clean)]
+    assert rms[0] < 1.3 * rms[1]
+
+
 @pytest.mark.parametrize(("family", "other"), [("compliance", "harmonics"), ("harmonics", "compliance")])
 def test_a_family_that_is_added_with_another_is_told_from_a_supported_one(family, other):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
