@@ -21,6 +21,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..estimation.error_model import ErrorModel
 from ..estimation.problem import Problem
+from ..estimation.robust import MAD_TO_STD
 from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
@@ -173,7 +174,7 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
         return True
     unchanged, _ = extended(without)
     residuals = [residuals_of(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
-    noise = [1.4826 * size for size in _sizes(residuals[1], 0.5)]
+    noise = [MAD_TO_STD * size for size in _sizes(residuals[1], 0.5)]
     costs = [
         sum(
             float(np.sum(np.minimum(np.sum((r / s) ** 2, 0), len(r) + MAX_SAMPLE_COST)))

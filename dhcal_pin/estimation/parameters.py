@@ -37,6 +37,7 @@ from .. import se3
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
+from ..robot.dh_extraction import HAYATI_MAX_RAD
 from ..robot.error_families import FAMILIES, ErrorFamily
 from ..robot.transmission import coefficient_indices
 from .error_model import ErrorModel, ErrorParameter
@@ -60,8 +61,6 @@ _HARMONIC_NAME = re.compile(r"(.+)\.((?:sin|cos)\d+)")
 
 # Difference to 1 of an axis' largest component below which the axis counts as an axis of its frame.
 AXIS_ALIGNMENT_TOL = 1e-5
-# Angle [rad] between joint axes below which `hayati` replaces d by β.
-MAX_PARALLEL_ANGLE = np.deg2rad(5.0)
 
 _FRAME_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
@@ -110,7 +109,7 @@ def _is_nearly_parallel(chain: Chain, i: int, convention: Convention) -> bool:
     link = i + 1 if convention == "standard" else i
     if not 0 < link < len(chain.moving_joints):
         return False
-    return abs(chain.link_transforms[link][2, 2]) > np.cos(MAX_PARALLEL_ANGLE)
+    return abs(chain.link_transforms[link][2, 2]) > np.cos(HAYATI_MAX_RAD)
 
 
 def dh(chain: Chain) -> list[ErrorParameter]:

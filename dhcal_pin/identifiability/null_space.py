@@ -36,6 +36,7 @@ from ..measurements.base import Measurement
 from ..measurements.pose import Pose
 from ..measurements.position import Position
 from ..robot.chain import Chain
+from ..robot.sampling import joint_range
 from .propagation import NEGLIGIBLE
 
 Cause = Literal["structure", "instrument", "poses", "unmoved"]
@@ -114,10 +115,8 @@ class ObservabilityProbe:
         )
 
     def draw_configurations(self, rng: np.random.Generator, m: int) -> Array:
-        """Draw joint positions within the limits and within ±π rad or ±π m."""
-        chain = self.chain
-        low, high = np.maximum(chain.lower, -np.pi), np.minimum(chain.upper, np.pi)
-        return rng.uniform(low, high, (m, chain.n_joints))
+        """Draw joint positions within the limits and within half a turn or half a metre."""
+        return rng.uniform(*joint_range(self.chain), (m, self.chain.n_joints))
 
     def _resampled(self, item: Measurement, joints: Sequence[int], rng: np.random.Generator) -> Measurement:
         """Return a measurement with joints drawn anew, in images near the measured ones."""

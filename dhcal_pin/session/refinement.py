@@ -8,6 +8,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem
+from ..estimation.robust import MAD_TO_STD
 from .facts import Session
 from .linear_model import Layout, inverse, whitened_rows
 from .robot_changes import apply_changes, update
@@ -33,7 +34,7 @@ def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
         columns = [rows[..., layout.model], *(cause.columns_of(rows, numbers, times) for cause in causes)]
         jacobian, residual = np.concatenate(columns, -1), rows[..., -1]
         size = np.sqrt(np.mean(residual**2, 1))
-        noise = max(1.4826 * float(np.median(np.abs(residual))), MIN_NOISE)
+        noise = max(MAD_TO_STD * float(np.median(np.abs(residual))), MIN_NOISE)
         weights = np.minimum(1.0, HUBER_LIMIT * noise / np.fmax(size, 1e-300))[:, None, None]
         flat = (jacobian * np.sqrt(weights)).reshape(-1, len(prior)) / noise
         right = (residual[..., None] * np.sqrt(weights)).ravel() / noise

@@ -33,6 +33,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..estimation.problem import Problem
+from ..estimation.robust import MAD_TO_STD
 from ..measurements.base import Measurement, residual_of
 from ..measurements.configurations import group_by_configuration
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
@@ -240,7 +241,7 @@ class _Search:
             freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
             for chosen in labels:
-                scale = 1.4826 * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
+                scale = MAD_TO_STD * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
                 noise[chosen] = max(scale, MIN_NOISE)
             size = np.sqrt(np.sum((after / noise) ** 2 * is_row, 1) / is_row.sum(1))
             previous, weights = weights, np.minimum(1.0, HUBER_LIMIT / np.maximum(size, 1e-12))

@@ -345,6 +345,20 @@ def test_similar_poses_name_the_joint_to_move():
     assert all("joint_5" in text for text in texts)
 
 
+@pytest.mark.parametrize(("low", "high"), [(3.5, 6.0), (-7.0, -3.3)])
+def test_a_joint_whose_range_lies_beyond_half_a_turn_is_drawn_within_it(low, high):
+    """Ranges such as 3.5 to 6 rad raised an error of NumPy."""
+    limits = np.full(6, np.pi)
+    lower, upper = np.append(-limits[1:], low), np.append(limits[1:], high)
+    chain = Chain.from_dh(replace(paper("sim_6dof"), lower=lower, upper=upper))
+    of = problem(chain, "dh", q=np.random.default_rng(0).uniform(lower, upper, (40, 6)))
+    drawn = ObservabilityProbe(of, np.zeros(len(of.weights))).draw_configurations(
+        np.random.default_rng(0), 50
+    )
+    assert np.all((drawn >= lower) & (drawn <= upper))
+    assert explain(of) == THEORY[0][3]
+
+
 @pytest.mark.parametrize("seeds", some_slow([1, 3], {0}))
 @pytest.mark.parametrize("arm", [*TABLES, "ur10", "tiago", "sim_6dof_actual"])
 def test_poses_over_the_full_range_need_no_advice(arm, seeds):
