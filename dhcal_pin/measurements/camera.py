@@ -21,7 +21,7 @@ covariance is I + A·Aᵀ, and residuals and Jacobians are multiplied by its inv
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -693,14 +693,24 @@ def exp_and_jacobian(rotvec: Array) -> tuple[Array, Array]:
     return np.eye(3) + first * k + second * square, np.eye(3) + second * k + third * square
 
 
+def select_images(data: Sequence[Measurement]) -> list[CameraCorners]:
+    """Return the image coordinates among measurements."""
+    return [item for item in data if isinstance(item, CameraCorners)]
+
+
+def change_images(
+    data: Sequence[Measurement], change: Callable[[CameraCorners], CameraCorners]
+) -> tuple[Measurement, ...]:
+    """Return measurements whose image coordinates are changed by a function."""
+    return tuple(change(item) if isinstance(item, CameraCorners) else item for item in data)
+
+
 def with_shown_entries(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
     """Return measurements whose rigs have the cameras and boards that any of their images shows."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     cameras = {item.rig.cameras[i].name for item in images for i in np.unique(item.camera)}
     boards = {item.rig.boards[i].name for item in images for i in np.unique(item.board)}
-    return tuple(
-        item._with_entries(cameras, boards) if isinstance(item, CameraCorners) else item for item in data
-    )
+    return change_images(data, lambda item: item._with_entries(cameras, boards))
 
 
 def _solve_symmetric(matrices: Array, right: Array) -> Array:

@@ -115,7 +115,7 @@ def test_estimated_corners_have_the_size_of_their_board():
     arm, images = photograph(3, 5e-4)
     (board,) = images.rig.boards
     images = with_rig(images, boards=(replace(board, has_free_points=True),)).initialized(arm)
-    larger = _scaled(images, 1.1)
+    larger = _scaled(1.1, images)
     assert isinstance(larger, CameraCorners)
     (points,) = larger.points(np.array([p.nominal for p in larger.instrument_parameters]))
     np.testing.assert_allclose(points, 1.1 * board.points, atol=1e-12)

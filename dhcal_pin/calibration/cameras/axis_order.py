@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from ...estimation.problem import Problem, merge_instrument_parameters
 from ...estimation.solver import minimize
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, change_images, select_images
 from ...robot.chain import Chain
 from ..reweighting import Fit
 from .stages import ImageError, Stage, fitted_error
@@ -82,9 +83,7 @@ def exchange_axes(
     """Find exchanged values of cameras, and put intrinsics into the order that explains the images."""
     out = tuple(data)
     found: list[Exchange] = []
-    names = dict.fromkeys(
-        camera.name for item in data if isinstance(item, CameraCorners) for camera in item.rig.cameras
-    )
+    names = dict.fromkeys(camera.name for item in select_images(data) for camera in item.rig.cameras)
     for name in names:
         best = _best_order(chain, _images_of(data, name), name)
         if best is not None:
@@ -100,12 +99,7 @@ def reorder(data: Sequence[Measurement], exchanges: Sequence[Exchange]) -> tuple
     out = tuple(data)
     for exchange in exchanges:
         if exchange.what in ORDERS:
-            out = tuple(
-                _reordered(item, exchange.camera, ORDERS[exchange.what])
-                if isinstance(item, CameraCorners)
-                else item
-                for item in out
-            )
+            out = change_images(out, partial(_reordered, exchange.camera, ORDERS[exchange.what]))
     return out
 
 
@@ -121,11 +115,10 @@ def axis_stages(exchanges: Sequence[Exchange]) -> tuple[Stage, ...]:
 def _images_of(data: Sequence[Measurement], name: str) -> list[CameraCorners]:
     """Return the images of one camera in measurements."""
     out = []
-    for item in data:
-        if isinstance(item, CameraCorners):
-            numbers = [i for i, camera in enumerate(item.rig.cameras) if camera.name == name]
-            mask = np.isin(item.camera, numbers)
-            out += [item.take(mask)] if mask.any() else []
+    for item in select_images(data):
+        numbers = [i for i, camera in enumerate(item.rig.cameras) if camera.name == name]
+        mask = np.isin(item.camera, numbers)
+        out += [item.take(mask)] if mask.any() else []
     return out
 
 
@@ -152,7 +145,7 @@ def _best_order(chain: Chain, parts: Sequence[CameraCorners], name: str) -> Exch
         changed = [i for i, other in enumerate(order.intrinsics) if other != i]
         is_change = np.all(np.abs(values[list(order.intrinsics)] - values)[changed] > MIN_CHANGE)
         if is_change and stated[0].pixels >= order.min_error:
-            found = _frames_error(chain, [_reordered(part, name, order) for part in parts])
+            found = _frames_error(chain, [_reordered(name, order, part) for part in parts])
             if found is not None:
                 errors[what] = found[0]
     what = min(errors, key=lambda each: errors[each].pixels, default="")
@@ -191,7 +184,7 @@ def _thinned(item: CameraCorners) -> CameraCorners:
     return item.take(np.isin(item.image, chosen))
 
 
-def _reordered(item: CameraCorners, name: str, order: AxisOrder) -> CameraCorners:
+def _reordered(name: str, order: AxisOrder, item: CameraCorners) -> CameraCorners:
     """Return a measurement with another order of the values of a camera."""
     cameras, values = [], {}
     pixels, sigma = item.values.copy(), item.sigma.copy()

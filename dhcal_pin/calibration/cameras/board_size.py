@@ -14,6 +14,7 @@ number n of lengths that the images determine (MacKay 1992).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,8 +22,7 @@ from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.problem import Problem
 from ...estimation.solver import minimize
-from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, change_images, select_images
 from ...measurements.images.camera_parameters import POINTS_SET
 from ..reweighting import Fit
 from .causes import MAX_SIZE_STEP, SIZE_STEP, find_minimum
@@ -74,7 +74,7 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     problem, x = fit.problem, fit.solution.x
     stated = _rms_correction(problem.errors, x)
     lengths = _lengths(problem.errors)
-    if stated < MIN_DOUBTFUL_CORRECTION or not all(isinstance(item, CameraCorners) for item in problem.data):
+    if stated < MIN_DOUBTFUL_CORRECTION or len(select_images(problem.data)) < len(problem.data):
         return None
     # Wide priors would leave the size of the arm undetermined.
     weights = problem.weights.copy()
@@ -83,7 +83,7 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     best = [x]
 
     def solve(log_size: float) -> tuple[Problem, Array]:
-        scaled = problem.with_data([_scaled(item, float(np.exp(log_size))) for item in problem.data])
+        scaled = problem.with_data(change_images(problem.data, partial(_scaled, float(np.exp(log_size)))))
         return scaled, minimize(scaled, "lm", best[0], _MAX_ITERATIONS, loose=True).x
 
     def cost(log_size: float) -> float:
@@ -97,8 +97,8 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     ratio = count * np.log(stated / max(found, 1e-9))
     if ratio < MIN_DOUBTFUL_LOG_RATIO or abs(log_size) < MIN_CHANGE:
         return None
-    boards = [b for item in problem.data if isinstance(item, CameraCorners) for b in item.rig.boards]
-    return BoardSize(float(np.exp(log_size)), boards[0].square, stated, found, float(ratio))
+    square = select_images(problem.data)[0].rig.boards[0].square
+    return BoardSize(float(np.exp(log_size)), square, stated, found, float(ratio))
 
 
 def _lengths(errors: ErrorModel) -> Array:
@@ -113,9 +113,8 @@ def _rms_correction(errors: ErrorModel, x: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
 
 
-def _scaled(item: Measurement, size: float) -> Measurement:
+def _scaled(size: float, item: CameraCorners) -> CameraCorners:
     """Return images of boards of another size."""
-    assert isinstance(item, CameraCorners)
     boards = tuple(
         replace(board, type="points", listed_points=size * board.points) for board in item.rig.boards
     )

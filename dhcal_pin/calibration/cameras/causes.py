@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from ...estimation.robust import KEPT
 from ...estimation.solver import minimize
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, change_images, select_images
 from ...measurements.images.camera_start import first_values
 from ..reweighting import Fit, reweight
 
@@ -92,7 +92,7 @@ class HandEyeData:
 
 def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:
     """Return images with the rig and the joint values of some causes."""
-    return _shifted(_with_rig(causes, item), hand_eye, causes)
+    return _shifted(hand_eye, causes, _with_rig(causes, item))
 
 
 def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
@@ -135,18 +135,14 @@ def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
         # Parameters are in the order of their frames.
         parameters = sorted((*errors.parameters, *arm.parameters), key=lambda p: p.error_frame)
         errors = replace(arm, parameters=tuple(parameters))
-    data = tuple(
-        _with_rig(causes, item) if isinstance(item, CameraCorners) else item for item in hand_eye.data
-    )
+    data = change_images(hand_eye.data, partial(_with_rig, causes))
     known = dict(hand_eye.known)
     if causes.has_lens:
-        freed = {name for item in data if isinstance(item, CameraCorners) for name in _lens_names(item)}
+        freed = {name for item in select_images(data) for name in _lens_names(item)}
         known = {name: value for name, value in known.items() if name not in freed}
     if start is None:
-        data = tuple(_without_poses(item, known) for item in data)
-    data = tuple(
-        _shifted(item, hand_eye, causes) if isinstance(item, CameraCorners) else item for item in data
-    )
+        data = change_images(data, partial(_without_poses, known))
+    data = change_images(data, partial(_shifted, hand_eye, causes))
     data = tuple(item.initialized(errors.chain) for item in data)
     weights = np.array([1 / p.prior for p in errors.parameters])
     problem = make_problem(errors, data, weights, known)
@@ -160,15 +156,13 @@ def _lens_names(item: CameraCorners) -> list[str]:
     return [p.name for p in item.instrument_parameters if item.set_of(p.name) == "intrinsics"]
 
 
-def _without_poses(item: Measurement, known: Mapping[str, float]) -> Measurement:
+def _without_poses(known: Mapping[str, float], item: CameraCorners) -> CameraCorners:
     """Return images without first values of the poses that are estimated."""
-    if not isinstance(item, CameraCorners):
-        return item
     names = [p.name for p in item.instrument_parameters if item.set_of(p.name) in ("camera", "board")]
     return item.with_values({name: np.nan for name in names if name not in known})
 
 
-def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> CameraCorners:
+def _shifted(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> CameraCorners:
     """Return the images for which there are shifted joint values, with these and with first values."""
     if not causes.shift:
         return item
@@ -189,7 +183,7 @@ def _shifted(item: CameraCorners, hand_eye: HandEyeData, causes: Causes) -> Came
 
 def file_sequence(data: Sequence[Measurement]) -> Array:
     """Return the joint values of all images in the order of the rows of their file."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     q = np.concatenate([item.q for item in images])
     rows = np.concatenate([item.rows for item in images])
     q = q[np.argsort(rows, kind="stable")]
@@ -206,7 +200,7 @@ def places_in_sequence(sequence: Array, q: Array) -> Array:
 # ------------------------------------------------------------------------------------ sizes and shifts
 def find_sizes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]) -> dict[str, float]:
     """Find the size of each board that fits the images best."""
-    names = [b.name for item in hand_eye.data if isinstance(item, CameraCorners) for b in item.rig.boards]
+    names = [b.name for item in select_images(hand_eye.data) for b in item.rig.boards]
     sizes = dict.fromkeys(dict.fromkeys(names), 1.0) | dict(causes.sizes)
     for name in sizes:
 

@@ -28,7 +28,7 @@ from ...estimation.robust import ZERO_WEIGHT
 from ...exceptions import DhcalError
 from ...formatting import Quantity, Table, format_quantity
 from ...measurements.base import Measurement, errors_of, instrument_values
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, select_images
 from ...measurements.images.names import list_images
 from ...plausibility.displacement import measure_correction
 from ...subsampling import evenly_spaced_indices
@@ -331,7 +331,7 @@ def describe_contradiction(fit: Fit, errors: Accuracy) -> str:
     if board is None or pixels is None or not lengths:
         return ""
     jitter = residual_jitter(fit)
-    sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
+    sigma = np.concatenate([item.sigma for item in select_images(fit.data)])
     noise = jitter.noise * se3.rms_length(sigma)
     # Larger errors are refused.
     if not jitter.is_significant or not MAX_NOISE_RATIO * noise < pixels.rms <= MAX_LINEAR_ERROR:
@@ -378,7 +378,7 @@ class _State:
         error = held_out_error(fit, folds)
         assert error is not None
         jitter = residual_jitter(fit)
-        sigma = np.concatenate([item.sigma for item in fit.data if isinstance(item, CameraCorners)])
+        sigma = np.concatenate([item.sigma for item in select_images(fit.data)])
         scatter = jitter.noise * se3.rms_length(sigma)
         growth = min(float(np.hypot(1.0, held_out_prediction_std(fit, folds))), MAX_LEFT_OUT_RATIO)
         return cls(causes, fit, error, scatter, growth * scatter, jitter.is_significant)
@@ -645,7 +645,7 @@ def _arm_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
 
 def _images(data: Sequence[Measurement]) -> CameraCorners:
     """Return the first image coordinates among measurements."""
-    return next(item for item in data if isinstance(item, CameraCorners))
+    return select_images(data)[0]
 
 
 def _rig(data: Sequence[Measurement]) -> Any:

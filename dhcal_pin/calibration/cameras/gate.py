@@ -39,7 +39,7 @@ from ...estimation.priors import PriorGroups, determined_fractions, effective_pa
 from ...estimation.problem import Problem
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import select_images
 from ...measurements.images.camera_parameters import POINTS_SET
 from ..partition import Fold, configuration_groups, k_fold
 from ..reweighting import Fit
@@ -213,7 +213,7 @@ def temperature(n_configurations: int, samples: int) -> float:
 
 def rows_per_displacement(data: Sequence[Measurement]) -> float:
     """Return the number of image coordinates per component of the displacement of an image, at least 1."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     n_configurations = len(np.unique(configuration_groups(images)))
     # Corners that share a displacement contain six independent values per image, however many they are.
     return max(sum(2 * len(item.rows) for item in images) / (6 * n_configurations), 1.0)
@@ -297,8 +297,7 @@ def without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fi
     errors = nominal_arm(problem.errors)
     values = {
         p.name: p.nominal
-        for item in problem.data
-        if isinstance(item, CameraCorners)
+        for item in select_images(problem.data)
         for p in item.instrument_parameters
         if item.set_of(p.name) in held
     }

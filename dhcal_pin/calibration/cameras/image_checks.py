@@ -26,7 +26,7 @@ from ...estimation.robust import ZERO_WEIGHT
 from ...estimation.uncertainty import Uncertainty
 from ...formatting import Quantity
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, select_images
 from ...measurements.mounting import Mount, MountedRig
 from ...robot.chain import Chain
 from ..partition import different_configurations
@@ -60,7 +60,7 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
     # Corners within `max_error` [px] of the model, and not mostly rejected, are not questioned.
     if fitted_error(fit).pixels <= max_error and rejected.mean() <= MAX_IMAGE_OUTLIER_SHARE:
         return ""
-    images = [item for item in fit.data if isinstance(item, CameraCorners)]
+    images = select_images(fit.data)
     if len(images) < len(fit.data):
         return ""
     differences = [
@@ -196,7 +196,7 @@ def _largest_std(blocks: Sequence[Array]) -> float:
 
 def second_rotation(chain: Chain, data: Sequence[Measurement]) -> float:
     """Return the RMS rotation of the tool about the axis with the second largest rotation [rad]."""
-    q = np.unique(np.concatenate([item.q for item in data if isinstance(item, CameraCorners)]), axis=0)
+    q = np.unique(np.concatenate([item.q for item in select_images(data)]), axis=0)
     rotations = chain.poses(q)[:, :3, :3]
     mean = se3.nearest_rotation(rotations.mean(0))
     turns = np.array([se3.log3(mean.T @ rotation) for rotation in rotations])

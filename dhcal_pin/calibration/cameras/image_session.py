@@ -21,7 +21,7 @@ from ... import se3
 from ..._typing import Array
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, select_images
 from ...measurements.pose import Pose
 from ...robot.chain import Chain
 from ...session import Session, refine_changes
@@ -71,7 +71,7 @@ def find_image_session(
     arm: ArmType,
 ) -> Session | None:
     """Find what happened while images of one camera and one board were taken; None if it is unknown."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
     if len(images) < len(data) or len(pairs) != 1:
         return None

@@ -14,7 +14,7 @@ from dataclasses import replace
 from ...estimation.priors import PriorGroup, PriorGroups
 from ...estimation.problem import Problem
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, change_images, select_images
 from ..reweighting import Fit
 
 # Narrowest prior as a fraction of the default one: half a pixel, and 0.003 for distortion.
@@ -25,8 +25,7 @@ def lens_prior_groups(problem: Problem) -> PriorGroups:
     """Group the values of the lenses that the rig states with a prior."""
     stated = {
         (f"camera_{camera.name}", unit)
-        for item in problem.data
-        if isinstance(item, CameraCorners)
+        for item in select_images(problem.data)
         for camera in item.rig.cameras
         if camera.intrinsics == "prior"
         for unit in (("px", "1") if camera.has_intrinsics else ("1",))
@@ -73,14 +72,9 @@ def with_lens_priors(fit: Fit) -> Fit:
         )
         if p.unit in ("px", "1")
     }
-    data = [
-        item.replace(
-            instrument_parameters=tuple(
-                replace(p, prior=prior.get(p.name, p.prior)) for p in item.instrument_parameters
-            )
-        )
-        if isinstance(item, CameraCorners)
-        else item
-        for item in fit.data
-    ]
-    return replace(fit, data=tuple(data))
+
+    def with_priors(item: CameraCorners) -> CameraCorners:
+        parameters = (replace(p, prior=prior.get(p.name, p.prior)) for p in item.instrument_parameters)
+        return item.replace(instrument_parameters=tuple(parameters))
+
+    return replace(fit, data=change_images(fit.data, with_priors))

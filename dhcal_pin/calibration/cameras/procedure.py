@@ -22,7 +22,7 @@ from ...estimation.priors import PriorGroups
 from ...estimation.robust import KEPT
 from ...exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import change_images, select_images
 from ...robot.chain import Chain
 from ..result import Result, make_result
 from ..reweighting import Fit, reweight
@@ -51,7 +51,7 @@ def require_shown_families(extend: str | Sequence[str] | None, families: Sequenc
 
 def with_common_start(chain: Chain, data: tuple[Measurement, ...]) -> tuple[Measurement, ...]:
     """Return images of several files with first values from all of them, if one file alone has too few."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     names = {tuple(p.name for p in item.instrument_parameters) for item in images}
     if len(images) < 2 or len(names) > 1:
         return data
@@ -62,7 +62,7 @@ def with_common_start(chain: Chain, data: tuple[Measurement, ...]) -> tuple[Meas
         columns = {n: np.concatenate([getattr(item, n) for item in images]) for n in images[0].sample_fields}
         joined = images[0].replace(**columns, recorded=None).initialized(chain)
         start = {p.name: p.nominal for p in joined.instrument_parameters}
-        return tuple(item.with_values(start) if isinstance(item, CameraCorners) else item for item in data)
+        return change_images(data, lambda item: item.with_values(start))
     return data
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from ...estimation.parameters import LOW_COST, set_names
 from ...exceptions import InvalidArgumentError
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import select_images
 from ...robot.chain import Chain
 
 # Parameter sets of a rig by name, with one line for help texts.
@@ -86,7 +86,7 @@ def require_joint_values(data: Sequence[Measurement], names: Sequence[str]) -> N
 
 def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, float]:
     """Find the parameters of cameras and boards that are held at the values of the rig."""
-    images = [item for item in data if isinstance(item, CameraCorners)]
+    images = select_images(data)
     if sets and not images:
         raise InvalidArgumentError(
             f"parameter set {sets[0]!r} needs image coordinates; expected measurements with the columns u, v "
@@ -102,10 +102,5 @@ def held_values(data: Sequence[Measurement], sets: Sequence[str]) -> dict[str, f
 
 def count_corners(data: Sequence[Measurement]) -> int:
     """Return the number of corners of all boards."""
-    boards = {
-        board.name: len(board.points)
-        for item in data
-        if isinstance(item, CameraCorners)
-        for board in item.rig.boards
-    }
+    boards = {board.name: len(board.points) for item in select_images(data) for board in item.rig.boards}
     return sum(boards.values())

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ...cameras.boards import Board
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners
+from ...measurements.camera import CameraCorners, change_images, select_images
 from ..partition import Fold
 from ..reweighting import Fit
 from .sets import MAX_POINTS
@@ -87,7 +88,7 @@ def judged_boards(boards: Iterable[Board]) -> list[str]:
 
 def boards_of(data: Sequence[Measurement]) -> list[Board]:
     """Return the boards of images."""
-    return [board for item in data if isinstance(item, CameraCorners) for board in item.rig.boards]
+    return [board for item in select_images(data) for board in item.rig.boards]
 
 
 def with_free_points(fit: Fit, boards: Collection[str]) -> Fit:
@@ -96,7 +97,7 @@ def with_free_points(fit: Fit, boards: Collection[str]) -> Fit:
     names = [p.name for p in problem.instrument_parameters]
     weights = dict(zip(names, problem.weights[robot:].tolist(), strict=True))
     values = dict(zip(names, fit.solution.x[robot:].tolist(), strict=True))
-    data = tuple(_free_points(item, boards) for item in problem.data)
+    data = change_images(problem.data, partial(_free_points, boards))
     freed = replace(problem, data=data)
     parameters = freed.instrument_parameters
     own = [weights.get(p.name, np.sqrt(problem.temperature) / p.prior) for p in parameters]
@@ -107,16 +108,14 @@ def with_free_points(fit: Fit, boards: Collection[str]) -> Fit:
         bounds = np.concatenate([bounds, np.tile([[-np.inf], [np.inf]], n_more)], 1)
     return replace(
         fit,
-        data=tuple(_free_points(item, boards) for item in fit.data),
+        data=change_images(fit.data, partial(_free_points, boards)),
         problem=replace(freed, weights=np.concatenate([problem.weights[:robot], own]), bounds=bounds),
         solution=replace(fit.solution, x=np.concatenate([fit.solution.x[:robot], x])),
     )
 
 
-def _free_points(item: Measurement, boards: Collection[str]) -> Measurement:
+def _free_points(boards: Collection[str], item: CameraCorners) -> CameraCorners:
     """Return image coordinates with the corners of some boards as unknowns."""
-    if not isinstance(item, CameraCorners):
-        return item
     freed = tuple(
         replace(board, has_free_points=board.has_free_points or board.name in boards)
         for board in item.rig.boards
