@@ -153,6 +153,13 @@ def _log3_near_half_turn(r: Array) -> Array:
     return q[:, 1:] * (2 * np.arctan2(sine, q[:, 0]) / sine)[:, None]
 
 
+def turn_between(start: Array, end: Array) -> Array:
+    """Return rotations about the axes normal to both that turn unit vectors (..., 3) into other ones."""
+    axis, cosine = np.cross(start, end), np.sum(start * end, -1, keepdims=True)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    return exp3(axis / np.maximum(sine, 1e-300) * np.arctan2(sine, cosine))
+
+
 def right_jacobian_inverse(rotvec: ArrayLike) -> Array:
     """Compute the inverse right Jacobian of SO(3).
 
@@ -208,6 +215,12 @@ def quaternion_to_matrix(quaternion: ArrayLike) -> Array:
     quaternion = np.asarray(quaternion, float)
     cross = skew(quaternion[..., 1:])
     return np.eye(3) + 2 * quaternion[..., :1, None] * cross + 2 * cross @ cross
+
+
+def rotvec_to_quaternion(rotvec: Array) -> Array:
+    """Convert rotation vectors (..., 3) to unit quaternions w, x, y, z, (..., 4)."""
+    half = 0.5 * np.linalg.norm(rotvec, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * rotvec * np.sinc(half / np.pi)], -1)
 
 
 def nearest_rotation(matrix: Array) -> Array:

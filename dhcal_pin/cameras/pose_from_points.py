@@ -193,14 +193,7 @@ def _mirror_plane(pose: Array) -> list[Array]:
     mirrored = 2 * (normal @ sight) * sight - normal
     if np.linalg.norm(mirrored - normal) < 1e-9:
         return []
-    return [se3.transform(_turn_between(normal, mirrored) @ pose[:3, :3], position)]
-
-
-def _turn_between(start: Array, end: Array) -> Array:
-    """Return the rotation about the axis normal to both that turns a unit vector (3,) into another one."""
-    axis = np.cross(start, end)
-    sine = np.linalg.norm(axis)
-    return se3.exp3(axis / max(sine, 1e-300) * np.arctan2(sine, start @ end))
+    return [se3.transform(se3.turn_between(normal, mirrored) @ pose[:3, :3], position)]
 
 
 def _mirror(pose: Array, points: Array) -> list[Array]:
@@ -217,7 +210,7 @@ def _orthographic_pose(points: Array, image: Array) -> Array:
     sights = np.column_stack([image, np.ones(len(image))])
     sights /= np.linalg.norm(sights, axis=1)[:, None]
     axis = sights.mean(0) / np.linalg.norm(sights.mean(0))
-    turn = _turn_between(axis, np.array([0.0, 0.0, 1.0]))
+    turn = se3.turn_between(axis, np.eye(3)[2])
     turned = sights @ turn.T
     plane = turned[:, :2] / turned[:, 2:]
     centre, middle = points.mean(0), plane.mean(0)

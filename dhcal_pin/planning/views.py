@@ -203,7 +203,7 @@ def draw_views(
         distance = rng.uniform(limits.min_distance, limits.max_distance, _BATCH)
         tilt, azimuth, roll = rng.uniform([[0], [0], [0]], [[largest], [2 * np.pi], [2 * np.pi]], (3, _BATCH))
         rotations = (
-            _towards(sight.T)
+            se3.turn_between(np.eye(3)[2], sight.T)
             @ se3.exp3(np.stack([zero, zero, azimuth], 1))
             @ se3.exp3(np.stack([tilt, zero, zero], 1))
             @ se3.exp3(np.stack([zero, zero, roll], 1))
@@ -220,15 +220,6 @@ def draw_views(
             "other distances, or a smaller share of the corners"
         )
     return out
-
-
-def _towards(directions: Array) -> Array:
-    """Return rotations (m, 3, 3) whose z axes are unit vectors (m, 3)."""
-    z = np.array([0.0, 0.0, 1.0])
-    axis = np.cross(z, directions)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    angle = np.arctan2(sine, directions[:, 2:])
-    return se3.exp3(axis * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 0.0))
 
 
 @dataclass(frozen=True)

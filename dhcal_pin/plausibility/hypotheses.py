@@ -232,7 +232,8 @@ class QuaternionOrder:
         # Read as w, x, y, z, the columns x, y, z, w have to move by one; the other way round, back.
         step = 1 if self.order == "xyzw" else -1
         return _with_rotations(
-            item, lambda old: se3.quaternion_to_matrix(np.roll(_matrix_to_quaternion(old), step, 1))
+            item,
+            lambda old: se3.quaternion_to_matrix(np.roll(se3.rotvec_to_quaternion(se3.log3(old)), step, 1)),
         )
 
 
@@ -340,14 +341,6 @@ def _with_rotations(item: Measurement, change: Callable[[Array], Array]) -> Pose
 def _with_poses(item: PoseMeasurement, poses: Array) -> PoseMeasurement:
     """Return measurements with other poses (m, 4, 4), whose Euler angles are not known."""
     return item.replace(poses=poses, angles=np.full_like(item.angles, np.nan))
-
-
-def _matrix_to_quaternion(rotations: Array) -> Array:
-    """Convert rotations (m, 3, 3) to unit quaternions w, x, y, z of either sign, (m, 4)."""
-    vectors = se3.log3(rotations)
-    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
-    # sin(a/2)/a, with its limit 1/2 at 0.
-    return np.concatenate([np.cos(0.5 * angles), vectors * 0.5 * np.sinc(0.5 * angles / np.pi)], 1)
 
 
 @dataclass(frozen=True)

@@ -219,9 +219,7 @@ def corrected_text(
             unit = targets.units[name]
             columns[f"{name}[{unit}]"] = _cells(values * ANGLES[unit])
     else:
-        half_angle = np.linalg.norm(rotvec, axis=1) / 2
-        vector = rotvec * np.sinc(half_angle / np.pi)[:, None] / 2
-        columns |= dict(zip(QUATERNION, map(_cells, [np.cos(half_angle), *vector.T]), strict=True))
+        columns |= dict(zip(QUATERNION, map(_cells, se3.rotvec_to_quaternion(rotvec).T), strict=True))
     unit = targets.units["x"]
     columns[f"miss_position[{unit}]"] = _cells(result.residual_error[:, 0] * LENGTHS[unit])
     if targets.values.ndim == 3:
