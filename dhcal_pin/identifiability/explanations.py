@@ -371,14 +371,8 @@ class Explainer:
 
     def _explain_poses(self, group: UnobservableGroup) -> tuple[str, str]:
         """Explain directions that more or other poses would make observable."""
-        problem, r = self.probe.problem, group.vectors.shape[1]
-        samples = sum(len(item.rows) for item in problem.data)
-        n_equations = self.probe.n_equations
-        if len(self.names) - self.layers["unmoved"].shape[1] == n_equations:
-            n_missing = -(-r * samples // n_equations)
-            return f"{n_equations} equations for {len(self.names)} parameters", (
-                f"measure at least {format_count(n_missing, 'more pose')}"
-            )
+        if len(self.names) - self.layers["unmoved"].shape[1] == self.probe.n_equations:
+            return _explain_few_equations(self.probe, group.vectors.shape[1])
         chain = self.plain_errors.chain
         decisive = [
             j
@@ -387,6 +381,13 @@ class Explainer:
         ]
         joints = _list_names([chain.joint_names[j] for j in decisive]) if decisive else "the joints"
         return "the poses are too similar", f"measure poses over the full range of {joints}"
+
+
+def _explain_few_equations(probe: ObservabilityProbe, n_open: int) -> tuple[str, str]:
+    """Explain that unknowns are open because there are too few equations, and how many poses are missing."""
+    n_equations, samples = probe.n_equations, sum(len(item.rows) for item in probe.problem.data)
+    poses = format_count(-(-n_open * samples // n_equations), "more pose")
+    return f"{n_equations} equations for {len(probe.x)} parameters", f"measure at least {poses}"
 
 
 def explain_unobservable(probe: ObservabilityProbe, system: TriangularSystem) -> list[str]:
@@ -438,10 +439,8 @@ def _explain_curves(probe: ObservabilityProbe, system: TriangularSystem, curve_j
         name: round(float(shares[curve_joints == i].sum())) for i, name in enumerate(probe.chain.joint_names)
     }
     listed = ", ".join(f"{name} {share}" for name, share in by_joint.items() if share)
-    samples = sum(len(item.rows) for item in probe.problem.data)
     if system.rank == probe.n_equations:
-        reason = f"{probe.n_equations} equations for {len(others)} parameters"
-        advice = f"measure at least {-(-count * samples // probe.n_equations)} more poses"
+        reason, advice = _explain_few_equations(probe, count)
     elif n_open(probe.full_range, qr.rank(probe.full_range)) < count:
         reason, advice = "the poses are too similar", "measure poses over the full range of the joints"
     else:
