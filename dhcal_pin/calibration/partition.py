@@ -40,16 +40,11 @@ _MIN_RELATIVE_SPREAD = 1e-6
 
 def _merge_groups(labels: Array, others: Array) -> Array:
     """Merge groups (m,) that have samples of one group (m,) of the others in common; keep their order."""
-    values, merged = np.unique(labels, return_inverse=True)
+    values, groups = np.unique(labels, return_inverse=True)
     _, others = np.unique(others, return_inverse=True)
-    while True:
-        lowest = np.full(len(merged), len(values))
-        np.minimum.at(lowest, others, merged)
-        by_group = np.full(len(values), len(values))
-        np.minimum.at(by_group, merged, lowest[others])
-        if np.array_equal(by_group[merged], merged):
-            return values[merged]
-        merged = by_group[merged]
+    connected = connect_nodes(len(values) + len(others), groups, len(values) + others)
+    _, first, merged = np.unique(connected[: len(values)], return_index=True, return_inverse=True)
+    return values[first[merged]][groups]
 
 
 def configuration_groups(data: Sequence[Measurement]) -> Array:
