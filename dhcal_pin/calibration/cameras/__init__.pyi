@@ -41,7 +41,6 @@ from .sets import held_values as held_values
 from .sets import image_sets as image_sets
 from .sets import require_joint_values as require_joint_values
 from .sets import split_sets as split_sets
-from .stages import STAGES as STAGES
 from .stages import ImageError as ImageError
 from .stages import Stage as Stage
 from .stages import fitted_error as fitted_error

@@ -1,8 +1,10 @@
 """Stages of a calibration from images: which unknowns were freed in turn, and what each of them improved.
 
-Unknowns are freed in the order of `STAGES`. Each stage is judged on images that its fit did not see: on
-random ones, and on whole regions of joint space. Random images lie between fitted ones, and a wrong model
-may predict them well. Regions show whether the model holds elsewhere.
+The stages in their order are "axis order" (exchanged axes of the intrinsics), "frames" (poses of cameras and
+boards), "intrinsics" (lenses), "target points" (corners of the boards) and "arm" (errors of the arm). Each
+stage is judged on images that its fit did not see: on random ones, and on whole regions of joint space.
+Random images lie between fitted ones, and a wrong model may predict them well. Regions show whether the model
+holds elsewhere.
 """
 
 from __future__ import annotations
@@ -19,10 +21,6 @@ from ...measurements.base import errors_of
 from ...measurements.camera import CameraCorners
 from ..reweighting import Fit
 
-# Stages in their order: exchanged axes of the intrinsics, poses of cameras and boards, lenses, corners of the
-# boards, errors of the arm.
-STAGES = ("axis order", "frames", "intrinsics", "target points", "arm")
-
 
 @dataclass(frozen=True)
 class ImageError:
@@ -38,7 +36,7 @@ class ImageError:
 class Stage:
     """Accuracy after one more group of unknowns was freed."""
 
-    name: str  # One of `STAGES`
+    name: str  # One of the stages above
     is_kept: bool  # Whether the unknowns of this stage are free in the result
     n_unknowns: int  # Number of unknowns of the fit of this stage
     fitted: ImageError  # Error of the fitted images
