@@ -32,7 +32,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -47,9 +47,9 @@ from .problem import (
     Chunk,
     Linearization,
     Problem,
-    chunk_residual,
     linear_system,
     uses_normal_equations,
+    whitened_residuals,
 )
 from .solver import SolverResult
 
@@ -276,10 +276,11 @@ class SolvedProblem:
         else:
             root = system.sqrt_covariance(problem.weights)[0]
             chunks = problem.map_chunks(partial(_prediction_covariance, model, root))
-        return [
-            np.concatenate([np.empty((0, item.residual_dim, item.residual_dim)), *_chunks_of(chunks, item)])
-            for item in problem.data
-        ]
+        out = []
+        for item in problem.data:
+            parts = [next(chunks) for _ in range(0, len(item.rows), CHUNK_SIZE)]
+            out.append(np.concatenate([np.empty((0, item.residual_dim, item.residual_dim)), *parts]))
+        return out
 
 
 def studentized_residuals(
@@ -294,18 +295,12 @@ def studentized_residuals(
         n_unknowns = effective_parameters(problem, solution)
     if n_rows <= n_unknowns and n_rows <= solution.system.rank:
         return [np.zeros(len(item.rows)) for item in data]
-    chain = problem.chain(solution.x)
     # Residuals of one image are whitened together. Rejected ones must not contribute to the others.
     weighted = [
         item if np.all(w == 1) else item.with_weights(w) for item, w in zip(data, weights, strict=True)
     ]
-    chunks = problem.with_data(weighted).map_chunks(
-        partial(chunk_residual, chain, problem.instruments(solution.x))
-    )
-    residuals = [
-        np.concatenate([np.empty((item.residual_dim, 0)), *_chunks_of(chunks, item)], 1) / np.sqrt(w)
-        for item, w in zip(data, weights, strict=True)
-    ]
+    whitened = whitened_residuals(problem.with_data(weighted), solution.x)
+    residuals = [residual / np.sqrt(w) for residual, w in zip(whitened, weights, strict=True)]
     covariances = (
         residual_covariances(solved.prediction_covariances, weights)
         if n_unknowns >= NEGLIGIBLE_LEVERAGE * n_rows
@@ -316,12 +311,6 @@ def studentized_residuals(
         standardized_residuals(residual, covariance, w > 0.5)
         for residual, covariance, w in zip(residuals, covariances, weights, strict=True)
     ]
-
-
-def _chunks_of(results: Iterator[Array], item: Measurement) -> Iterator[Array]:
-    """Yield the next results that belong to one measurement."""
-    for _ in range(0, len(item.rows), CHUNK_SIZE):
-        yield next(results)
 
 
 def residual_covariances(predictions: Sequence[Array], weights: Sequence[Array]) -> list[Array]:
