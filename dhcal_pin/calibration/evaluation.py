@@ -204,6 +204,16 @@ def error_norms(errors: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     return {group: np.concatenate(out[group]) for group in in_order(out)}
 
 
+def aligned_norms(errors: Sequence[Mapping[str, Array]], data: Sequence[Measurement]) -> dict[str, Array]:
+    """Return the error norms of all samples by group, (N,) each; NaN for samples without this group."""
+    parts = [error_norms([each]) for each in errors]
+    unknown = [np.full(len(item.rows), np.nan) for item in data]
+    return {
+        group: np.concatenate([norms.get(group, nan) for norms, nan in zip(parts, unknown, strict=True)])
+        for group in dict.fromkeys(group for norms in parts for group in norms)
+    }
+
+
 def accuracy(
     chain: Chain, data: Measurement | Sequence[Measurement], known: Mapping[str, float] | None = None
 ) -> Accuracy:

@@ -20,11 +20,11 @@ from ..identifiability.null_space import ObservabilityProbe
 from ..io.origins_file import without_negligible_moves
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
-from ..measurements.groups import ERROR_GROUPS, error_group
+from ..measurements.groups import ERROR_GROUPS
 from . import cameras, summary
 from .cross_validation import refit
 from .estimates import Estimate, make_estimates
-from .evaluation import Accuracy, accuracy, compute_errors
+from .evaluation import Accuracy, accuracy, aligned_norms, compute_errors
 from .evidence import Evidence
 from .presentation import ResultPlots
 from .presentation.residual_table import ResidualTable, residual_table
@@ -144,20 +144,11 @@ class Result(Evidence, ResultPlots):
         The samples are in the order of `residuals`: first the fitted ones, outliers included, then the
         held-out ones. Samples without a group have NaN.
         """
-        nominal, instruments = self._nominal
-        counts = [len(item.rows) for item in (*self.data, *self.holdout)]
-        starts = np.cumsum([0, *counts])
-        norms: dict[str, tuple[Array, Array]] = {}
-        for side, chain, known in ((0, nominal, instruments), (1, self.chain, self.instruments)):
-            errors = [
-                error for data in (self.data, self.holdout) for error in compute_errors(chain, data, known)
-            ]
-            for start, groups in zip(starts, errors, strict=False):
-                for name, values in groups.items():
-                    empty = np.full((2, starts[-1]), np.nan)
-                    sides = norms.setdefault(error_group(name), (empty[0], empty[1]))
-                    sides[side][start : start + len(values)] = np.linalg.norm(values, axis=1)
-        return norms
+        sides = []
+        for chain, known in (self._nominal, (self.chain, self.instruments)):
+            errors = [e for data in (self.data, self.holdout) for e in compute_errors(chain, data, known)]
+            sides.append(aligned_norms(errors, (*self.data, *self.holdout)))
+        return {group: (before, sides[1][group]) for group, before in sides[0].items()}
 
     @cached_property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -8,8 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from .._typing import Array
-from ..calibration.evaluation import Accuracy, compute_errors, error_norms
+from ..calibration.evaluation import Accuracy, aligned_norms, compute_errors
 from ..calibration.summary import STATISTIC_LABELS, statistic
 from ..formatting import Table, format_count
 from ..iso9283.characteristics import PoseCharacteristics
@@ -78,23 +77,11 @@ def validation_page(validation: Validation) -> str:
 def _samples(validation: Validation) -> Samples:
     """Collect the samples of a validation."""
     data, chain = validation.data, validation.chain
-    norms = {"after": _norms(chain, data, validation.known)}
+    fits = {"after": (chain, validation.known)}
     if validation.reference:
-        norms = {"before": _norms(validation.reference[0], data, validation.reference[1])} | norms
+        fits = {"before": validation.reference} | fits
+    norms = {side: aligned_norms(compute_errors(of, data, known), data) for side, (of, known) in fits.items()}
     return measured_samples(chain, measurement_names(validation.paths, data), data, norms)
-
-
-def _norms(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> dict[str, Array]:
-    """Return the error norms of all samples by group, (N,) each; NaN for samples without this group."""
-    parts = [
-        (len(item.rows), error_norms([errors]))
-        for item, errors in zip(data, compute_errors(chain, data, known), strict=True)
-    ]
-    groups = {group for _, norms in parts for group in norms}
-    return {
-        group: np.concatenate([norms.get(group, np.full(count, np.nan)) for count, norms in parts])
-        for group in groups
-    }
 
 
 def _sections(validation: Validation, samples: Samples) -> list[Section]:
