@@ -28,11 +28,11 @@ from ..identifiability import explanations
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files import Part
 from ..measurements.arguments import require_chain
-from ..measurements.base import Measurement, instrument_values, residual_of
+from ..measurements.base import Measurement, instrument_values
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
+from .presentation.residual_table import sigma_scales
 from .procedure import Method, calibrate
-from .result import Result
 
 _Value = TypeVar("_Value")
 
@@ -174,7 +174,7 @@ def calibrate_stream(
         known,
         executor,
         parts=parts,
-        scales=_sigma_scales(fit, head),
+        scales=None if head.has_stated_sigma else sigma_scales(fit, 0),
     )
     solution = minimize(problem, method, fit.x, max_iterations, progress)
     calibrated = fit.errors.at(solution.x)
@@ -191,18 +191,6 @@ def calibrate_stream(
         for total in (before, after)
     )
     return StreamResult(problem, solution.x, calibrated, solution, n_samples, before, after)
-
-
-def _sigma_scales(fit: Result, head: Measurement) -> dict[str, float] | None:
-    """Return the scales of unstated standard deviations that the fit of the first part determined."""
-    if head.has_stated_sigma:
-        return None
-    (used,) = fit.problem.data
-    plain, scaled = (residual_of(item, fit.chain, fit.problem.instruments(fit.x)) for item in (head, used))
-    return {
-        name: float(np.linalg.norm(plain[group.rows]) / np.linalg.norm(scaled[group.rows])) or 1.0
-        for name, group in head.residual_groups.items()
-    }
 
 
 def _squared_errors(

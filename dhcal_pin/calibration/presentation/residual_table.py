@@ -180,11 +180,11 @@ def _with_fitted_sigma(fit: Evidence, item: Measurement) -> Measurement:
     same_kind = [i for i, other in enumerate(fit.data) if other.kind == item.kind]
     same_file = [i for i in same_kind if item.source and fit.data[i].source == item.source]
     for index in [*same_file, *same_kind]:
-        return item.with_scaled_sigma(_sigma_scales(fit, index))
+        return item.with_scaled_sigma(sigma_scales(fit, index))
     return item.with_scaled_sigma(dict.fromkeys(item.residual_groups, np.nan))
 
 
-def _sigma_scales(fit: Evidence, index: int) -> dict[str, float]:
+def sigma_scales(fit: Evidence, index: int) -> dict[str, float]:
     """Return the factor by which the fit scaled the standard deviations of each residual group."""
     u = fit.problem.instrument_values_of(fit.data[index], fit.x)
     frames = fit.chain.forward_kinematics(fit.data[index].conditions())
