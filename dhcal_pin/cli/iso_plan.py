@@ -24,7 +24,6 @@ from .options import read_one_robot
 from .output_table import Makers, Output, chosen_files, file_contents, paths_by_name
 from .outputs import checked_files, write_outputs
 from .plan_input import input_paths, parse_length, workspace_constraints
-from .plan_outputs import DEGREE_DECIMALS
 from .screens import console
 from .screens.result_screens import files_block, notes_block
 from .screens.screen import Block, Screen
@@ -71,10 +70,8 @@ class IsoPlanned:
 
 def _poses_text(done: IsoPlanned) -> str:
     """Return the content of the file of poses."""
-    units = done.args.joint_units
     comments = [done.title, "move to P5 before the first row: every point is approached from the one before"]
-    decimals = DEGREE_DECIMALS if units == "deg" else None
-    return configurations_text(done.q, done.chain, comments, units, decimals, done.labels)
+    return configurations_text(done.q, done.chain, comments, done.args.joint_units, done.labels)
 
 
 def _program_content(done: IsoPlanned, path: str) -> str:

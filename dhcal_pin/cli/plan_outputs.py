@@ -22,9 +22,6 @@ from ..report.provenance import versions
 from ..robot.chain import Chain
 from .output_table import Makers, Output, chosen_files, paths_by_name
 
-# Decimals of joint positions in degrees and millimetres: 0.36 arc seconds.
-DEGREE_DECIMALS = 4
-
 
 @dataclass(frozen=True, eq=False)
 class Planned:
@@ -69,9 +66,7 @@ class Planned:
             f"{pixels}{1e3 * noise.position:.4g} mm, {np.degrees(noise.rotation):.4g} deg",
         ]
         comments += _counts(self)
-        units = self.args.joint_units
-        decimals = DEGREE_DECIMALS if units == "deg" else None
-        return configurations_text(plan.q, self.chain, [*comments, *self.moves], units, decimals)
+        return configurations_text(plan.q, self.chain, [*comments, *self.moves], self.args.joint_units)
 
     @cached_property
     def scene(self) -> str:

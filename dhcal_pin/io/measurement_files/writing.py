@@ -18,6 +18,8 @@ from .columns import ISO_POINT, SECOND_PREFIX, check_joint_names, condition_colu
 
 # Unit of prismatic joints beside the unit of revolute joints.
 _LENGTH_UNITS = {"rad": "m", "deg": "mm"}
+# Decimals of planned joint positions in degrees and millimetres: 0.36 arc seconds.
+_DEGREE_DECIMALS = 4
 
 
 def measurement_text(data: Measurement, chain: Chain, comments: Sequence[str] = ()) -> str:
@@ -63,11 +65,11 @@ def configurations_text(
     chain: Chain,
     comments: Sequence[str],
     angle_unit: str,
-    decimals: int | None,
     iso_points: Sequence[str] = (),
 ) -> str:
     """Return the CSV text of joint positions, with the points of a test according to ISO 9283 if given."""
     check_joint_names(chain)
+    decimals = _DEGREE_DECIMALS if angle_unit == "deg" else None
     columns = joint_columns(q, chain, angle_unit=angle_unit, decimals=decimals)
     return csv_text({ISO_POINT: iso_points} | columns if iso_points else columns, comments)
 
