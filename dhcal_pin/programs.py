@@ -62,15 +62,10 @@ class Program:
 
 def program_text(program: Program, path: PathLike) -> str:
     """Write a program in the format that the ending of a file name selects."""
-    require_program_ending(path)
-    name = os.fspath(path).lower()
-    return next(write for ending, write in FORMATS.items() if name.endswith(ending))(program)
-
-
-def require_program_ending(path: PathLike) -> None:
-    """Require the file extension of a program."""
-    if not os.fspath(path).lower().endswith(tuple(FORMATS)):
-        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; choose from {', '.join(FORMATS)}")
+    for ending, write in FORMATS.items():
+        if os.fspath(path).lower().endswith(ending):
+            return write(program)
+    raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; choose from {', '.join(FORMATS)}")
 
 
 def urscript(program: Program) -> str:

@@ -16,14 +16,15 @@ from ..formatting import Table
 from ..io.measurement_files import configurations_text
 from ..iso9283.cube import CYCLES, N_CENTRES, SIDES, IsoCube, find_iso_cube
 from ..measurements.base import Noise
-from ..programs import Program, Stop, program_text, require_program_ending
+from ..programs import Program, Stop, program_text
 from ..report.provenance import file_digests, versions
 from ..robot.chain import Chain
 from ..units import parse_noise
 from .options import read_one_robot
-from .output_table import Makers, Output, chosen_files, file_contents, paths_by_name
+from .output_table import Makers, chosen_files, file_contents, paths_by_name
 from .outputs import checked_files, write_outputs
 from .plan_input import input_paths, parse_length, workspace_constraints
+from .plan_outputs import OUTPUTS as OUTPUTS_OF_PLANS
 from .screens import console
 from .screens.result_screens import files_block, notes_block
 from .screens.screen import Block, Screen
@@ -83,7 +84,7 @@ def _program_content(done: IsoPlanned, path: str) -> str:
     return program_text(Program(done.chain, done.title, warning, stops), path)
 
 
-OUTPUTS = {"output": Output("poses", (".csv",)), "json": Output(), "export": Output()}
+OUTPUTS = {name: OUTPUTS_OF_PLANS[name] for name in ("output", "json", "export")}
 
 
 def run_iso_plan(args: Namespace) -> int:
@@ -93,8 +94,6 @@ def run_iso_plan(args: Namespace) -> int:
             raise InvalidArgumentError(f"{option}: not allowed with --iso9283, which states all poses")
     inputs = input_paths(args)
     files = checked_files(args, OUTPUTS, inputs)
-    for path in args.export:
-        require_program_ending(path)
     sides = [parse_length(args.cube, "--cube", "a side with a unit, such as 400mm")] if args.cube else SIDES
     if sides[0] <= 0:
         raise InvalidArgumentError(f"--cube {args.cube}: expected a side above zero, such as 400mm")

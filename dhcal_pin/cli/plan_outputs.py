@@ -17,7 +17,7 @@ from ..io.robot import robot_name
 from ..io.servo_file import read_servos
 from ..planning.planner import Plan
 from ..planning.views import CameraViews
-from ..programs import Program, Stop, program_text
+from ..programs import FORMATS, Program, Stop, program_text
 from ..report.provenance import versions
 from ..robot.chain import Chain
 from .output_table import Makers, Output, chosen_files, paths_by_name
@@ -140,7 +140,7 @@ def _report_content(done: Planned) -> str:
 OUTPUTS = {
     "output": Output("poses", (".csv",)),
     "json": Output(),
-    "export": Output(),
+    "export": Output("a program", tuple(FORMATS)),
     "html": Output("a scene", (".html",), (".htm",)),
     "report": Output("the report of a plan", (".html",), (".htm",)),
 }

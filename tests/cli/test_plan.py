@@ -170,7 +170,7 @@ def test_box_and_visibility(tmp_path, capsys):
         (("--obstacle", "1,0,0:0,1,1m"), "below the second"),
         (("--obstacle", "nowhere.urdf"), "nowhere.urdf"),
         (("--obstacle", str(URDF / "sim_6dof.urdf")), "no collision geometry; expected obstacles"),
-        (("--export", "moves.gcode"), "unknown ending; choose from .script"),
+        (("--export", "moves.gcode"), "unknown ending; write a program as .script or .trajectory.csv"),
     ],
 )
 def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, capsys, options, words):

@@ -52,16 +52,15 @@ ARGUMENTS: Options = {
 def run(args: Namespace) -> int:
     """Correct targets, write them, and show which could not be reached."""
     from ...compensation import compensate  # lazy import, as the following: they load Pinocchio
-    from ...programs import program_text, require_program_ending
-    from ..output_table import numbered
-    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
+    from ...programs import FORMATS, program_text
+    from ..output_table import Output, numbered
+    from ..outputs import checked_files, existing_sidecars, write_with_json
 
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
     inputs = [*robots, *existing_sidecars(robots), args.targets, *tcp_file]
-    require_writable_outputs([args.output, *args.export, args.json], inputs)
-    for path in args.export:
-        require_program_ending(path)
+    table = {"output": Output(), "export": Output("a program", tuple(FORMATS)), "json": Output()}
+    checked_files(args, table, inputs)
     nominal, calibrated = read_robots(args)
     targets = io.read_targets(args.targets, calibrated)
     with screens.progress_bar("compensating", len(targets.values)) as progress:

@@ -22,8 +22,7 @@ def run(args: Namespace) -> int:
     for option in ("cube", "cycles"):
         if getattr(args, option):
             raise InvalidArgumentError(f"--{option}: needs --iso9283")
-    from ...programs import require_program_ending  # lazy import, as the following: they load Pinocchio
-    from ..arm_types import with_arm_type
+    from ..arm_types import with_arm_type  # lazy import, as the following: they load Pinocchio
     from ..output_table import file_contents
     from ..outputs import checked_files, require_workbook, write_outputs
     from ..plan_input import input_paths, planned_count, planned_kind, read_input
@@ -33,8 +32,6 @@ def run(args: Namespace) -> int:
     kind, inputs = planned_kind(args), input_paths(args)
     files = checked_files(args, OUTPUTS, inputs)
     require_workbook(args.sheet, inputs)
-    for path in args.export:
-        require_program_ending(path)
     chain = with_arm_type(read_one_robot(args.robot, args), args.arm, args.servos, args.parameters)
     given, rows = read_input(args, chain, kind)
     with screens.show_progress(f"choosing {count} poses") as progress:
