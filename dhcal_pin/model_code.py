@@ -73,17 +73,12 @@ class Language:
     link_term: str
 
 
-def require_code_ending(path: PathLike) -> None:
-    """Require the file extension of a language."""
-    if os.path.splitext(os.fspath(path))[1].lower() not in LANGUAGES:
-        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; choose from {', '.join(LANGUAGES)}")
-
-
 def model_code(chain: Chain, path: PathLike) -> str:
     """Write the model of a robot as source code in the language of the ending of a file name."""
-    require_code_ending(path)
     stem, ending = os.path.splitext(os.path.basename(os.fspath(path)))
-    language = LANGUAGES[ending.lower()]
+    language = LANGUAGES.get(ending.lower())
+    if language is None:
+        raise InvalidArgumentError(f"{os.fspath(path)}: unknown ending; choose from {', '.join(LANGUAGES)}")
     prefix = re.sub(r"\W", "_", stem, flags=re.ASCII).strip("_")
     if not prefix[:1].isalpha():
         prefix = f"model_{prefix}".strip("_")

@@ -278,7 +278,7 @@ def test_command_writes_the_robot_with_its_sidecar(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("output", "message"),
     [
-        ("model.c", "model.c: unknown ending; choose from .h, .py"),
+        ("model.c", "model.c: unknown ending; write source code as .h or .py"),
         ("no/model.h", "no/model.h: "),
         ("arm.py", "arm.py: is an input file"),
     ],

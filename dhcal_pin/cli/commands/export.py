@@ -23,12 +23,12 @@ ARGUMENTS: Options = {
 
 def run(args: Namespace) -> int:
     """Write the source code."""
-    from ...model_code import model_code, require_code_ending  # lazy import, as the following
-    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
+    from ...model_code import LANGUAGES, model_code  # lazy import, as the following
+    from ..output_table import Output
+    from ..outputs import checked_files, existing_sidecars, write_with_json
 
-    require_code_ending(args.output)
     inputs = [args.robot, *existing_sidecars([args.robot])]
-    require_writable_outputs([args.output, args.json], inputs)
+    checked_files(args, {"output": Output("source code", tuple(LANGUAGES)), "json": Output()}, inputs)
     text = model_code(read_one_robot(args.robot, args), args.output)
     write_with_json({args.output: text}, args.json, {"output": args.output}, inputs)
     screens.show(screens.files_screen([args.output]), args.verbosity)
