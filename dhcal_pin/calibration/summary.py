@@ -172,7 +172,7 @@ def headline(comparisons: Sequence[Comparison]) -> Headline:
         f"RMS {ERROR_GROUPS[group].label} {describe_samples(best)}: {before_text} before, {after_text} after"
     )
     if best.n_outliers:
-        text += f", without {_count_outliers(best.n_outliers)}"
+        text += f", without {format_count(best.n_outliers, 'outlier')}"
         everything = best.after_with_outliers.groups.get(group)
         text += (
             f" ({statistic(everything)} with {'it' if best.n_outliers == 1 else 'them'})"
@@ -252,11 +252,6 @@ def regressions(fit: Evidence, comparisons: Sequence[Comparison]) -> list[str]:
         for c in judged
         if headline([c]).percent_reduction < 0
     ]
-
-
-def _count_outliers(count: int) -> str:
-    """Return the number of outliers in words."""
-    return f"{count} outliers" if count > 1 else "one outlier"
 
 
 def describe_samples(comparison: Comparison) -> str:
