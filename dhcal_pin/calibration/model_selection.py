@@ -104,6 +104,9 @@ MIN_CORRELATED_NOISE = 0.02
 MIN_LOG_BAYES_FACTOR = 5.5
 # Largest number of selections; each but the first is without the outliers that the last one shows.
 MAX_SELECTIONS = 3
+# Share of rejected samples from which on joint errors are tried as their cause, and the largest growth of the
+# noise with which joint errors explain all samples.
+MIN_MISTAKEN_SHARE, MAX_NOISE_GROWTH = 0.1, 1.5
 # Number of random folds.
 N_FOLDS = 5
 # Smallest number of different configurations for a selection.
@@ -257,6 +260,10 @@ class Extension:
             "region_ratio": self.region_ratio,
             "trials": [asdict(trial) for trial in self.trials],
         }
+
+
+# Fit with families of joint errors, and what was added.
+ExtendedFit = tuple[Fit, Extension]
 
 
 @dataclass(frozen=True, eq=False)
@@ -554,9 +561,7 @@ def _region_errors(problem: Problem, x: Array, noise: float, temperature: float)
 
 
 @UnbufferedRows()
-def extend(
-    fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None
-) -> tuple[Fit, Extension]:
+def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None) -> ExtendedFit:
     """Add the families of joint errors that the measurements support, and find how much the samples count."""
     if unknown := [name for name in families if name not in EXTENSIONS]:
         raise UnknownNameError(
@@ -608,6 +613,33 @@ def extend(
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     return reweight(extended, (stage,), (), max_iterations, progress, leverages), extension
+
+
+def may_mistake_joint_errors(fit: Fit) -> bool:
+    """Return whether a robust fit of the geometry may take the errors of joints for outliers."""
+    # Samples that were approached from one side agree with each other, and so do those from the other side.
+    n_rejected, n_samples = _count_rejected(fit)
+    return n_rejected >= MIN_MISTAKEN_SHARE * n_samples
+
+
+def simpler_explanation(chosen: ExtendedFit, everything: ExtendedFit) -> ExtendedFit:
+    """Return the fit of everything if its joint errors explain most of the samples that the other rejects."""
+    (few, extension), (many, _) = everything, chosen
+    is_better = extension.supported and 2 * _count_rejected(few)[0] <= _count_rejected(many)[0]
+    return everything if is_better and _spread(few) <= MAX_NOISE_GROWTH * _spread(many) else chosen
+
+
+def _count_rejected(fit: Fit) -> tuple[int, int]:
+    """Return the number of rejected samples and of all."""
+    weights = np.concatenate(fit.weights)
+    return int(np.sum(weights <= robust.ZERO_WEIGHT)), len(weights)
+
+
+def _spread(fit: Fit) -> float:
+    """Return the RMS residual of the samples that are not rejected, in their own standard deviations."""
+    kept = fit.without_rejected()
+    squares = [r**2 for r in kept.problem.residuals(kept.solution.x, kept.data)]
+    return float(np.sqrt(sum(each.sum() for each in squares) / sum(each.size for each in squares)))
 
 
 def with_selected(

@@ -183,16 +183,24 @@ def calibrate(
     groups = _prior_groups(begun.fit, setup.priors)
     reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
+
+    @cache
+    def supported(fit: Fit, stages: tuple[str, ...], names: Sequence[str]) -> model_selection.ExtendedFit:
+        """Fit with robust weights and the families that are supported, from a first fit."""
+        chosen = extended(reweighted(fit, stages), names)
+        if stages != AUTO or not model_selection.may_mistake_joint_errors(reweighted(fit, stages)):
+            return chosen
+        everything = extended(reweighted(fit, (robust.KEPT,)), names)
+        return model_selection.simpler_explanation(chosen, everything)
+
     if setup.finds_session and can_have_session((*setup.data, *setup.holdout)):
         models = SessionModels(
             setup.errors,
             partial(_first_fit, setup),
             lambda fit: reweighted(fit, AUTO),
-            lambda fit: extended(reweighted(fit, AUTO), EXTENSIONS),
+            lambda fit: supported(fit, AUTO, EXTENSIONS),
             lambda fit: (
-                extended(reweighted(fit, AUTO), setup.families)
-                if setup.families
-                else (fit, model_selection.Extension())
+                supported(fit, AUTO, setup.families) if setup.families else (fit, model_selection.Extension())
             ),
             HAND_BUILT if setup.signs else MANUFACTURED,
         )
@@ -202,8 +210,10 @@ def calibrate(
     elif has_images(setup.data) and setup.priors != "none":
         result = _calibrate_images(setup, begun, groups)
     else:
-        fit, found = reweighted(begun.fit, robust.LOSSES[loss].stages), begun.session
-        result = _calibrate_samples(setup, replace(begun, fit=fit), groups, extended)
+        stages, found = robust.LOSSES[loss].stages, begun.session
+        fitted = replace(begun, fit=reweighted(begun.fit, stages))
+        with_families = partial(supported, begun.fit, stages, setup.families)
+        result = _calibrate_samples(setup, fitted, groups, with_families)
         # The scale of one axis and a zero far off make the robot longer or shorter, too.
         if found and not found.scales and not result.diagnosis.zero:
             scale = find_scale(result.problem, result.x)
@@ -443,7 +453,7 @@ def _calibrate_samples(
     setup: _Setup,
     begun: SessionFit,
     groups: PriorGroups,
-    extended: Callable[[Fit, Sequence[str]], tuple[Fit, model_selection.Extension]],
+    with_families: Callable[[], model_selection.ExtendedFit],
 ) -> Result:
     """Shrink the correction of a fit where the data are too few, and add families of joint errors."""
     fit, holdout, families = begun.fit, begun.holdout, setup.families
@@ -456,7 +466,7 @@ def _calibrate_samples(
         result = replace(result, earlier_diagnosis=diagnose(result, setup.progress))
     if not families or shrinkage_factor < 1 or result.diagnosis.hypotheses:
         return result
-    fit, extension = extended(fit, families)
+    fit, extension = with_families()
     result_with_families = make_result(fit, shrinkage_factor, holdout, "lm")
     return replace(
         result_with_families, signs=setup.signs, extension=extension, earlier_diagnosis=result.diagnosis

@@ -34,7 +34,7 @@ from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
-from .model_selection import Extension, outlier_weights, with_joint_errors
+from .model_selection import ExtendedFit, Extension, outlier_weights, with_joint_errors
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
 
@@ -55,7 +55,7 @@ SAME_ZERO = np.deg2rad(3.0)
 MAX_WIDTH = 8.0
 
 # Function that adds the families of joint errors that the measurements support to a fit.
-Extend = Callable[[Fit], tuple[Fit, Extension]]
+Extend = Callable[[Fit], ExtendedFit]
 
 
 @dataclass(frozen=True)

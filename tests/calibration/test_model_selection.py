@@ -161,6 +161,35 @@ def test_outliers_that_joint_errors_hide_do_not_hide_other_families(seed):
     assert rms[0] < 1.3 * rms[1]
 
 
+@pytest.mark.parametrize(
+    ("order", "seed"),
+    some_slow([(order, seed) for order in ("mixed", "halves") for seed in range(4)], {0, 4}),
+)
+def test_samples_approached_from_the_other_side_are_no_outliers(order, seed):
+    """All joints come from one side or from the other: half of the samples agree without backlash."""
+    rng = np.random.default_rng(seed)
+    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    errors = select_parameters(arm, "minimal,base,tool,backlash")
+    names = {p.name for p in select_parameters(arm, "backlash").parameters}
+    own = np.array([p.name in names for p in errors.parameters])
+    values = rng.normal(size=len(own)) * np.minimum(errors.priors, 0.1)
+    values[own] = rng.uniform(3e-4, 8e-4, own.sum())
+    truth = errors.at(values)
+
+    def measured(m: int, noise: float, sides: np.ndarray) -> Position:
+        conditions = Conditions(rng.uniform(-2.5, 2.5, (m, 6)), approach=np.tile(sides[:, None], 6))
+        return Position.simulate(truth, conditions, Noise(noise), rng)
+
+    sides = rng.choice([-1.0, 1.0], 70) if order == "mixed" else np.repeat([-1.0, 1.0], 35)
+    fit = calibrate(arm, measured(70, 5e-5, sides))
+    assert fit.extension is not None
+    assert "backlash" in fit.extension.supported
+    assert fit.n_outliers == 0
+    assert fit.verdict.status == "ok"
+    more = measured(200, 1e-9, rng.choice([-1.0, 1.0], 200))
+    assert fit.validate(more)["position_rms_m"] < 1e-4
+
+
 @pytest.mark.parametrize(("family", "other"), [("compliance", "harmonics"), ("harmonics", "compliance")])
 def test_a_family_that_is_added_with_another_is_told_from_a_supported_one(family, other):
     arm, data = simulated(f"minimal,base,tool,{family}", 3)
