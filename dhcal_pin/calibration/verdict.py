@@ -35,6 +35,7 @@ from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
+from ..robot.error_families import BACKLASH
 from ..session.check import Recheck, recheck
 from ..session.linear_model import measures_positions
 from ..session.search import can_have_session
@@ -52,6 +53,8 @@ STATUSES: tuple[Status, ...] = ("ok", "caution", "refused")
 
 # A joint that moves less than this never moved [rad or m].
 MIN_MOTION = 1e-3
+# Negative backlash from which on directions of approach are reversed, in standard deviations.
+MIN_REVERSED = 5.0
 # Displacement by a correction, relative to that of manufacturing errors as the default priors expect them:
 # above the first, measurements and robot are to be checked; above the second, no manufacturing error is so
 # large. Errors of up to 2 degrees and 10 mm in every joint reach 10.
@@ -171,6 +174,7 @@ def judge(fit: Evidence) -> Verdict:
             *_wrong_joint_values(fit),
             *_signs(fit),
             *_large_zeros(fit),
+            *_reversed_directions(fit),
             *_board_size(fit),
             *_two_robots(fit),
         ]
@@ -309,6 +313,23 @@ def _few_images(fit: Evidence) -> list[Finding]:
     if small := cameras.small_ranges(fit.chain, fit.data):
         text += f" Turn the joints that moved less than half of their range: {', '.join(small)}."
     return [Finding("refused", text)]
+
+
+def _reversed_directions(fit: Evidence) -> list[Finding]:
+    """Advise caution if the backlash of joints is negative, which is impossible."""
+    values = zip(fit.errors.parameters, fit.x, fit.std, strict=False)
+    names = [
+        parameter.name.removesuffix(f".{BACKLASH}")
+        for parameter, value, std in values
+        if parameter.name.endswith(f".{BACKLASH}") and value < -MIN_REVERSED * std
+    ]
+    if not names:
+        return []
+    text = f"The backlash of {join_names(names)} is negative, which is impossible: the directions of approach"
+    columns = "The columns approach_JOINT are 1 if the joint moved towards larger values before it stopped."
+    return [
+        Finding("caution", f"{text} of {'these joints' if len(names) > 1 else 'it'} are reversed. {columns}")
+    ]
 
 
 def _mixups(diagnosis: Diagnosis) -> list[Finding]:

@@ -15,6 +15,7 @@ import numpy as np
 from .._typing import Array
 from ..calibration.evaluation import compute_errors
 from ..estimation.initialization import align
+from ..estimation.parameters import PARAMETER_SETS
 from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
@@ -25,6 +26,7 @@ from ..plausibility.displacement import workspace_radius
 from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
+from ..robot.error_families import COMPLIANCE
 from ..units import ANGLES, LENGTHS
 from .reachability import reach_sphere
 
@@ -112,6 +114,7 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         *_check_lengths(chain, file),
         *_check_rotations(file),
         *_check_limits(chain, file, joint_units),
+        *_check_payload(chain, file),
         *_check_repetitions(file),
     ]
 
@@ -348,6 +351,20 @@ def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str])
                     "check its sign, zero and unit"
                 )
     return out
+
+
+def _check_payload(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Return a warning about masses of a payload that bend no joint, or that the result does not contain."""
+    masses = file.data.conditions().payload
+    if masses is None or chain.payload is not None or not np.any(masses > 0):
+        return []
+    option = "state mass and centre of the payload by --payload, such as 5kg@0,0,80mm"
+    if not PARAMETER_SETS[COMPLIANCE](chain):
+        return [f"the column of the payload has no effect, because the robot has no masses; {option}"]
+    if np.ptp(masses) == 0:
+        mass = f"{masses[0]:g} kg"
+        return [f"the payload is {mass} in all rows, but the result holds for the robot without it; {option}"]
+    return []
 
 
 def _check_repetitions(file: MeasurementFile) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,11 +182,18 @@ def test_samples_approached_from_the_other_side_are_no_outliers(order, seed):
         return Position.simulate(truth, conditions, Noise(noise), rng)
 
     sides = rng.choice([-1.0, 1.0], 70) if order == "mixed" else np.repeat([-1.0, 1.0], 35)
-    fit = calibrate(arm, measured(70, 5e-5, sides))
+    data = measured(70, 5e-5, sides)
+    fit = calibrate(arm, data)
     assert fit.extension is not None
     assert "backlash" in fit.extension.supported
     assert fit.n_outliers == 0
     assert fit.verdict.status == "ok"
+    assert data.recorded is not None
+    assert data.recorded.approach is not None
+    turned = data.recorded.approach * np.where(np.arange(6) == 1, -1, 1)
+    reversed_fit = calibrate(arm, data.replace(recorded=replace(data.recorded, approach=turned)))
+    assert reversed_fit.verdict.status == "caution"
+    assert any("backlash of shoulder_lift_joint is negative" in text for text in reversed_fit.verdict.reasons)
     more = measured(200, 1e-9, rng.choice([-1.0, 1.0], 200))
     assert fit.validate(more)["position_rms_m"] < 1e-4
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from measurement_files import csv_text_of, frames, joint_positions, real_ur10
@@ -12,7 +14,7 @@ from dhcal_pin import se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, Position, Wires
-from dhcal_pin.robot import Chain
+from dhcal_pin.robot import Chain, Payload, parse_urdf
 from dhcal_pin.robot.inverse_kinematics import wrap_into_limits
 
 
@@ -178,6 +180,31 @@ def test_joints_beyond_their_limits(warnings_of, ur10):
     q[11, 2] = np.pi + 1e-5
     (text,) = warnings_of(ur10, csv_text_of(ur10, q))
     assert "joint elbow_joint is beyond its limits, -3.142 rad to 3.142 rad, in lines 5, 9;" in text
+
+
+@pytest.mark.parametrize(
+    ("has_masses", "masses", "payload", "expected"),
+    [
+        (False, [0, 5], None, "has no effect, because the robot has no masses; state mass and centre"),
+        (False, [0, 5], Payload(5.0), ""),
+        (
+            True,
+            [5, 5],
+            None,
+            "the payload is 5 kg in all rows, but the result holds for the robot without it",
+        ),
+        (True, [5, 5], Payload(5.0), ""),
+        (True, [0, 5], None, ""),
+        (True, [0, 0], None, ""),
+    ],
+)
+def test_a_payload_that_the_result_does_not_contain(warnings_of, ur10, has_masses, masses, payload, expected):
+    data = ur10.urdf.data if has_masses else re.sub(rb"(?s)<inertial>.*?</inertial>", b"", ur10.urdf.data)
+    arm = Chain.from_urdf(parse_urdf(data, "arm.urdf"), "tool0").with_payload(payload)
+    header, *rows = csv_text_of(ur10, joint_positions(ur10)).splitlines()
+    lines = [f"{header},payload[kg]", *(f"{row},{masses[i % 2]}" for i, row in enumerate(rows))]
+    found = warnings_of(arm, "\n".join(lines))
+    assert [expected in text for text in found] == ([True] if expected else [])
 
 
 def test_repeated_rows_give_a_warning(warnings_of, ur10):
