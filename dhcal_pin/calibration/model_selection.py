@@ -572,26 +572,15 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or no_progress
-    core, has_outliers = fit, False
-    for _ in range(MAX_SELECTIONS):
-        judged = core.without_rejected()
-        report(PHASE, 1, _N_STEPS)
-        trials, model, random_ratio, selected = select_families(judged, families)
-        report(PHASE, 2, _N_STEPS)
-        extended, noise = core, _noise(judged)
-        if selected:
-            extended, noise = _fit_selected(core, selected, model, max_iterations)
-        # Outliers that the errors of the joints hid hide further families.
-        is_new = any(np.any(new < old) for new, old in zip(extended.weights, core.weights, strict=True))
-        if not (is_new and _rejection_stage(extended) == robust.REJECTED):
-            break
-        core, has_outliers = core.solved_with_weights(extended.weights, max_iterations), True
+    core, trials, random_ratio, extended, noise = _select_and_fit(fit, families, max_iterations, report)
+    has_outliers, judged = core is not fit, core.without_rejected()
+    is_extended = any(trial.is_selected for trial in trials)
     report(PHASE, 3, _N_STEPS)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if _are_residuals_correlated(extended, noise):
         is_prismatic = extended.problem.errors.chain.is_prismatic
         temperature = design_effect(different_configurations(judged.data)[0], is_prismatic)
-    if not selected and temperature == 1:
+    if not is_extended and temperature == 1:
         return fit, Extension(trials, n_configurations=n_configurations)
     errors = _region_errors(extended.without_rejected().problem, extended.solution.x, noise, temperature)
     geometry = _region_errors(judged.problem, core.solution.x, _noise(judged), 1.0)
@@ -613,6 +602,26 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
     if stage == robust.KEPT:
         extended = replace(extended, weights=fit.weights)
     return reweight(extended, (stage,), (), max_iterations, progress, leverages), extension
+
+
+def _select_and_fit(
+    fit: Fit, families: Sequence[str], max_iterations: int, report: Progress, n_left: int = MAX_SELECTIONS
+) -> tuple[Fit, tuple[FamilyTrial, ...], float, Fit, float]:
+    """Select families and fit them; again without the outliers that they show, which hide other families."""
+    # Returned are the fit that is extended, the trials, the error of random folds relative to that of the
+    # geometry, the extended fit and its noise.
+    judged = fit.without_rejected()
+    report(PHASE, 1, _N_STEPS)
+    trials, model, random_ratio, selected = select_families(judged, families)
+    report(PHASE, 2, _N_STEPS)
+    extended, noise = fit, _noise(judged)
+    if selected:
+        extended, noise = _fit_selected(fit, selected, model, max_iterations)
+    is_new = any(np.any(new < old) for new, old in zip(extended.weights, fit.weights, strict=True))
+    if n_left > 1 and is_new and _rejection_stage(extended) == robust.REJECTED:
+        without = fit.solved_with_weights(extended.weights, max_iterations)
+        return _select_and_fit(without, families, max_iterations, report, n_left - 1)
+    return fit, trials, random_ratio, extended, noise
 
 
 def may_mistake_joint_errors(fit: Fit) -> bool:
