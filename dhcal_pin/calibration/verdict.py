@@ -172,10 +172,10 @@ def judge(fit: Evidence) -> Verdict:
         findings += [
             *_mixups(fit.diagnosis),
             *_wrong_joint_values(fit),
+            *_board_size(fit),
             *_signs(fit),
             *_large_zeros(fit),
             *_reversed_directions(fit),
-            *_board_size(fit),
             *_two_robots(fit),
         ]
     if not any(finding.status == "refused" for finding in findings):

@@ -15,7 +15,13 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import ZERO_WEIGHT, reject_groups, standardized_residuals
 from dhcal_pin.exceptions import DhcalError, FileFormatError, InvalidArgumentError, UnknownNameError
-from dhcal_pin.io import measurement_text, read_measurements, read_robot, write_urdf
+from dhcal_pin.io import (
+    measurement_text,
+    read_measurement_file,
+    read_measurements,
+    read_robot,
+    write_urdf,
+)
 from dhcal_pin.measurements import Noise, Position
 from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.robot import Chain, Conditions
@@ -268,6 +274,25 @@ def test_rows_with_a_time_are_in_order(arm, tmp_path):
     assert recorded.order.tolist() == [0, 1, 2]
     (tmp_path / "data.csv").write_text(text(arm))
     assert read_measurements(tmp_path / "data.csv", arm).recorded is None
+
+
+def test_directions_come_from_skipped_rows_too(arm, tmp_path):
+    """The instrument lost the target in some rows; in one row the joint values are missing."""
+    rng = np.random.default_rng(8)
+    data = Position.simulate(arm, rng.uniform(-2, 2, (12, 6)), Noise(5e-5), rng)
+    wanted = directions_in_order(data.q)
+    names, *rows = (line.split(",") for line in measurement_text(data, arm).splitlines())
+    for row in (3, 4, 7):
+        rows[row][names.index("y[m]")] = "nan"
+    rows[9][0] = "nan"
+    lines = [",".join(row) for row in (names, *rows)]
+    (tmp_path / "data.csv").write_text("\n".join(["# rows: in order", *lines]))
+    recorded = read_measurement_file(tmp_path / "data.csv", arm, skip_bad_rows=True).data.recorded
+    assert recorded is not None
+    kept = [0, 1, 2, 5, 6, 8, 10, 11]
+    # Nobody knows from where the arm came to the row behind missing joint values.
+    wanted[10] = 0
+    np.testing.assert_array_equal(recorded.approach, wanted[kept])
 
 
 @pytest.mark.parametrize(

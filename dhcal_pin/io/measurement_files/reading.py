@@ -30,7 +30,7 @@ from ...measurements.euler_angles import ROTATION_VECTOR
 from ...measurements.mounting import MountedRig
 from ...measurements.pose import Pose, PoseMeasurement
 from ...robot.chain import Chain
-from ...robot.conditions import CONDITIONS, Condition
+from ...robot.conditions import CONDITIONS, Condition, directions_in_order
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
 from ..tables import Column, DataTable, TextLayout, format_lines, read_table
 from .columns import (
@@ -192,6 +192,7 @@ def _parse_table(
     prefixes = () if has_poses else ("", SECOND_PREFIX)[: kind.configurations_per_row]
     for prefix in prefixes:
         _require_joints(table, chain, prefix)
+    complete = table
     table = _usable_rows(table, chain, kind, prefixes, skip_bad_rows)
     measured = value_table(table, chain)
     values = parse_values(measured, kind)
@@ -211,6 +212,8 @@ def _parse_table(
         turn = [column.name for column in data.COLUMNS[3:]]
         if measured.columns.keys() >= set(turn):
             data = data.with_euler_angles(ROTATION_VECTOR, np.stack([values[name] for name in turn], -1))
+    if len(table.lines) < len(complete.lines) and len(prefixes) == 1 and _is_ordered(table, chain):
+        data = data.with_conditions(approach=_directions(complete, table, chain))
     data = with_conditions(data, table, chain)
     is_holdout = _parse_holdout_mask(table)
     return MeasurementFile(
@@ -334,8 +337,24 @@ def with_conditions(data: Measurement, table: DataTable, chain: Chain) -> Measur
             values[name] = parsed[0]
     if values:
         data = data.with_conditions(**values)
-    is_ordered = "time" in values or is_in_order(table)
-    return data.in_order() if is_ordered and data.configurations_per_row == 1 else data
+    is_ordered = _is_ordered(table, chain) and data.configurations_per_row == 1
+    return data.in_order() if is_ordered else data
+
+
+def _is_ordered(table: DataTable, chain: Chain) -> bool:
+    """Return whether the rows are in the order of measurement."""
+    return "time" in _present_conditions(table, chain) or is_in_order(table)
+
+
+def _directions(complete: DataTable, table: DataTable, chain: Chain) -> Array:
+    """Return the direction of the last motion of each joint in usable rows (m, n); 0 if it is unknown."""
+    # The arm was at the joint values of skipped rows, too. Where these are missing, a new sequence begins.
+    joints = [complete.columns[name].index for name in chain.joint_names if name in complete.columns]
+    known = complete.without_bad_rows(joints, [])
+    q = parse_joint_positions(known, chain, "")
+    gaps = np.flatnonzero(np.diff(np.searchsorted(complete.lines, known.lines)) > 1) + 1
+    directions = np.concatenate([directions_in_order(part) for part in np.split(q, gaps)])
+    return directions[np.isin(known.lines, table.lines)]
 
 
 def _parse_condition(table: DataTable, column: Column, condition: Condition) -> Array:
