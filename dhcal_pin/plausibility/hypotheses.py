@@ -24,6 +24,7 @@ from .. import se3
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, label_stops
+from ..measurements.contact import PointContact
 from ..measurements.euler_angles import (
     EULER_NOTATIONS,
     ROTATION_VECTOR,
@@ -132,8 +133,17 @@ class RowShift:
         first = np.flatnonzero(gaps == gaps[gaps > 0].min())
         upper, lower = order[first], order[first + 1]
         joints, values = (upper, lower) if self.step > 0 else (lower, upper)
+        if isinstance(item, PointContact) and _are_renamed(item.label[joints], item.label[values]):
+            # The points are touched in turn: this changes their names only.
+            return None
         q = item.configurations().reshape(item.configurations_per_row, len(item.rows), -1)[:, joints]
         return item.take(values).resample(q.reshape(-1, q.shape[-1]))
+
+
+def _are_renamed(before: Array, after: Array) -> bool:
+    """Return whether labels (m,) are the same ones with other names."""
+    pairs = {*zip(before.tolist(), after.tolist(), strict=True)}
+    return len(pairs) == len({*before.tolist()}) == len({*after.tolist()})
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import UnknownNameError
+from dhcal_pin.io import read_robot
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
@@ -389,6 +390,17 @@ def test_noise_of_a_joint_that_measures_a_contact_is_no_wrong_unit(seed):
     wrong = data.resample(data.q * [1, 1, 1e3, 1])
     (hypothesis,) = diagnose_mixups(arm, [wrong]).hypotheses
     assert hypothesis.key == "joint:lift:mm-not-m"
+
+
+@pytest.mark.parametrize("seed", some_slow(list(range(6)), {0, 3, 5}))
+def test_zeros_of_a_hobby_arm_are_no_wrong_unit_of_contacts(seed):
+    """All joints in radians instead of degrees would move 57 times less, and so would the noise."""
+    arm = read_robot("example:so101", tip="gripper_frame_link")
+    rng = np.random.default_rng(seed)
+    zeros = np.deg2rad(rng.uniform(3, 8, arm.n_joints) * rng.choice([-1, 1], arm.n_joints))
+    q = rng.uniform(np.maximum(arm.lower, -1.2), np.minimum(arm.upper, 1.2), (90, arm.n_joints))
+    data = PointContact.simulate(arm.with_zeros_moved(zeros), q, Noise(2e-4), rng)
+    assert not diagnose_mixups(arm, [data]).hypotheses
 
 
 @pytest.mark.parametrize("kind", [Pose, Position])
