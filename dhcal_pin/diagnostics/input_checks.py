@@ -38,6 +38,8 @@ _MAX_TURN_RAD, _MAX_STROKE_M = 4 * np.pi, 20.0
 _MIN_RADIANS_AS_DEG, _MAX_RADIANS_AS_DEG = 1.0, 2 * np.pi
 # In that case the measured positions spread by more than this factor farther than the modelled ones.
 _MIN_SPREAD_RATIO = 5.0
+# Largest mass that a robot carries [kg].
+_MAX_PAYLOAD = 2500.0
 # A joint may exceed its limits by this much without a warning [rad or m]; controllers round.
 _LIMIT_SLACK = 1e-3
 # Largest median error of image coordinates after a fit that gets no warning [px].
@@ -356,7 +358,12 @@ def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str])
 def _check_payload(chain: Chain, file: MeasurementFile) -> list[str]:
     """Return a warning about masses of a payload that bend no joint, or that the result does not contain."""
     masses = file.data.conditions().payload
-    if masses is None or chain.payload is not None or not np.any(masses > 0):
+    if masses is None or not np.any(masses > 0):
+        return []
+    if np.any(is_heavy := masses > _MAX_PAYLOAD):
+        largest = f"{masses.max():g} kg in {_format_rows(file.data, is_heavy)}"
+        return [f"the payload is {largest}, more than any robot carries; check its unit, such as payload[g]"]
+    if chain.payload is not None:
         return []
     option = "state mass and centre of the payload by --payload, such as 5kg@0,0,80mm"
     if not PARAMETER_SETS[COMPLIANCE](chain):

@@ -196,6 +196,7 @@ def test_joints_beyond_their_limits(warnings_of, ur10):
         (True, [5, 5], Payload(5.0), ""),
         (True, [0, 5], None, ""),
         (True, [0, 0], None, ""),
+        (True, [0, 5000], Payload(5.0), "the payload is 5000 kg in lines 3, 5, 7"),
     ],
 )
 def test_a_payload_that_the_result_does_not_contain(warnings_of, ur10, has_masses, masses, payload, expected):
