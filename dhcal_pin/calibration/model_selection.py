@@ -23,7 +23,12 @@ questions are asked.
    Backlash and thermal growth are tried only where the direction of approach or the temperature is known.
 
    If a family is supported, eccentricity and elasticity are added in any case. Their priors shrink them where
-   the measurements do not determine them. The model is then fitted by iteration.
+   the measurements do not determine them. The model is then fitted by iteration. Outliers that are set apart
+   only from this fit hide smaller families: without them, families are selected again.
+
+   Where a robust fit of the geometry rejects many samples, errors of the joints may be the cause, such as
+   backlash with two directions of approach. All samples are then fitted with families, too. That fit counts
+   if it rejects at most half as many samples with hardly more noise.
 
 2. How many independent samples do the measurements count for? The residuals of a real arm are correlated:
    they are errors of the model, equal in neighbouring configurations. N configurations then contain the
