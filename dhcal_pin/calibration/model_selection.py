@@ -93,6 +93,7 @@ from ..formatting import Table, format_fixed
 from ..identifiability.residual_correlation import MAX_WHITE_Z, design_effect, find_residual_correlation
 from ..measurements.base import known_conditions
 from ..robot.error_families import FAMILIES, HARMONICS
+from .good_samples import find_good_samples
 from .partition import (
     configuration_groups,
     contact_groups,
@@ -622,11 +623,22 @@ def _select_and_fit(
     extended, noise = fit, _noise(judged)
     if selected:
         extended, noise = _fit_selected(fit, selected, model, max_iterations)
-    is_new = any(np.any(new < old) for new, old in zip(extended.weights, fit.weights, strict=True))
-    if n_left > 1 and is_new and _rejection_stage(extended) == robust.REJECTED:
-        without = fit.solved_with_weights(extended.weights, max_iterations)
-        return _select_and_fit(without, families, max_iterations, report, n_left - 1)
+        weights = _without_outliers(extended)
+        is_new = any(np.any(new < old) for new, old in zip(weights, fit.weights, strict=True))
+        if n_left > 1 and is_new:
+            without = fit.solved_with_weights(weights, max_iterations)
+            return _select_and_fit(without, families, max_iterations, report, n_left - 1)
     return fit, trials, random_ratio, extended, noise
+
+
+def _without_outliers(extended: Fit) -> tuple[Array, ...]:
+    """Return the weights of samples without the outliers that are set apart from an extended fit."""
+    if _rejection_stage(extended) == robust.REJECTED and _count_rejected(extended)[0]:
+        return extended.weights
+    data = [item.with_weights(1 / w) for item, w in zip(extended.problem.data, extended.weights, strict=True)]
+    groups = configuration_groups(extended.data)
+    found, stage = find_good_samples(extended.problem, extended.solution, data, groups, extended.weights)
+    return tuple(found) if stage == robust.REJECTED else extended.weights
 
 
 def may_mistake_joint_errors(fit: Fit) -> bool:
