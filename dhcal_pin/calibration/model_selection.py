@@ -24,7 +24,8 @@ questions are asked.
 
    If a family is supported, eccentricity and elasticity are added in any case. Their priors shrink them where
    the measurements do not determine them. The model is then fitted by iteration. Outliers that are set apart
-   only from this fit hide smaller families: without them, families are selected again.
+   only from this fit hide smaller families: without them, families are selected again. Many outliers are
+   searched as in the fit of the geometry, see `good_samples`.
 
    Where a robust fit of the geometry rejects many samples, errors of the joints may be the cause, such as
    backlash with two directions of approach. All samples are then fitted with families, too. That fit counts
@@ -110,9 +111,9 @@ MIN_CORRELATED_NOISE = 0.02
 MIN_LOG_BAYES_FACTOR = 5.5
 # Largest number of selections; each but the first is without the outliers that the last one shows.
 MAX_SELECTIONS = 3
-# Share of rejected samples from which on joint errors are tried as their cause, and the largest growth of the
-# noise with which joint errors explain all samples.
-MIN_MISTAKEN_SHARE, MAX_NOISE_GROWTH = 0.1, 1.5
+# Share of samples from which on outliers are many, and the largest growth of the noise with which errors of
+# joints explain them.
+MIN_MANY, MAX_NOISE_GROWTH = 0.1, 1.5
 # Number of random folds.
 N_FOLDS = 5
 # Smallest number of different configurations for a selection.
@@ -623,7 +624,7 @@ def _select_and_fit(
     extended, noise = fit, _noise(judged)
     if selected:
         extended, noise = _fit_selected(fit, selected, model, max_iterations)
-        weights = _without_outliers(extended)
+        weights = _outliers_shown(fit, extended)
         is_new = any(np.any(new < old) for new, old in zip(weights, fit.weights, strict=True))
         if n_left > 1 and is_new:
             without = fit.solved_with_weights(weights, max_iterations)
@@ -631,21 +632,23 @@ def _select_and_fit(
     return fit, trials, random_ratio, extended, noise
 
 
-def _without_outliers(extended: Fit) -> tuple[Array, ...]:
-    """Return the weights of samples without the outliers that are set apart from an extended fit."""
+def _outliers_shown(fit: Fit, extended: Fit) -> tuple[Array, ...]:
+    """Return the weights of a fit without the outliers that are set apart from an extended one."""
     if _rejection_stage(extended) == robust.REJECTED and _count_rejected(extended)[0]:
         return extended.weights
     data = [item.with_weights(1 / w) for item, w in zip(extended.problem.data, extended.weights, strict=True)]
     groups = configuration_groups(extended.data)
     found, stage = find_good_samples(extended.problem, extended.solution, data, groups, extended.weights)
-    return tuple(found) if stage == robust.REJECTED else extended.weights
+    # A few are found by their residuals. Many outliers bend the fit towards themselves.
+    is_many = np.mean(np.concatenate(found) <= robust.ZERO_WEIGHT) >= MIN_MANY
+    return tuple(found) if is_many and stage == robust.REJECTED else fit.weights
 
 
 def may_mistake_joint_errors(fit: Fit) -> bool:
     """Return whether a robust fit of the geometry may take the errors of joints for outliers."""
     # Samples that were approached from one side agree with each other, and so do those from the other side.
     n_rejected, n_samples = _count_rejected(fit)
-    return n_rejected >= MIN_MISTAKEN_SHARE * n_samples
+    return n_rejected >= MIN_MANY * n_samples
 
 
 def simpler_explanation(chosen: ExtendedFit, everything: ExtendedFit) -> ExtendedFit:
