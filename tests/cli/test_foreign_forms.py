@@ -288,8 +288,17 @@ def test_bad_rows_of_excel_and_of_a_mapped_file(assert_refused, run, robot_folde
 
 
 def test_no_usable_row_is_an_error(assert_refused, run, robot_folder):
+    """Skipping bad rows is no remedy if all are bad."""
     write("data.csv", "\n".join([HEADER, *(["1,2,3,a,b,c"] * 3)]))
-    assert_refused(["data.csv: no row has all numbers"], *CALIBRATE, "--skip-bad-rows")
+    words = ["data.csv: no row has all numbers (line 2: column 'x': 'a' is not a finite number)"]
+    assert_refused(words, *CALIBRATE, "--skip-bad-rows")
+    assert_refused(["data.csv:2: column 'x'", "lines 2-4; correct or remove them\n"], *CALIBRATE)
+
+
+def test_ambiguous_thousands_separators_are_named(assert_refused, robot_folder):
+    write("data.csv", "\n".join([HEADER.replace(",", ";"), "1.5;2;3;4,001;5;6", "1;2;3;4;5;6"]))
+    words = "column 'x': '4,001' is not a finite number with decimal points: write it without thousands separators"
+    assert_refused([f"data.csv:2: {words}"], *CALIBRATE)
 
 
 # --- column maps that messages propose -------------------------------------------------------------

@@ -306,7 +306,10 @@ def _usable_rows(
     if not skip_bad_rows:
         table.require_good_rows(", or use --skip-bad-rows")
     if not len(table.lines):
-        raise FileFormatError(f"{table.source}: no row has all numbers; correct the file or its columns")
+        line, reason = next(iter(table.bad_rows.items()), (table.header_line, "no rows"))
+        raise FileFormatError(
+            f"{table.source}: no row has all numbers (line {line}: {reason}); correct the file or its columns"
+        )
     return table
 
 

@@ -35,6 +35,13 @@ if TYPE_CHECKING:
 MAX_ROWS = 1_000_000
 # Units that a row under the header may have.
 _KNOWN_UNITS = frozenset(unit for units in UNITS.values() for unit in units)
+# Numbers with signs for thousands by their decimal sign: only decimals behind them make them unambiguous.
+GROUPED_NUMBERS = {
+    ".": re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+\.\d+"),
+    ",": re.compile(r"[+-]?[1-9]\d{0,2}(?:\.\d{3})+,\d+"),
+}
+# Numbers that may have signs for thousands, or another decimal sign than the other numbers.
+_AMBIGUOUS_NUMBER = re.compile(r"[+-]?\d{1,3}(?:[.,'’ \u00a0\u202f]\d{3})+(?:[.,]\d*)?")
 # Largest number of lines, or of runs of lines, that a message lists.
 MAX_LISTED_RUNS = 100
 # Header of a measurement file, as an example in messages.
@@ -196,17 +203,21 @@ class DataTable:
 
     def _parse(self, cell: str) -> float:
         """Return the number in a cell, NaN if it is none."""
-        if self.decimal != ".":
-            # A point would be a sign for thousands.
-            cell = "" if "." in cell else cell.replace(self.decimal, ".")
+        other = "." if self.decimal == "," else ","
+        if other in cell:
+            if not GROUPED_NUMBERS[self.decimal].fullmatch(cell.strip()):
+                return math.nan
+            cell = cell.replace(other, "")
         with suppress(ValueError):
-            return parse_number(cell)
+            return parse_number(cell.replace(self.decimal, "."))
         return math.nan
 
     def _bad_number(self, row: int, index: int) -> str:
         """Return why a cell is not a finite number."""
         text = self.cells[row][index].strip()
         signs = " with decimal commas" if self.decimal == "," else ""
+        if _AMBIGUOUS_NUMBER.fullmatch(text):
+            signs = f" with decimal {'commas' if signs else 'points'}: write it without thousands separators"
         problem = f"{quote(text)} is not a finite number{signs}" if text else "is empty"
         return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
 
@@ -257,6 +268,8 @@ class DataTable:
             return
         line, reason = next(iter(self.bad_rows.items()))
         what, others = "the row", ""
+        if not len(self.lines):
+            alternative = ""
         if len(self.bad_rows) > 1:
             what = "them"
             others = f"; {len(self.bad_rows)} rows cannot be used: lines {format_lines(self.bad_rows)}"

@@ -4,7 +4,8 @@ What the layout of a file does not state is detected from its lines:
 
 - Separator: of comma, semicolon, tab and runs of spaces the one under which most rows have as many cells as
   the header, and most of their cells are numbers. Commas are preferred among equals.
-- Decimal sign: a comma, if there are numbers with a decimal comma and none with a decimal point.
+- Decimal sign: a comma, if there are numbers with a decimal comma and none with a decimal point. Numbers
+  with separated thousands, such as `1.234,5`, decide it.
 
 Lines are split one by one, so that an unbalanced quote does not extend over the following lines. A row with
 another number of cells than the header is a bad row; empty cells at the end of a row do not count.
@@ -26,7 +27,7 @@ import numpy as np
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
-from .table import MEASUREMENT_HEADER, DataTable, require_few_rows, units_under_header
+from .table import GROUPED_NUMBERS, MEASUREMENT_HEADER, DataTable, require_few_rows, units_under_header
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
 BLANK_CHARACTERS = " \t,;"
@@ -221,7 +222,7 @@ def _split_stripped(line: str, separator: str) -> list[str]:
 
 def _is_decimal(cell: str) -> bool:
     """Return whether a cell is a number with either decimal sign."""
-    return any(pattern.fullmatch(cell) for pattern in (_INTEGER, *_DECIMALS.values()))
+    return any(pattern.fullmatch(cell) for pattern in (_INTEGER, *_DECIMALS.values(), *GROUPED_NUMBERS.values()))
 
 
 def _decimal_of_lines(rows: Sequence[str], separator: str) -> str:
@@ -235,8 +236,11 @@ def _decimal_of_lines(rows: Sequence[str], separator: str) -> str:
 def detect_decimal(cells: Iterable[str]) -> str:
     """Return the decimal sign of some cells."""
     cells = [cell.strip() for cell in cells]
-    has = {sign: any(map(pattern.fullmatch, cells)) for sign, pattern in _DECIMALS.items()}
-    return "," if has[","] and not has["."] else "."
+    for patterns in (GROUPED_NUMBERS, _DECIMALS):
+        has = {sign: any(map(pattern.fullmatch, cells)) for sign, pattern in patterns.items()}
+        if has["."] or has[","]:
+            return "." if has["."] else ","
+    return "."
 
 
 def _parse_numbers(rows: Sequence[str], separator: str, decimal: str) -> dict[int, Array]:

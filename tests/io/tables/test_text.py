@@ -156,7 +156,13 @@ def test_spaces_at_the_ends_of_a_joint_name_are_named():
         ("a;b\n1.5;2\n", ("a", "b"), [[1.5, 2]], "semicolons"),
         # With points as well, commas are not decimal: the cell is no number.
         ("a;b\n1.5;2,5\n", ("a", "b"), [[1.5, np.nan]], "semicolons"),
-        ("a;b\n1.234,5;2,5\n", ("a", "b"), [[np.nan, 2.5]], "semicolons, decimal commas"),
+        # The other sign separates thousands only before decimals, and in groups of three digits.
+        ("a;b\n1.234,5;2,5\n", ("a", "b"), [[1234.5, 2.5]], "semicolons, decimal commas"),
+        ("a;b\n-1.234.567,8;1.068\n", ("a", "b"), [[-1234567.8, np.nan]], "semicolons, decimal commas"),
+        ("a;b\n2,601.229;-0.5\n", ("a", "b"), [[2601.229, -0.5]], "semicolons"),
+        ('a,b\n"2,601.229",1.5\n', ("a", "b"), [[2601.229, 1.5]], "commas"),
+        ("a;b\n12.34,5;2,5\n", ("a", "b"), [[np.nan, 2.5]], "semicolons, decimal commas"),
+        ("a;b\n0.123,5;2,5\n", ("a", "b"), [[np.nan, 2.5]], "semicolons, decimal commas"),
         ("a,b,c,\n1,2,3,\n4,5,6,\n", ("a", "b", "c"), [[1, 2, 3], [4, 5, 6]], "commas"),
         ("a\n1\n2\n", ("a",), [[1], [2]], "commas"),
         ('a;b\n1;"two; three"\n4;5\n', ("a", "b"), [[1, np.nan], [4, 5]], "semicolons"),
