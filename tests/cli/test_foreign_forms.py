@@ -111,7 +111,7 @@ NOTED_FORMS = {
         lambda: frame(at=pd.to_datetime(TIMES), note=["a"] * 20).to_parquet("data.parquet"),
         "columns 'at', 'note' ignored",
     ),
-    "Excel": (lambda: write_excel("data.xlsx"), "read sheet 'Messung', not 'Notizen'"),
+    "Excel": (lambda: write_excel("data.xlsx"), "sheet 'Messung' was read, not 'Notizen'"),
     "Excel with texts": (lambda: write_excel("data.xlsx", as_text=True), "column 'measured at' ignored"),
 }
 
@@ -140,7 +140,7 @@ def test_commands_read_the_chosen_sheet_without_its_bad_rows(run, robot_folder, 
     sheet.cell(4, 5).value = "lost"
     workbook.save("d.xlsx")
     status, _, err = run(*words.split(), "--sheet", "Long")
-    assert (status, "read sheet 'Long', not 'Data'" in err) == (2, True)
+    assert (status, "sheet 'Long' was read, not 'Data'" in err) == (2, True)
     status, _, err = run(*words.split())
     assert (status, "d.xlsx:4: column 'y': 'lost' is not" in err) == (2, True)
     status, _, err = run(*words.split(), "--skip-bad-rows", "--verbose")

@@ -10,18 +10,23 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Sequence, Set
+from dataclasses import replace
 from datetime import date, datetime, time
+from functools import partial
 from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 from ..._typing import PathLike
 from ...exceptions import FileFormatError, UnknownNameError
 from ..tabular import unreadable
-from .table import DataTable, units_under_header
+from .table import DataTable, find_header, units_under_header
 from .text import TextLayout, detect_decimal
 
 # Largest size of all sheets and texts of a workbook [byte]; openpyxl reads 4 MiB per second.
 MAX_XML_BYTES = 32 << 20
+
+# Rows in which a header below titles is looked for.
+_N_TITLE_ROWS = 50
 
 
 def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
@@ -64,7 +69,7 @@ def read_spreadsheet(path: PathLike, layout: TextLayout) -> DataTable:
     title = layout.sheet or max(filled, key=lambda each: _likelihood(filled[each], layout.names))
     rows = filled[title]
     others = [other for other in filled if other != title]
-    notes = (f"read sheet {title!r}, not {', '.join(map(repr, others))}",) if others else ()
+    notes = (f"sheet {title!r} was read, not {', '.join(map(repr, others))}",) if others else ()
     return _build_table(source, rows, layout, f"Excel sheet {title!r}", notes)
 
 
@@ -130,6 +135,11 @@ def _build_table(
         cell for _, cells in content for cell in cells if isinstance(cell, str)
     )
     texts = [(number, [_cell_text(cell, decimal) for cell in cells]) for number, cells in content]
+    header = find_header([cells for _, cells in texts[:_N_TITLE_ROWS]]) if layout.has_header else 0
+    read_below_titles = None
+    if header:
+        below = replace(layout, skip=texts[header][0] - 1)
+        read_below_titles = partial(_build_table, source, rows, below, description, notes)
     header_line, headers = texts[0]
     data = texts[layout.has_header :]
     units = units_under_header(headers, data[0][1]) if layout.has_header and data[1:] else ()
@@ -149,4 +159,5 @@ def _build_table(
         notes=notes,
         units=units[:width],
         header_example=layout.header_example,
+        read_below_titles=read_below_titles,
     )

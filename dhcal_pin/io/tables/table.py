@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,6 +42,12 @@ GROUPED_NUMBERS = {
 }
 # Numbers that may have signs for thousands, or another decimal sign than the other numbers.
 _AMBIGUOUS_NUMBER = re.compile(r"[+-]?\d{1,3}(?:[.,'’ \u00a0\u202f]\d{3})+(?:[.,]\d*)?")
+# Other ways to write a unit: the degree sign, and the ordinal indicator that looks like it.
+_UNIT_SYNONYMS = {"\u00b0": "deg", "\u00ba": "deg"}
+# A header `name` or `name[unit]`; indices in the name, such as `name[0]`, are no units.
+_HEADER = re.compile(r"\s*((?:[^\[\]]|\[\d+\])+?)\s*(?:\[(?!\d+\])\s*([^\[\]]*?)\s*\])?\s*")
+# Least number of names in a header, and of numbers in a row under it.
+_MIN_COLUMNS = 3
 # Largest number of lines, or of runs of lines, that a message lists.
 MAX_LISTED_RUNS = 100
 # Header of a measurement file, as an example in messages.
@@ -87,6 +93,8 @@ class DataTable:
     units: tuple[str, ...] = ()  # Cells of the row of units under the header; empty if there is none
     header_example: str = MEASUREMENT_HEADER  # Header that is expected, for messages
     euler_angles: EulerAngles | None = None  # Angles that columns of rotation vectors were computed from
+    # Function that reads the table below lines of titles; None if the first line looks like the header.
+    read_below_titles: Callable[[], DataTable] | None = None
 
     @classmethod
     def from_columns(
@@ -113,6 +121,11 @@ class DataTable:
         return f"{self.source}:{self.header_line}"
 
     @cached_property
+    def below_titles(self) -> DataTable | None:
+        """Table below lines of titles; None if the first line looks like the header."""
+        return self.read_below_titles() if self.read_below_titles is not None else None
+
+    @cached_property
     def has_numbers_as_header(self) -> bool:
         """Whether most header cells are numbers, so that the file probably has no header."""
         cells = [cell for cell in self.headers if cell]
@@ -130,13 +143,13 @@ class DataTable:
         for index, cell in enumerate(self.headers):
             if not cell:
                 continue
-            match = re.fullmatch(r"\s*([^\[\]]+?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
+            match = _HEADER.fullmatch(cell)
             if not match:
                 raise FileFormatError(
                     f"{self.header_location}: header {quote(cell)}: write name or name[unit], with commas "
                     "between them"
                 )
-            name, unit = match[1], match[2] or ""
+            name, unit = match[1], _usual_unit(match[2] or "")
             if below := self.units[index] if self.units else "":
                 if unit not in ("", below):
                     raise FileFormatError(
@@ -159,7 +172,8 @@ class DataTable:
 
     def column_label(self, index: int) -> str:
         """Return how messages call a column: its name without the unit, or its number."""
-        name = self.headers[index].split("[")[0].strip() or self.headers[index]
+        match = _HEADER.fullmatch(self.headers[index])
+        name = match[1] if match else self.headers[index]
         return f"column {quote(name)}" if name else f"column {index + 1}"
 
     def cell_location(self, row: int, column: str) -> str:
@@ -187,7 +201,7 @@ class DataTable:
         if wrong.size:
             row = int(wrong[0])
             raise FileFormatError(
-                f"{self.source}:{self.lines[row]}: {self._bad_number(row, column.index)}; "
+                f"{self.source}:{self.lines[row]}: {self._bad_cell(row, column.index)}; "
                 "correct or remove the row"
             )
         return values
@@ -212,14 +226,17 @@ class DataTable:
             return parse_number(cell.replace(self.decimal, "."))
         return math.nan
 
-    def _bad_number(self, row: int, index: int) -> str:
+    def _bad_cell(self, row: int, index: int) -> str:
         """Return why a cell is not a finite number."""
         text = self.cells[row][index].strip()
+        return self.bad_number(text, index) if text else f"{self.column_label(index)} is empty"
+
+    def bad_number(self, text: str, index: int) -> str:
+        """Return why a text in a column is not a finite number."""
         signs = " with decimal commas" if self.decimal == "," else ""
         if _AMBIGUOUS_NUMBER.fullmatch(text):
             signs = f" with decimal {'commas' if signs else 'points'}: write it without thousands separators"
-        problem = f"{quote(text)} is not a finite number{signs}" if text else "is empty"
-        return f"{self.column_label(index)}: {problem}" if text else f"{self.column_label(index)} {problem}"
+        return f"{self.column_label(index)}: {quote(text)} is not a finite number{signs}"
 
     def thinned(self, max_rows: int) -> DataTable:
         """Return a table with at most a number of rows, drawn at random, and a note if some are left out."""
@@ -249,7 +266,7 @@ class DataTable:
         reasons: dict[int, str] = {}
         for index, column in values.items():
             for row in np.flatnonzero(~np.isfinite(column)).tolist():
-                reasons.setdefault(row, self._bad_number(row, index))
+                reasons.setdefault(row, self._bad_cell(row, index))
         for index in texts:
             for row, cells in enumerate(self.cells):
                 if not cells[index].strip():
@@ -284,14 +301,43 @@ def units_under_header(headers: Sequence[str], cells: Sequence[str]) -> tuple[st
     >>> units_under_header(["joint_1", "x", "set"], ["[deg]", "mm", "-"])
     ('deg', 'mm', '')
     """
-    units = ["" if cell.strip() == "-" else cell.strip(" []()") for cell in cells]
+    units = ["" if cell.strip() == "-" else _usual_unit(cell.strip(" []()")) for cell in cells]
     if not _KNOWN_UNITS.intersection(units) or any(map(_is_number, units)):
         return ()
     return (*units, *[""] * len(headers))[: len(headers)]
 
 
+def _usual_unit(unit: str) -> str:
+    """Return the usual way to write a unit."""
+    return _UNIT_SYNONYMS.get(unit, unit)
+
+
+def find_header(rows: Sequence[Sequence[str]]) -> int | None:
+    """Return the index of the first row of names above numbers, or above units and numbers; None without it.
+
+    >>> find_header([["Job", "7"], ["J1", "J2", "x"], ["deg", "deg", "mm"], ["1", "2", "3"]])
+    1
+    """
+    for i, cells in enumerate(rows):
+        filled = [cell for cell in cells if cell]
+        n_names = sum(not _is_number(cell) for cell in filled)
+        if n_names >= _MIN_COLUMNS and 2 * n_names > len(filled):
+            for below in rows[i + 1 : i + 3]:
+                is_as_wide = not any(below[_width(cells) :])
+                if is_as_wide and sum(map(_is_number, below)) >= _MIN_COLUMNS:
+                    return i
+    return None
+
+
+def _width(cells: Sequence[str]) -> int:
+    """Return the number of cells up to the last one with content."""
+    return max((i for i, cell in enumerate(cells, 1) if cell), default=0)
+
+
 def _is_number(cell: str) -> bool:
     """Return whether a cell is a number with either decimal sign."""
+    if any(pattern.fullmatch(cell) for pattern in GROUPED_NUMBERS.values()):
+        return True
     with suppress(ValueError):
         parse_number(cell.replace(",", "."))
         return True

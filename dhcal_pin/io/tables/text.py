@@ -19,7 +19,8 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,14 @@ import numpy as np
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
-from .table import GROUPED_NUMBERS, MEASUREMENT_HEADER, DataTable, require_few_rows, units_under_header
+from .table import (
+    GROUPED_NUMBERS,
+    MEASUREMENT_HEADER,
+    DataTable,
+    find_header,
+    require_few_rows,
+    units_under_header,
+)
 
 # Characters of a line without content: spreadsheets write empty rows as separators only.
 BLANK_CHARACTERS = " \t,;"
@@ -131,7 +139,21 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
         f"{name}, decimal commas" if decimal == "," else name,
         units=units,
         header_example=layout.header_example,
+        read_below_titles=_reader_below_titles(source, content, layout) if layout.has_header else None,
     )
+
+
+def _reader_below_titles(
+    source: str, content: Sequence[tuple[int, str]], layout: TextLayout
+) -> Callable[[], DataTable] | None:
+    """Return the function that reads a table below lines of titles, None without such lines."""
+    first = content[:_N_SEPARATOR_ROWS]
+    separators = [layout.separator] if layout.separator else SEPARATORS
+    found = [find_header([_split_stripped(line, name) for _, line in first]) for name in separators]
+    header = min((i for i in found if i is not None), default=0)
+    if not header:
+        return None
+    return partial(parse_lines, source, content, replace(layout, skip=content[header][0] - 1))
 
 
 class _TextRows(Sequence[list[str]]):
@@ -222,7 +244,9 @@ def _split_stripped(line: str, separator: str) -> list[str]:
 
 def _is_decimal(cell: str) -> bool:
     """Return whether a cell is a number with either decimal sign."""
-    return any(pattern.fullmatch(cell) for pattern in (_INTEGER, *_DECIMALS.values(), *GROUPED_NUMBERS.values()))
+    return any(
+        pattern.fullmatch(cell) for pattern in (_INTEGER, *_DECIMALS.values(), *GROUPED_NUMBERS.values())
+    )
 
 
 def _decimal_of_lines(rows: Sequence[str], separator: str) -> str:

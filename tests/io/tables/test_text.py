@@ -59,7 +59,7 @@ def test_the_sheet_with_numbers_is_read(tmp_path):
     workbook.save(tmp_path / "a.xlsx")
     table = read_table(tmp_path / "a.xlsx")
     assert table.headers == ("a", "b", "c")
-    assert table.notes == ("read sheet 'Data', not 'Info', 'Other'",)
+    assert table.notes == ("sheet 'Data' was read, not 'Info', 'Other'",)
     other = read_table(tmp_path / "a.xlsx", TextLayout(sheet="Other"))
     assert other.values(1).tolist() == [5]
     with pytest.raises(UnknownNameError, match=r"a\.xlsx: no sheet 'data' .*'Info', 'Data', 'Other'"):
@@ -79,7 +79,7 @@ def test_the_sheet_with_the_most_known_columns_or_rows_is_read_and_errors_name_t
     arm = Chain.from_dh(read_dh(write(tmp_path, "scara.dh.toml", SCARA)))
     chosen = read_table(tmp_path / "a.xlsx", TextLayout(names={"Temperature"}))
     assert chosen.headers == ("Temperature", "21.5", "20.3", "19.1")
-    with pytest.raises(FileFormatError, match=r"a\.xlsx:1: .*; read sheet 'Info', not 'Data'$"):
+    with pytest.raises(FileFormatError, match=r"a\.xlsx:1: .*; sheet 'Info' was read, not 'Data'$"):
         read_measurements(tmp_path / "a.xlsx", arm, sheet="Info")
 
 
@@ -88,6 +88,36 @@ def test_a_row_of_units_is_understood_as_in_the_header(tmp_path, units):
     table = read_table(write(tmp_path, "a.csv", f"q,x,n\n{units}\n1,2,3\n4,5,6\n"))
     assert {name: column.unit for name, column in table.columns.items()} == {"q": "deg", "x": "mm", "n": ""}
     assert (table.values(1).tolist(), table.lines) == ([2, 5], [3, 4])
+
+
+def test_indices_in_headers_are_no_units(tmp_path):
+    header = "name[0],name[1],q[0].position[rad],x [mm],a [°],b[º]"
+    table = read_table(write(tmp_path, "a.csv", f"{header}\n1,2,3,4,5,6\n"))
+    assert {name: column.unit for name, column in table.columns.items()} == {
+        **{"name[0]": "", "name[1]": "", "q[0].position": "rad"},
+        **{"x": "mm", "a": "deg", "b": "deg"},
+    }
+    assert [table.column_label(i) for i in (1, 2, 3)] == [
+        *("column 'name[1]'", "column 'q[0].position'", "column 'x'")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("Tracker export;;\n# c\nJob: UR10\n\nP,J1,J2,x\nP1,1,2,3\n", 5),
+        ("UR10;7;8\nJ1;J2;x\ndeg;deg;mm\n1,5;2;1.003,5\n", 2),
+        ("J1,J2,x\n1,2,3\n", 0),
+        ("J1,J2,x,note\n1,2,,lost\nlost,lost,lost,lost\n1,2,3,\n", 3),
+        ("a,b\n1,2\n3,4\n", 0),
+        ("1,2,3\n4,5,6\n", 0),
+    ],
+)
+def test_a_header_below_titles_is_found(tmp_path, text, line):
+    below = read_table(write(tmp_path, "a.csv", text)).below_titles
+    assert (below.header_line if below else 0) == line
+    if below:
+        assert below.bad_rows == {}
 
 
 def test_units_of_two_places_must_agree(tmp_path):
