@@ -50,7 +50,9 @@ class ColumnSummary:
 
     name: str  #: Name in the header, or number of a column without a name.
     unit: str  #: Unit in the header.
-    role: str  #: "joint", "measured", "sigma", "other" (such as the set or commanded positions) or "ignored".
+    #: "joint", "measured", "sigma", "condition", "other" (such as the set or commanded positions),
+    #: or "ignored".
+    role: str
     minimum: float | None = None  #: Smallest number, in `unit`; None for texts.
     maximum: float | None = None  #: Largest number, in `unit`; None for texts.
     lower: float | None = None  #: Lower joint limit, in `unit`; None without a robot or a limit.
@@ -94,12 +96,13 @@ def inspect_file(
     """Say what a measurement file contains."""
     if chain is None:
         table = read_table(source, TextLayout(sheet=sheet))
-        return _inspect_table(table, None)
+        return _inspect_table(file_columns.with_known_spelling(table, None), None)
     table = open_measurement_table(source, chain, columns, servos, sheet)
     try:
         file = parse_measurements(table, chain, skip_bad_rows=True, rig=rig)
     except DhcalError as error:
-        inspection = _inspect_table(table, chain)
+        has_titles = file_columns.has_titles(table, chain)
+        inspection = _inspect_table(table.below_titles if has_titles and table.below_titles else table, chain)
         if file_columns.needs_column_map(table, chain):
             lines = tuple(propose_map(table, chain))
             return replace(inspection, problem=header_problem(table, chain), column_map=lines)
@@ -156,6 +159,8 @@ def _role(column: Column, chain: Chain | None, measured: Set[str]) -> str:
         return "sigma" if name.startswith("sigma_") else "measured"
     if name in file_columns.AUXILIARY_COLUMNS:
         return "other"
+    if file_columns.is_condition(name, chain):
+        return "condition"
     if chain is None:
         return "joint" if column.unit in {*LENGTHS, *ANGLES} else "ignored"
     return "joint" if name.removeprefix(file_columns.SECOND_PREFIX) in chain.joint_names else "ignored"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -84,6 +85,13 @@ FORMS = {
     ),
     "separators at the end": lambda: write("data.csv", TEXT.replace("\n", ",,\n")),
     "row of units": lambda: write("data.csv", TEXT.replace(HEADER, UNITS_BELOW)),
+    "degree signs": lambda: write("data.csv", TEXT.replace("[deg]", "[°]", 2).replace("[deg]", "[º]")),
+    "row of units with degree signs": lambda: write(
+        "data.csv", TEXT.replace(HEADER, UNITS_BELOW.replace("deg", "°"))
+    ),
+    "capitals": lambda: write(
+        "data.csv", TEXT.replace("x[mm],y[mm]", "X[mm],Y [mm]").replace("joint_2", "Joint_2")
+    ),
     "known time": lambda: write("data.csv", with_columns(["time[s]", [str(7.5 * i) for i in range(20)]])),
 }
 # Name of the form, function that writes it, and the note on it.
@@ -96,6 +104,14 @@ NOTED_FORMS = {
     "comments": (
         lambda: write("data.csv", with_columns(["remark", ["", "ok, good", *["x"] * 18]], sign=";")),
         "column 'remark' ignored",
+    ),
+    "names of points": (
+        lambda: write("data.csv", with_columns(["Point", [f"P{i}" for i in range(1, 21)]])),
+        "column 'Point' ignored",
+    ),
+    "numbers of points": (
+        lambda: write("data.csv", with_columns(["Point", [str(i) for i in range(1, 21)]])),
+        "column 'Point' ignored",
     ),
     "temperature and counter": (
         lambda: write(
@@ -297,8 +313,8 @@ def test_no_usable_row_is_an_error(assert_refused, run, robot_folder):
 
 def test_ambiguous_thousands_separators_are_named(assert_refused, robot_folder):
     write("data.csv", "\n".join([HEADER.replace(",", ";"), "1.5;2;3;4,001;5;6", "1;2;3;4;5;6"]))
-    words = "column 'x': '4,001' is not a finite number with decimal points: write it without thousands separators"
-    assert_refused([f"data.csv:2: {words}"], *CALIBRATE)
+    words = "data.csv:2: column 'x': '4,001' is not a finite number with decimal points: write it without"
+    assert_refused([f"{words} thousands separators; correct"], *CALIBRATE)
 
 
 # --- column maps that messages propose -------------------------------------------------------------
@@ -331,12 +347,113 @@ def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected
     assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
 
 
+def columns_of_ros():
+    """Return the columns of a recording of ROS in another order of the joints."""
+    radians = np.radians(NUMBERS[:, :3])
+    out = {"/joint_states/header/stamp/secs": [str(1_700_000_000 + 3 * i) for i in range(20)]}
+    for j in (1, 0, 2):
+        topic = f"/joint_states/joint_{j + 1}"
+        out[f"{topic}/velocity"] = ["0.0"] * 20
+        out[f"{topic}/position"] = [repr(float(value)) for value in radians[:, j]]
+    return out | {f"/leica/point/{axis}": [cells[3 + i] for cells in CELLS] for i, axis in enumerate("xyz")}
+
+
+def columns_of_names():
+    """Return columns of arrays of names and positions, in another order of the joints."""
+    order = {f"name[{k}]": [f"joint_{j + 1}"] * 20 for k, j in enumerate((2, 0, 1))}
+    order |= {f"position[{k}]": [cells[j] for cells in CELLS] for k, j in enumerate((2, 0, 1))}
+    return order | {f"point.{axis}": [cells[3 + i] for cells in CELLS] for i, axis in enumerate("xyz")}
+
+
+def columns_of_an_export():
+    """Return columns with a counter, times, thousands separators and decimal commas."""
+    angles = {f"Achse {j + 1}": [cells[j].replace(".", ",") for cells in CELLS] for j in range(3)}
+    lengths = {
+        f"Mess {axis} [um]": [
+            f"{1e3 * value:,.6f}".translate(str.maketrans(",.", ".,")) for value in NUMBERS[:, 3 + i].tolist()
+        ]
+        for i, axis in enumerate("XYZ")
+    }
+    counts = {"Messpunkt Nr.": [str(i) for i in range(1, 21)], "Zeitstempel": ["12.03.2025 10:00:00"] * 20}
+    return counts | angles | lengths
+
+
+@pytest.mark.parametrize(
+    ("columns", "order", "unit"),
+    [
+        (columns_of_ros, [f"/joint_states/joint_{j}/position" for j in (1, 2, 3)], "rad"),
+        (columns_of_names, ["position[1]", "position[2]", "position[0]"], "deg"),
+        (columns_of_an_export, ["Achse 1", "Achse 2", "Achse 3"], "deg"),
+    ],
+)
+def test_joints_are_proposed_by_their_names(run, expected, columns, order, unit):
+    """Times and counters are no joints."""
+    table = columns()
+    write("data.csv", "\n".join(map(";".join, [table, *zip(*table.values(), strict=True)])))
+    status, _, err = run(*CALIBRATE)
+    assert (status, err.count("\n")) == (2, 1)
+    assert f'joints = {{order = {json.dumps(order)}, unit = "{unit}"}}' in err
+    assert "state the robot" not in err
+    Path("map.toml").write_text(proposed_map(err))
+    found = calibrate(run, "--columns", "map.toml")[0]["parameters"]
+    for one, other in zip(found, expected, strict=True):
+        assert one["value"] == pytest.approx(other["value"], abs=1e-6)
+
+
+def test_a_counter_is_no_joint_without_names_either(run, expected):
+    rows = [[str(i), *cells] for i, cells in enumerate(CELLS, 1)]
+    write("data.csv", "\n".join(map(",".join, rows)))
+    assert "order = [2, 3, 4]" in run(*CALIBRATE)[2]
+    rows = [[str(10 * i), *cells, "0.02"] for i, cells in enumerate(CELLS, 1)]
+    write("data.csv", "\n".join(map(",".join, [["k", *"pqruvw", "rms"], *rows])))
+    assert 'order = ["p", "q", "r"]' in run(*CALIBRATE)[2]
+
+
+def write_below_titles(ending, table):
+    """Write a table under two lines of titles and an empty line."""
+    titles = [["Tracker export"], ["Job", "7", "", "A. B."], []]
+    if ending == "csv":
+        return write("data.csv", "\n".join(map(";".join, [*titles, *table])) + "\n")
+    from openpyxl import Workbook
+
+    workbook = Workbook()
+    for row in [*titles, *table]:
+        workbook.active.append([float(cell) if re.fullmatch(r"[\d.-]+", cell) else cell for cell in row])
+    workbook.save("data.xlsx")
+
+
+@pytest.mark.parametrize("ending", ["csv", "xlsx"])
+@pytest.mark.parametrize("header", ["J1,J2,J3,X in mm,Y in mm,Z in mm", HEADER])
+def test_a_header_below_titles_is_found(run, expected, ending, header):
+    write_below_titles(ending, [header.split(","), *CELLS])
+    command = (*CALIBRATE[:2], f"data.{ending}", *CALIBRATE[3:])
+    status, _, err = run(*command)
+    assert (status, err.count("\n")) == (2, 1)
+    assert f"data.{ending}:1: no names of columns in this line; they seem to be in line 4; remove" in err
+    lines = proposed_map(err)
+    assert lines.startswith("skip = 3\njoints = ")
+    Path("map.toml").write_text(lines)
+    assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
+    (file,) = json_of(run("inspect", f"data.{ending}", "--robot", "arm.dh.toml", "--json", "-"))["files"]
+    assert "\n".join(file["column_map"]) == lines.strip()
+    assert (file["rows"], file["bad_rows"], len(file["columns"])) == (20, {}, 6)
+    Path("map.toml").write_text(lines.replace("skip = 3\n", ""))
+    status, _, err = run(*command, "--columns", "map.toml")
+    assert (status, "skip = 3 in the map reads the header in line 4" in err) == (2, True)
+
+
+def test_texts_that_may_be_coordinates_are_named(run, robot_folder):
+    write("data.csv", "J1;J2;J3;X;Y;Z\n" + "1.5;2.5;3.5;1,068;2,5;3.5\n" * 5)
+    err = unfolded(run("inspect", "data.csv", "--robot", "arm.dh.toml")[2])
+    assert "column 'X': '1,068' is not a finite number with decimal points: write it without thousands" in err
+
+
 def test_no_map_is_proposed_for_the_file_of_a_robot_with_more_joints(run, expected):
     head = ",".join(f"axis{i}[deg]" for i in range(4))
     write("data.csv", f"{head},x[mm],y[mm],z[mm]\n" + "1,2,3,4,500,600,700\n" * 9)
     status, _, err = run(*CALIBRATE)
     assert (status, err.count("\n")) == (2, 1)
-    assert "state the robot of this file" in err
+    assert "more angles than the robot has joints: give the robot that was measured" in err
     assert "order" not in err
 
 
@@ -370,8 +487,8 @@ def test_optional_packages_are_named(assert_refused, run, robot_folder, monkeypa
 @pytest.mark.parametrize(
     ("header", "word"),
     [
-        ("X[mm]", "did you mean 'x'?"),
         ("poinnt", "did you mean 'point'?"),
+        ("X[mm]", "'X' is neither"),
         ("flange[deg]", "'flange' is neither"),
         ("offset[mm]", "'offset' is neither"),
         ("weight", "'weight' is neither"),
@@ -380,7 +497,5 @@ def test_optional_packages_are_named(assert_refused, run, robot_folder, monkeypa
 def test_columns_that_may_be_meant_are_not_ignored(assert_refused, run, robot_folder, header, word):
     """A misspelt name, an angle or a length, and numbers without a unit."""
     text = with_columns([header, [str(i**2) for i in range(20)]])
-    if header == "X[mm]":
-        text = TEXT.replace("x[mm]", header)
     write("data.csv", text)
     assert_refused(["data.csv:1:", word], *CALIBRATE)

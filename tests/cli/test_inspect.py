@@ -74,6 +74,24 @@ def test_columns_ranges_and_coverage(run, pose_file, ur10):
     assert columns["time"]["role"] == "other"
 
 
+@pytest.mark.parametrize("options", [(), ("--robot", "arm.dh.toml")])
+def test_conditions_are_used(run, robot_folder, options):
+    names = ["temperature[degC]", "payload[kg]", "approach_joint_2", "remark"]
+    lines = [f"{line},20.5,1.5,1,ok" for line in positions_csv(12).splitlines()[1:]]
+    Path("data.csv").write_text("\n".join([",".join([HEADER, *names]), *lines]))
+    (file,) = inspect(run, "data.csv", *options)["files"]
+    roles = [column["role"] for column in file["columns"][6:]]
+    assert roles == ["condition", "condition", "condition", "ignored"]
+    err = run("inspect", "data.csv", *options)[2]
+    assert "conditions: temperature, payload, approach_joint_2" in err
+    assert "not used: remark\n" in err
+
+
+def test_names_in_capitals_are_known_without_a_robot(run, robot_folder):
+    Path("data.csv").write_text(positions_csv(12).replace("x[mm],y[mm],z[mm]", "X[mm],Y[mm],Z[mm]"))
+    assert inspect(run, "data.csv")["files"][0]["kind"] == "position"
+
+
 def test_ranges_are_in_the_units_of_the_file(run, robot_folder):
     Path("data.csv").write_text(positions_csv(30))
     (file,) = inspect(run, "data.csv", "--robot", "arm.dh.toml")["files"]

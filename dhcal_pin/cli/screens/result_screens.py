@@ -203,6 +203,9 @@ def _inspection_blocks(inspection: FileInspection) -> list[Block]:
         if column.counts and column.role != "ignored":
             counts = [f"{text} ({count} rows)" for text, count in column.counts.items()]
             texts.append(f"{column.name}: {list_first(counts)}")
+    conditions = [column.name for column in inspection.columns if column.role == "condition"]
+    if conditions:
+        texts.append(f"conditions: {', '.join(conditions)}")
     ignored = [column.name for column in inspection.columns if column.role == "ignored"]
     if len(ignored) == len(inspection.columns) and not inspection.problem:
         texts.append("No column is known. With --robot a column map is proposed.")

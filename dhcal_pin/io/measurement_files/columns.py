@@ -11,25 +11,28 @@ kind needs in any case, and no names that start with the prefix of the second co
 The conditions of the samples may stand beside them: `time[s]`, `temperature[degC]`, `payload[kg]` and the
 direction of the last motion of a joint, `approach_JOINT`. A joint of such a name comes first.
 
-Other columns are ignored if they cannot be meant as a joint or a measured value: times, counters, texts, and
-quantities other than lengths and angles. Any other unknown column is an error, as it may be misspelt.
+Other columns are ignored if they cannot be meant as a joint or a measured value: times, counters, texts that
+do not go with the measured values, and quantities other than lengths and angles. Any other unknown column is
+an error, as it may be misspelt.
 """
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import replace
 
 import numpy as np
 
+from ..._typing import Array
 from ...exceptions import FileFormatError, UnknownNameError
 from ...measurements import KINDS
 from ...measurements.base import Measurement
 from ...messages import quote
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS
-from ...units import ANGLES, LENGTHS
+from ...units import ANGLES, LENGTHS, UNITS, column_header
 from ..tables import Column, DataTable
 from ..tabular import require_usable_names
 
@@ -78,6 +81,8 @@ _CONTENTS: dict[str, str] = {
     **dict.fromkeys(("set", *_REMARKS), "text"),
     **dict.fromkeys((*COMMANDED, *AFTER), "length"),
 }
+# Contents of measured values with a unit.
+_MEASURED_CONTENTS = ("length", "angle", "pixel", "acceleration")
 # Names of times and counters in the files of other programs.
 _TIME_OR_COUNTER = re.compile(
     r".*(?:time|stamp|date|datum|zeit).*|t|no\.?|nr\.?|#|i|id|idx|index|row|line|sample|seq|unnamed.*",
@@ -143,6 +148,36 @@ def condition_columns(chain: Chain) -> dict[str, list[str]]:
     return {name: names for name, names in columns.items() if not joints.intersection(names)}
 
 
+def is_condition(name: str, chain: Chain | None) -> bool:
+    """Return whether a column states a condition of the samples, of any joint if the robot is not known."""
+    if chain is not None:
+        return any(name in columns for columns in condition_columns(chain).values())
+    return name in CONDITIONS or any(
+        condition.is_per_joint and name.startswith(f"{condition.name}_") for condition in CONDITIONS.values()
+    )
+
+
+def with_known_spelling(table: DataTable, chain: Chain | None) -> DataTable:
+    """Return a table in which names with a unit are spelt as known ones, such as `x[mm]` for `X[mm]`."""
+    try:
+        columns = table.columns
+    except FileFormatError:  # reported where the columns are used
+        return table
+    contents = _CONTENTS if chain is None else column_contents(chain)
+    spellings: dict[str, list[str]] = {}
+    for name, content in contents.items():
+        if content in _MEASURED_CONTENTS:
+            spellings.setdefault(name.lower(), []).append(name)
+    headers = list(table.headers)
+    names = [name.lower() for name in columns]
+    for name, column in columns.items():
+        known = spellings.get(name.lower(), [])
+        is_only = len(known) == names.count(name.lower()) == 1
+        if is_only and name != known[0] and column.unit in UNITS[contents[known[0]]]:
+            headers[column.index] = column_header(known[0], column.unit)
+    return replace(table, headers=tuple(headers)) if headers != [*table.headers] else table
+
+
 def is_in_order(table: DataTable) -> bool:
     """Return whether a comment declares that the rows of a table are in the order of measurement."""
     return any(text.strip().lower() == IN_ORDER for text in table.comments)
@@ -184,7 +219,7 @@ def joints_off_the_chain(chain: Chain) -> list[str]:
 
 def needs_column_map(table: DataTable, chain: Chain) -> bool:
     """Return whether a file has no header, one that names no joint or no measured value, or Euler angles."""
-    if table.has_numbers_as_header:
+    if table.has_numbers_as_header or has_titles(table, chain):
         return True
     values = value_table(table, chain)
     if has_tool_poses(values):
@@ -198,6 +233,12 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     if set(values.columns) & VALUE_COLUMNS:
         return not names & joints and n_unknown >= chain.n_joints
     return n_unknown >= (1 if names & joints else chain.n_joints)
+
+
+def has_titles(table: DataTable, chain: Chain) -> bool:
+    """Return whether the header seems to be below lines of titles, as the first line has no known name."""
+    names = {header.partition("[")[0].strip() for header in table.headers}
+    return table.read_below_titles is not None and not names & known_columns(chain)
 
 
 def euler_columns(table: DataTable, chain: Chain) -> list[str]:
@@ -243,12 +284,35 @@ def _can_be_ignored(table: DataTable, column: Column, known: Iterable[str]) -> b
     """Return whether an unknown column cannot be meant as a joint or a measured value."""
     if _TIME_OR_COUNTER.fullmatch(column.name):
         return True
-    if _suggestions(column.name, known, table.columns) or column.unit in {*LENGTHS, *ANGLES}:
+    suggestions = _suggestions(column.name, known, table.columns)
+    if column.unit in {*LENGTHS, *ANGLES}:
         return False
     if column.unit:
+        return not suggestions
+    values = table.values(column.index)
+    is_text = not all(
+        is_number or not cells[column.index].strip()
+        for is_number, cells in zip(np.isfinite(values), table.cells, strict=True)
+    )
+    if not is_text and not counts_rows(values):
+        return False
+    return not any(_is_possible(table, name) for name in suggestions)
+
+
+def _is_possible(table: DataTable, name: str) -> bool:
+    """Return whether a table may have one more column of texts, so that another column may be meant by it."""
+    if _CONTENTS.get(name) != "text" or name in AUXILIARY_COLUMNS:
         return True
-    is_number = np.isfinite(table.values(column.index))
-    return not all(is_number[row] or not cells[column.index].strip() for row, cells in enumerate(table.cells))
+    try:
+        _kind_of_columns({*_present_values(table), name}, table.header_location)
+    except FileFormatError:
+        return False
+    return True
+
+
+def counts_rows(values: Array) -> bool:
+    """Return whether a column (m,) counts its rows."""
+    return len(values) > 2 and values[0] in (0, 1) and bool(np.all(np.diff(values) == 1))
 
 
 def unknown_column_error(
@@ -259,7 +323,7 @@ def unknown_column_error(
     remedy = (
         f"did you mean {suggestions[0]!r}?"
         if suggestions
-        else f"remove it, or state the robot of this file; the joints are {', '.join(joint_names)}"
+        else f"remove it or rename it; the joints of the robot are {', '.join(joint_names)}"
     )
     return UnknownNameError(
         f"{where}: column {name!r} is neither a joint of this robot nor a known measurement column; {remedy}"
@@ -301,6 +365,11 @@ def find_kind(table: DataTable) -> type[Measurement]:
     present = _present_values(table)
     if has_tool_poses(table):
         present -= set(TOOL_POSE)
+    return _kind_of_columns(present, table.header_location)
+
+
+def _kind_of_columns(present: Set[str], where: str) -> type[Measurement]:
+    """Find the measurement kind that has some columns of values."""
     candidates = [
         (len(required), -len(kind.columns), kind)
         for kind in KINDS.values()
@@ -314,7 +383,7 @@ def find_kind(table: DataTable) -> type[Measurement]:
         if len(possible) == 1:
             (missing, *_) = sorted((sorted(each - present) for each in possible[0].required_columns), key=len)
             expected = f"kind {possible[0].kind} needs {', '.join(missing)}, too"
-        raise FileFormatError(f"{table.header_location}: no measured values{incomplete}; {expected}")
+        raise FileFormatError(f"{where}: no measured values{incomplete}; {expected}")
     kind = max(candidates, key=lambda candidate: candidate[:2])[2]
     if unrelated := sorted(present - set(kind.columns)):
         others = "".join(
@@ -324,7 +393,7 @@ def find_kind(table: DataTable) -> type[Measurement]:
             and (missing := min((sorted(each - present) for each in other.required_columns), key=len))
         )
         raise FileFormatError(
-            f"{table.header_location}: column {unrelated[0]!r} does not go with "
+            f"{where}: column {unrelated[0]!r} does not go with "
             f"{', '.join(sorted(present & set(kind.columns)))}; "
             f"a file of kind {kind.kind} has {', '.join(kind.columns)}{others}"
         )

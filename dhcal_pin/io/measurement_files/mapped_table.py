@@ -19,6 +19,7 @@ from ..tables import DataTable, TextLayout, read_table
 from ..tables.data_frame import is_data_frame
 from .column_map import PATH_PARTS, ColumnMap, ColumnRule, Rotation
 from .columns import ROTVEC
+from .map_proposal import skip_line
 
 # Largest deviation of a matrix' singular values from 1. A larger one is an error, not rounding.
 _MAX_ORTHOGONALITY_ERROR = 1e-3
@@ -58,6 +59,7 @@ def read_mapped_table(
             raise FileFormatError(
                 f"{table.header_location}: no column {missing[0]!r}, which {column_map.source} names; the "
                 f"file ({table.description}) has {', '.join(map(repr, table.headers[:_MAX_LISTED_NAMES]))}"
+                f"{_skip_hint(table, missing[0])}"
             )
         index = {name: found for name, found in indices.items() if found is not None}
         numbers = [rule.source_column for rule in column_map.rules if rule.content != "text"]
@@ -83,6 +85,16 @@ def read_mapped_table(
         description=table.description,
         notes=table.notes,
         euler_angles=euler_angles,
+    )
+
+
+def _skip_hint(table: DataTable, name: str | int) -> str:
+    """Return the remedy if a column is in a header below lines of titles; empty otherwise."""
+    below = table.below_titles
+    return (
+        f"; {skip_line(below)} in the map reads the header in line {below.header_line}"
+        if (below is not None and name in below.headers)
+        else ""
     )
 
 

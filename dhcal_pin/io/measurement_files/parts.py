@@ -14,6 +14,7 @@ from ...robot.chain import Chain
 from ..tables import parse_lines
 from ..tables.text import BLANK_CHARACTERS
 from ..tabular import unreadable
+from .columns import with_known_spelling
 from .reading import parse_measurements
 
 # Samples, or a function that reads them. The function is small enough to be sent to another process.
@@ -79,4 +80,5 @@ def _read_part(
     except UnicodeDecodeError as error:
         position = start + error.start
         raise FileFormatError(f"{source}: byte {position} is not UTF-8; save the file as UTF-8") from error
-    return parse_measurements(parse_lines(source, [header, *enumerate(lines, first_line)]), chain).fit
+    table = parse_lines(source, [header, *enumerate(lines, first_line)])
+    return parse_measurements(with_known_spelling(table, chain), chain).fit

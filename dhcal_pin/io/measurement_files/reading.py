@@ -46,6 +46,7 @@ from .columns import (
     condition_columns,
     describe_conditions,
     find_kind,
+    has_titles,
     has_tool_poses,
     is_in_order,
     joint_units,
@@ -53,6 +54,7 @@ from .columns import (
     known_columns,
     needs_column_map,
     value_table,
+    with_known_spelling,
 )
 from .counts import with_joint_values
 from .tool_poses import solve_tool_poses
@@ -148,6 +150,8 @@ def open_measurement_table(
     """Read the table of a measurement file, through a column map and a servo file if they are given."""
     if columns is None:
         table = read_table(source, TextLayout(sheet=sheet, names=known_columns(chain)))
+        if not has_titles(table, chain):
+            table = with_known_spelling(table, chain)
     else:
         from .column_map import read_map  # lazy import, as the following: only for files of other makers
         from .mapped_table import read_mapped_table
