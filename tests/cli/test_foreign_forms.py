@@ -347,12 +347,12 @@ def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected
     assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
 
 
-def columns_of_ros():
+def columns_of_ros(prefix="/joint_states/"):
     """Return the columns of a recording of ROS in another order of the joints."""
     radians = np.radians(NUMBERS[:, :3])
     out = {"/joint_states/header/stamp/secs": [str(1_700_000_000 + 3 * i) for i in range(20)]}
     for j in (1, 0, 2):
-        topic = f"/joint_states/joint_{j + 1}"
+        topic = f"{prefix}joint_{j + 1}"
         out[f"{topic}/velocity"] = ["0.0"] * 20
         out[f"{topic}/position"] = [repr(float(value)) for value in radians[:, j]]
     return out | {f"/leica/point/{axis}": [cells[3 + i] for cells in CELLS] for i, axis in enumerate("xyz")}
@@ -382,6 +382,7 @@ def columns_of_an_export():
     ("columns", "order", "unit"),
     [
         (columns_of_ros, [f"/joint_states/joint_{j}/position" for j in (1, 2, 3)], "rad"),
+        (lambda: columns_of_ros(""), [f"joint_{j}/position" for j in (1, 2, 3)], "rad"),
         (columns_of_names, ["position[1]", "position[2]", "position[0]"], "deg"),
         (columns_of_an_export, ["Achse 1", "Achse 2", "Achse 3"], "deg"),
     ],

@@ -53,7 +53,7 @@ _NOT_MEASURED = r"std|sigma|goal|target|command|nominal|soll"
 _NOT_POSITION = (
     rf"vel|speed|acc|effort|torque|force|moment|current|temp|tcp|(?<![a-z])qd+(?![a-z])|{_NOT_MEASURED}"
 )
-_ROTATION = r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|[abcwpr]|roll|pitch|yaw|rot.*)(?![a-z])"
+_ROTATION = r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|[abcwpr]|roll|pitch|yaw|rot.*|orientation.*)(?![a-z])"
 # Headers of times, and of counters of rows.
 _TIME = r"time|stamp|zeit|datum|(?<![a-z])(?:n?secs?|date)(?![a-z])"
 _COUNTER = (
@@ -219,7 +219,8 @@ def _choose_position(table: DataTable, others: Sequence[int]) -> list[int]:
 
 def _is_axis(header: str, axis: str) -> bool:
     """Return whether a header in lower case names a measured coordinate along an axis."""
-    return bool(re.search(rf"(?<![a-z]){axis}(?![a-z])", header)) and not re.search(_NOT_MEASURED, header)
+    is_named = re.search(rf"(?<![a-z]){axis}(?![a-z])", header)
+    return bool(is_named) and not re.search(rf"orientation|rotation|quat|{_NOT_MEASURED}", header)
 
 
 def _rotation_line(
@@ -234,8 +235,9 @@ def _rotation_line(
         candidates = [i for i in turns if re.search(_ROTATION, table.headers[i].lower())]
         candidates = [i for i in candidates if not re.search(_NOT_MEASURED, table.headers[i].lower())]
     if len(candidates) >= 4 and _are_quaternions(np.stack([columns[i] for i in candidates[:4]])):
+        is_scalar_last = bool(re.search(r"w\W*$", table.headers[candidates[3]].lower()))
         return [
-            f'rotation = {{convention = "quaternion", order = "wxyz", '
+            f'rotation = {{convention = "quaternion", order = "{"xyzw" if is_scalar_last else "wxyz"}", '
             f"columns = {_names(table, candidates[:4])}}}"
         ]
     if len(candidates) < 3:
@@ -307,7 +309,7 @@ def _suffixed_joint(table: DataTable, chain: Chain) -> tuple[str, str] | None:
             (joint, header)
             for joint in chain.joint_names
             for header in table.headers
-            if re.fullmatch(rf"{re.escape(joint)}[.:/](?!position$)\w+", header.strip())
+            if re.fullmatch(rf"{re.escape(joint)}[.:/](?!position$|velocity$|effort$)\w+", header.strip())
         ),
         None,
     )

@@ -228,6 +228,24 @@ def test_angles_of_makers_are_proposed_by_their_columns(tmp_path, arm, header, a
 
 
 @pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        (["qw", "qx", "qy", "qz"], "wxyz"),
+        (["qx", "qy", "qz", "qw"], "xyzw"),
+        ([f"/pose/orientation/{letter}" for letter in "xyzw"], "xyzw"),
+    ],
+)
+def test_quaternions_are_proposed_in_the_order_of_their_columns(tmp_path, arm, names, order):
+    header = ["A1", "A2", "A3", *(f"/pose/position/{axis}" for axis in "xyz"), *names]
+    rows = ["10,20,30,1,2,3,0.5,-0.5,0.5,0.5"] * 3
+    (tmp_path / "theirs.csv").write_text("\n".join([",".join(header), *rows]))
+    with pytest.raises(DhcalError) as error:
+        read_measurements(tmp_path / "theirs.csv", arm)
+    assert f'order = "{order}", columns = {json.dumps(names)}' in str(error.value)
+    assert 'x = {from = "/pose/position/x"' in str(error.value)
+
+
+@pytest.mark.parametrize(
     ("names", "unit", "order"),
     [
         ("ABC", "deg", "ZYX"),
