@@ -418,8 +418,9 @@ def write_below_titles(ending, table):
     from openpyxl import Workbook
 
     workbook = Workbook()
+    sheet = workbook.create_sheet("Data", 0)
     for row in [*titles, *table]:
-        workbook.active.append([float(cell) if re.fullmatch(r"[\d.-]+", cell) else cell for cell in row])
+        sheet.append([float(cell) if re.fullmatch(r"[\d.-]+", cell) else cell for cell in row])
     workbook.save("data.xlsx")
 
 

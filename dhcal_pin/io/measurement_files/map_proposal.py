@@ -101,7 +101,7 @@ def skip_line(below: DataTable) -> str:
     return f"skip = {below.header_line - 1}"
 
 
-def _choose_joints(table: DataTable, chain: Chain, columns: Mapping[int, Array]) -> list[int]:
+def _choose_joints(table: DataTable, chain: Chain, columns: Iterable[int]) -> list[int]:
     """Return the columns of the joints by the names in the header, nothing without such names."""
     if table.has_numbers_as_header:
         return []
