@@ -22,7 +22,7 @@ from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..formatting import Table
 from ..io.measurement_files import columns as file_columns
-from ..io.measurement_files.map_proposal import header_problem, propose_map
+from ..io.measurement_files.map_proposal import header_problem, propose_map, skip_line
 from ..io.measurement_files.reading import (
     MeasurementFile,
     open_measurement_table,
@@ -95,14 +95,13 @@ def inspect_file(
 ) -> FileInspection:
     """Say what a measurement file contains."""
     if chain is None:
-        table = read_table(source, TextLayout(sheet=sheet))
+        table = _below_titles(read_table(source, TextLayout(sheet=sheet)), None)
         return _inspect_table(file_columns.with_known_spelling(table, None), None)
     table = open_measurement_table(source, chain, columns, servos, sheet)
     try:
         file = parse_measurements(table, chain, skip_bad_rows=True, rig=rig)
     except DhcalError as error:
-        has_titles = file_columns.has_titles(table, chain)
-        inspection = _inspect_table(table.below_titles if has_titles and table.below_titles else table, chain)
+        inspection = _inspect_table(_below_titles(table, chain), chain)
         if file_columns.needs_column_map(table, chain):
             lines = tuple(propose_map(table, chain))
             return replace(inspection, problem=header_problem(table, chain), column_map=lines)
@@ -113,6 +112,15 @@ def inspect_file(
         bad_rows=file.bad_rows,
         warnings=(*find_input_warnings(chain, file), *_session_warnings(chain, file)),
     )
+
+
+def _below_titles(table: DataTable, chain: Chain | None) -> DataTable:
+    """Return the table below lines of titles with a note, or the table itself if it has no titles."""
+    below = table.below_titles
+    if below is None or not file_columns.has_titles(table, chain):
+        return table
+    note = f"the names of the columns seem to be in line {below.header_line}; in a column map, "
+    return replace(below, notes=(*below.notes, f"{note}{skip_line(below)} skips the lines above it"))
 
 
 def _session_warnings(chain: Chain, file: MeasurementFile) -> list[str]:

@@ -87,6 +87,15 @@ def test_conditions_are_used(run, robot_folder, options):
     assert "not used: remark\n" in err
 
 
+@pytest.mark.parametrize("options", [(), ("--robot", "arm.dh.toml")])
+def test_the_table_below_titles_is_shown(run, robot_folder, options):
+    Path("data.csv").write_text(f"Report;7\n\n{positions_csv(12).replace('[mm]', '').replace('joint_', 'A')}")
+    (file,) = inspect(run, "data.csv", *options)["files"]
+    assert [column["name"] for column in file["columns"]] == ["A1", "A2", "A3", "x", "y", "z"]
+    assert (file["rows"], file["bad_rows"], file["first_line"]) == (12, {}, 4)
+    assert "line 3; in a column map, skip = 2 skips the lines above it" in file["notes"][0]
+
+
 def test_names_in_capitals_are_known_without_a_robot(run, robot_folder):
     Path("data.csv").write_text(positions_csv(12).replace("x[mm],y[mm],z[mm]", "X[mm],Y[mm],Z[mm]"))
     assert inspect(run, "data.csv")["files"][0]["kind"] == "position"

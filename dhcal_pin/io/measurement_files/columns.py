@@ -235,10 +235,11 @@ def needs_column_map(table: DataTable, chain: Chain) -> bool:
     return n_unknown >= (1 if names & joints else chain.n_joints)
 
 
-def has_titles(table: DataTable, chain: Chain) -> bool:
+def has_titles(table: DataTable, chain: Chain | None) -> bool:
     """Return whether the header seems to be below lines of titles, as the first line has no known name."""
     names = {header.partition("[")[0].strip() for header in table.headers}
-    return table.read_below_titles is not None and not names & known_columns(chain)
+    known = _KNOWN if chain is None else known_columns(chain)
+    return table.read_below_titles is not None and not names & known
 
 
 def euler_columns(table: DataTable, chain: Chain) -> list[str]:
