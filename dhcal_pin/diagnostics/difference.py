@@ -23,8 +23,10 @@ degrees of freedom. If the noise was estimated from the residuals, χ²_A is ν_
 Residuals that vary with the joint values are evidence of their own. Calibrations state by how much each
 family of joint errors that the model lacks would decrease the cost. An F test judges the gains of both.
 
-If the difference is too large, joints are named in turn: that whose zero, or whose placement and joint
-errors, reduces χ² most beyond what each coefficient must reduce.
+Configurations for χ² have drawn directions of motion and temperatures, if one of the robots depends on them,
+so that backlash and thermal growth count as all other parameters do. See `common_conditions`.
+
+If the difference is too large, the joints and links that explain it are named, see `joint_differences`.
 
 Reference: W. Baarda, S-transformations and criterion matrices, Netherlands Geodetic Commission, 1973.
 
@@ -33,7 +35,7 @@ Shapes: m configurations, n joints, c components of a displacement: 3, or 6 with
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -48,7 +50,10 @@ from ..exceptions import InvalidArgumentError
 from ..formatting import Quantity
 from ..measurements.measured_region import MeasuredRegion, draw_joint_space
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from ..robot.error_families import FAMILIES
+from .common_conditions import at_reference, condition_remarks, varied, with_common_payload
+from .joint_differences import PartDifference, find_part_differences, parameters
 
 # Number of configurations at which the robots are compared.
 N_COMPARED = 200
@@ -65,18 +70,17 @@ MIN_STD_RATIO = 0.02
 RANK_RTOL = 1e-3
 # Largest part of the effect of a joint error outside of what the uncertainties contain.
 MAX_OUTSIDE = 1e-3
+# Smallest part of the effect of a parameter that base and tool do not have.
+MIN_OWN_EFFECT = 0.01
 # Effects of base and tool below this part of the largest one are none.
 EFFECT_RTOL = 1e-6
 # Probability below which calibrations are different: of the chi-square of the parameters, and of that of all.
 DIFFERENT_P = 0.005
 # Probability of the gain of a family of joint errors below which the models lack it.
 LACKING_P = 1e-4
-# Smallest reduction of chi-square by each coefficient of a joint that is named.
-MIN_REDUCTION = 12.0
-# Displacement that no uncertainty explains and that counts as a difference of the models [m].
-MIN_UNEXPLAINED = 1e-5
-# Orders of the harmonics of a joint that its errors may contain.
-ORDERS = (1, 2)
+# Displacement that no uncertainty explains and that counts as a difference of the models [m], and its
+# smallest part of the distance of the tools: the rest is of the linearization.
+MIN_UNEXPLAINED, MIN_UNEXPLAINED_PART = 1e-5, 0.05
 MAX_ITERATIONS = 10
 STEP_TOL = 1e-10
 
@@ -140,6 +144,12 @@ class ChiSquare:
         return float(special.chdtrc(freedom, max(self.value - self.constant, 0.0))) if freedom > 0 else np.nan
 
     @property
+    def limit(self) -> float:
+        """Reduced chi-square that `DIFFERENT_P` of cases exceed if the hypothesis is true."""
+        end = float(special.chdtri(self.freedom - self.constant, DIFFERENT_P))
+        return (self.constant + end) / max(self.freedom, 1)
+
+    @property
     def usual(self) -> tuple[float, float]:
         """Interval that contains the reduced chi-square of 95 % of cases if the hypothesis is true."""
         ends = (special.chdtri(self.freedom - self.constant, 1 - p) for p in (0.025, 0.975))
@@ -153,6 +163,7 @@ class ChiSquare:
             "degrees_of_freedom": self.freedom,
             "reduced_chi_square": self.reduced,
             "reduced_chi_square_95": list(self.usual),
+            "reduced_chi_square_limit": self.limit,
             "p_value": self.p_value,
         }
 
@@ -170,18 +181,22 @@ class Difference:
     of_parameters: ChiSquare | None = None
     #: Chi-square of the residuals of both calibrations and of the difference.
     overall: ChiSquare | None = None
-    unexplained: float = 0.0  #: RMS distance that no uncertainty can explain [m]
-    #: Joints that differ, that of the largest part of chi-square first, and these parts.
-    joints: dict[str, float] = field(default_factory=dict)
+    unexplained: float = 0.0  #: RMS distance that no uncertainty can explain [m]; 0 if it is rounding
+    #: Joints and links that differ, that of the largest part of chi-square first.
+    joints: dict[str, PartDifference] = field(default_factory=dict)
     #: Families of joint errors that both models lack, and the probability that chance causes it.
     lacking: dict[str, float] = field(default_factory=dict)
+    #: Conditions of `q` at which the distances are those of the robots; None for q alone.
+    at: Conditions | None = None
+    #: Conditions of the comparison that one of the robots does not have, and errors that only one has.
+    remarks: Sequence[str] = ()
 
     @property
     def verdict(self) -> str:
         """Whether the robots are "equal" or "different" within their uncertainties, or "unknown"."""
         if self.of_parameters is None or self.overall is None:
             return "unknown"
-        is_other = self.unexplained > max(MIN_UNEXPLAINED, self.everywhere.expected or 0.0)
+        is_other = self.unexplained > (self.everywhere.expected or 0.0)
         least = min(self.of_parameters.p_value, self.overall.p_value)
         return "different" if least < DIFFERENT_P or is_other or self.lacking else "equal"
 
@@ -190,25 +205,27 @@ class Difference:
         """What the difference means."""
         if self.of_parameters is None or self.overall is None:
             return [
-                "No calibration states its uncertainty, so that nothing says how large a difference may be."
+                "No calibration states its uncertainty, so that nothing says how large a difference may be.",
+                *self.remarks,
             ]
-        texts = [f"{_described(self.of_parameters)}; equal robots have {_interval(self.of_parameters)}."]
+        texts = [f"{_described(self.of_parameters)}; equal robots have {_limit(self.of_parameters)}."]
         if self.overall.freedom > self.of_parameters.freedom:
             texts.append(
                 f"With the residuals of both: {_described(self.overall)}; one robot that the model describes "
-                f"has {_interval(self.overall)}."
+                f"has {_limit(self.overall)}."
             )
         if self.lacking:
             names = ", ".join(f"{name} ({FAMILIES[name].description})" for name in self.lacking)
             texts.append(f"The model does not explain the arm: residuals of both vary with {names}.")
         elif self.overall.p_value < DIFFERENT_P <= self.of_parameters.p_value:
             texts.append("The noise is larger than stated, or the model does not explain the arm.")
-        if self.unexplained > MIN_UNEXPLAINED:
+        if self.unexplained:
             part = Quantity.error(self.unexplained, "m")
-            texts.append(f"{part} RMS is of errors that only one of the models has.")
+            texts.append(f"{part} RMS is of errors whose uncertainty no calibration states.")
         if self.joints:
-            texts.append(f"These joints differ: {', '.join(self.joints)}.")
-        return texts
+            parts = "; ".join(f"{name} ({part.text})" for name, part in self.joints.items())
+            texts.append(f"These parts differ: {parts}.")
+        return [*texts, *self.remarks]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the difference for a JSON document."""
@@ -221,7 +238,7 @@ class Difference:
             "parameters": self.of_parameters and self.of_parameters.to_dict(),
             "lacking": [{"name": name, "p_value": value} for name, value in self.lacking.items()],
             "unexplained_rms_m": self.unexplained,
-            "joints": [{"name": name, "chi_square": value} for name, value in self.joints.items()],
+            "joints": [{"name": name, **part.to_dict()} for name, part in self.joints.items()],
         }
 
 
@@ -234,9 +251,9 @@ def _described(found: ChiSquare) -> str:
     return f"Reduced chi-square {found.reduced:.2f} with {found.freedom:.0f} degrees of freedom"
 
 
-def _interval(found: ChiSquare) -> str:
-    """Describe the usual interval of a chi-square."""
-    return "{:.2f} to {:.2f}".format(*found.usual)
+def _limit(found: ChiSquare) -> str:
+    """Describe the limit of a chi-square."""
+    return f"less than {found.limit:.2f}"
 
 
 def compare(first: Calibrated, second: Calibrated) -> Difference:
@@ -253,33 +270,44 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
     if first.uncertainty is None and second.uncertainty is not None:
         # The measured point, which a nominal robot does not state.
         a = replace(a, tool=b.tool)
+    remarks = condition_remarks((a, b), (first.source, second.source))
+    a, b = with_common_payload((a, b))
     everywhere = draw_joint_space(a)
     q_all, q_region = everywhere[:N_COMPARED], _common_region(first, second)
-    lever = se3.rms_radius(a.poses(q_all)[:, :3, 3]) or 1.0
+    at_all, at_region = (q if q is None else at_reference((a, b), q) for q in (q_all, q_region))
+    assert at_all is not None
+    lever = se3.rms_radius(a.poses(at_all)[:, :3, 3]) or 1.0
     pair = (first.uncertainty, second.uncertainty)
     roots = [u for u in pair if u is not None]
-    is_turned = all(_determines_orientation(u, q_all, lever) for u in roots)
+    is_turned = all(_determines_orientation(u, at_all, lever) for u in roots)
     n_components = 6 if is_turned else 3
-    q = q_all if q_region is None else q_region
-    b = _aligned(a, replace(b, base=a.base, tool=a.tool), q, lever, n_components)
+    b = _aligned(a, replace(b, base=a.base, tool=a.tool), at_region or at_all, lever, n_components)
 
-    def distances(q: Array) -> Distances:
-        d = _displacements(a, b, q, 1.0)
-        expected = _expected(a, b, pair, q, lever, n_components)
+    def distances(at: Conditions) -> Distances:
+        d = _displacements(a, b, at, 1.0)
+        expected = _expected(a, b, pair, at, lever, n_components)
         angles = np.linalg.norm(d[:, 3:], axis=1) if is_turned else None
         return Distances(np.linalg.norm(d[:, :3], axis=1), angles, expected)
 
-    whole = distances(q_all)
+    whole = distances(at_all)
     rms = float(STATISTICS["rms"](whole.position))
     if rms > MAX_RELATIVE_DISTANCE * lever:
         raise InvalidArgumentError(
             f"{second.source}: another robot: its tool is {1e3 * rms:.3g} mm RMS from that of {first.source} "
             "after the best base and tool; expected two calibrations of one robot"
         )
-    difference = Difference(a, b, None if q_region is None else distances(q_region), whole, everywhere)
+    difference = Difference(
+        a,
+        b,
+        None if at_region is None else distances(at_region),
+        whole,
+        everywhere,
+        at=at_reference((a, b), everywhere),
+        remarks=remarks,
+    )
     if not roots:
         return difference
-    return _tested(difference, pair, q_all, lever, n_components)
+    return _tested(difference, pair, varied((a, b), q_all), lever, n_components)
 
 
 def _common_region(first: Calibrated, second: Calibrated) -> Array | None:
@@ -292,23 +320,28 @@ def _common_region(first: Calibrated, second: Calibrated) -> Array | None:
     return q[:: -(-len(q) // N_COMPARED)] if len(q) >= MIN_REGION else None
 
 
-def _displacements(a: Chain, b: Chain, q: Array, lever: float) -> Array:
+def _displacements(
+    a: Chain, b: Chain, at: Conditions, lever: float, of_second: Conditions | None = None
+) -> Array:
     """Return the displacements of the tool of b from that of a, (m, 6) [m]."""
-    of_a, of_b = a.poses(q), b.poses(q)
+    # The conditions of the second robot may be others.
+    of_a, of_b = a.poses(at), b.poses(at if of_second is None else of_second)
     turns = [se3.log3(turn) for turn in of_b[:, :3, :3] @ of_a[:, :3, :3].swapaxes(1, 2)]
     return np.hstack([of_b[:, :3, 3] - of_a[:, :3, 3], lever * np.array(turns)])
 
 
-def _frame_columns(chain: Chain, q: Array, lever: float, n_components: int) -> Array:
+def _frame_columns(chain: Chain, at: Conditions, lever: float, n_components: int) -> Array:
     """Return the effects of base and tool on displacements, (m·components, 12)."""
-    return frame_effects(chain, q, lever).reshape(len(q), 6, -1)[:, :n_components].reshape(-1, 12)
+    return frame_effects(chain, at, lever).reshape(len(at.q), 6, -1)[:, :n_components].reshape(-1, 12)
 
 
-def _aligned(a: Chain, b: Chain, q: Array, lever: float, n_components: int) -> Chain:
+def _aligned(
+    a: Chain, b: Chain, at: Conditions, lever: float, n_components: int, of_second: Conditions | None = None
+) -> Chain:
     """Return b with the base and tool with which its tool is nearest to that of a."""
     for _ in range(MAX_ITERATIONS):
-        effects = _frame_columns(b, q, lever, n_components)
-        d = _displacements(a, b, q, lever)[:, :n_components].ravel()
+        effects = _frame_columns(b, at, lever, n_components)
+        d = _displacements(a, b, at, lever, of_second)[:, :n_components].ravel()
         step = -np.linalg.lstsq(effects, d, rcond=EFFECT_RTOL)[0]
         b = replace(b, base=se3.exp6(step[:6]) @ b.base, tool=b.tool @ se3.exp6(step[6:]))
         if np.abs(effects @ step).max() < STEP_TOL:
@@ -316,62 +349,74 @@ def _aligned(a: Chain, b: Chain, q: Array, lever: float, n_components: int) -> C
     return b
 
 
-def _effects(chain: Chain, uncertainty: Uncertainty, q: Array, lever: float) -> Array:
+def _effects(chain: Chain, uncertainty: Uncertainty, at: Conditions, lever: float) -> Array:
     """Return the root of the covariance of the tool's displacements with the frames of a chain, (m, 6, r)."""
     moved = replace(uncertainty, chain=chain)
-    out = moved.tool_twists(chain.forward_kinematics(q), uncertainty.sqrt_covariance)
+    out = moved.tool_twists(chain.forward_kinematics(at), uncertainty.sqrt_covariance)
     out[:, 3:] *= lever
     return out
 
 
-def _without_frames(chain: Chain, q: Array, lever: float, n_components: int, columns: Array) -> Array:
+def _without_frames(chain: Chain, at: Conditions, lever: float, n_components: int, columns: Array) -> Array:
     """Remove what base and tool explain of displacements (m, 6, c), (m·components, c)."""
-    u, s, _ = np.linalg.svd(_frame_columns(chain, q, lever, n_components), full_matrices=False)
+    u, s, _ = np.linalg.svd(_frame_columns(chain, at, lever, n_components), full_matrices=False)
     u = u[:, s > EFFECT_RTOL * s[0]]
     flat = columns[:, :n_components].reshape(-1, columns.shape[2])
     return flat - u @ (u.T @ flat)
 
 
-def _determines_orientation(uncertainty: Uncertainty, q: Array, lever: float) -> bool:
+def _determines_orientation(uncertainty: Uncertainty, at: Conditions, lever: float) -> bool:
     """Return whether the measurements determine the orientation of the tool, up to another base and tool."""
     chain = uncertainty.chain
-    effects = _effects(chain, uncertainty, q, lever)
-    turn = _without_frames(chain, q, lever, 6, effects).reshape(len(q), 6, -1)[:, 3:]
-    position = _without_frames(chain, q, lever, 3, effects)
+    effects = _effects(chain, uncertainty, at, lever)
+    turn = _without_frames(chain, at, lever, 6, effects).reshape(len(at.q), 6, -1)[:, 3:]
+    position = _without_frames(chain, at, lever, 3, effects)
     return bool(np.linalg.norm(turn) <= MAX_STD_RATIO * np.linalg.norm(position))
 
 
 def _root(
-    a: Chain, b: Chain, pair: tuple[Uncertainty | None, Uncertainty | None], q: Array, lever: float, n: int
+    a: Chain,
+    b: Chain,
+    pair: tuple[Uncertainty | None, Uncertainty | None],
+    at: Conditions,
+    lever: float,
+    n: int,
 ) -> Array:
     """Return the root of the covariance of the displacements without base and tool, (m·n, r)."""
     # Base and tool of each calibration by themselves: measurements may leave them undetermined.
     parts = [
-        _without_frames(c, q, lever, n, _effects(c, u, q, lever))
+        _without_frames(c, at, lever, n, _effects(c, u, at, lever))
         for c, u in zip((a, b), pair, strict=True)
         if u is not None
     ]
     return np.hstack(parts)
 
 
-def _expected(a, b, pair, q: Array, lever: float, n: int) -> float | None:
+def _expected(a, b, pair, at: Conditions, lever: float, n: int) -> float | None:
     """Return the RMS distance that the uncertainties explain [m]."""
     if pair == (None, None):
         return None
-    root = _root(a, b, pair, q, lever, n).reshape(len(q), n, -1)[:, :3]
-    return float(np.sqrt(np.sum(root**2) / len(q)))
+    root = _root(a, b, pair, at, lever, n).reshape(len(at.q), n, -1)[:, :3]
+    return float(np.sqrt(np.sum(root**2) / len(at.q)))
 
 
-def _tested(difference: Difference, pair, q: Array, lever: float, n: int) -> Difference:
-    """Return a difference with its chi-square, and the joints that differ."""
+def _tested(difference: Difference, pair, at: Conditions, lever: float, n: int) -> Difference:
+    """Return a difference with its chi-square, and the parts that differ."""
     a, b = difference.first, difference.second
-    u, s, _ = np.linalg.svd(_root(a, b, pair, q, lever, n), full_matrices=False)
+    u, s, _ = np.linalg.svd(_root(a, b, pair, at, lever, n), full_matrices=False)
     usual = np.median(s[s > RANK_RTOL * s[0]])
     rank = int(np.sum(s > MIN_STD_RATIO * usual))
-    whiten = (u[:, :rank] / s[:rank]).T
-    d = _without_frames(a, q, lever, n, _displacements(a, b, q, lever)[..., None])
-    left = d - u[:, :rank] @ (u[:, :rank].T @ d)
-    z = (whiten @ d)[:, 0]
+    u, whiten = u[:, :rank], (u[:, :rank] / s[:rank]).T
+
+    def remaining(zeros: Array) -> Array:
+        """Return the displacements (m·n,) after zeros of the second robot are undone."""
+        undone = replace(at, zeros=np.tile(-zeros, (len(at.q), 1))) if zeros.any() else at
+        moved = _aligned(a, b, at, lever, n, undone) if zeros.any() else b
+        d = _displacements(a, moved, at, lever, undone)
+        return _without_frames(a, at, lever, n, d[..., None])[:, 0]
+
+    first = remaining(np.zeros(a.n_joints))
+    z = whiten @ first
     of_parameters = ChiSquare(float(z @ z), rank)
     fits = [each.fit for each in pair if each is not None and each.fit is not None]
     difference = replace(
@@ -379,16 +424,32 @@ def _tested(difference: Difference, pair, q: Array, lever: float, n: int) -> Dif
         of_parameters=of_parameters,
         overall=_with_residuals(of_parameters, fits),
         lacking=_lacking(fits),
-        unexplained=float(np.sqrt(np.sum(left**2) / len(q))),
+        unexplained=_unexplained(first, first, u, len(at.q)),
     )
     if difference.verdict != "different":
         return difference
-    columns = []
-    for name, effects in _joint_effects(a, q, lever):
-        own = _without_frames(a, q, lever, n, effects)
-        outside = np.sum((own - u[:, :rank] @ (u[:, :rank].T @ own)) ** 2, 0)
-        columns.append((name, whiten @ own[:, outside < MAX_OUTSIDE * np.sum(own**2, 0)]))
-    return replace(difference, joints=_named_joints(columns, z))
+    candidates = []
+    for each in parameters(a, at):
+        effects = _scaled(each.effects, lever)
+        own = _without_frames(a, at, lever, n, effects[..., None])[:, 0]
+        is_own = np.linalg.norm(own) > MIN_OWN_EFFECT * np.linalg.norm(effects)
+        if is_own and np.sum((own - u @ (u.T @ own)) ** 2) < MAX_OUTSIDE * np.sum(own**2):
+            candidates.append(replace(each, effects=whiten @ own))
+    joints, zeros = find_part_differences(candidates, lambda zeros: whiten @ remaining(zeros), a.n_joints)
+    unexplained = _unexplained(first, remaining(zeros), u, len(at.q))
+    return replace(difference, joints=joints, unexplained=unexplained)
+
+
+def _scaled(twists: Array, lever: float) -> Array:
+    """Return twists (m, 6) with angles times a length."""
+    return twists * np.repeat([1.0, lever], 3)
+
+
+def _unexplained(whole: Array, remaining: Array, u: Array, count: int) -> float:
+    """Return the RMS of displacements outside of the span of u [m]; 0 if it is of the linearization."""
+    left = float(np.linalg.norm(remaining - u @ (u.T @ remaining)))
+    is_small = left < MIN_UNEXPLAINED_PART * np.linalg.norm(whole)
+    return 0.0 if is_small or left < MIN_UNEXPLAINED * np.sqrt(count) else left / float(np.sqrt(count))
 
 
 def _with_residuals(of_parameters: ChiSquare, fits: Sequence[ModelFit]) -> ChiSquare:
@@ -413,41 +474,3 @@ def _lacking(fits: Sequence[ModelFit]) -> dict[str, float]:
         if p_value < LACKING_P / len(fits[0].gains):
             found[name] = p_value
     return dict(sorted(found.items(), key=lambda item: (item[1], item[0])))
-
-
-def _joint_effects(chain: Chain, q: Array, lever: float) -> Iterator[tuple[str, Array]]:
-    """Yield displacements by the zero of each joint, and by its placement and its errors, (m, 6, c) each."""
-    frames, n_bodies = chain.forward_kinematics(q), len(chain.moving_joints) + 1
-    bodies = Uncertainty(chain, np.zeros(0, int), np.eye(6 * n_bodies), np.empty((6 * n_bodies, 0)))
-    placements = bodies.tool_twists(frames, bodies.sqrt_covariance)
-    placements[:, 3:] *= lever
-    motions = chain.joint_jacobian(frames)
-    motions[:, 3:] *= lever
-    for i, name in enumerate(chain.joint_names):
-        terms = [np.ones(len(q)), q[:, i]]
-        if not chain.is_prismatic[i]:
-            terms += [f(k * q[:, i]) for k in ORDERS for f in (np.sin, np.cos)]
-        errors = motions[i].T[:, :, None] * np.stack(terms, 1)[:, None]
-        # The placement of a joint is a motion of the body in front of it.
-        body = chain.moving_joints.index(name)
-        yield name, errors[..., :1]
-        yield name, np.concatenate([placements[..., 6 * body : 6 * body + 6], errors], 2)
-
-
-def _named_joints(columns: Sequence[tuple[str, Array]], z: Array) -> dict[str, float]:
-    """Return the joints that differ, and the part of chi-square that each explains beyond those before it."""
-    named: dict[str, float] = {}
-    used, left = np.zeros((len(z), 0)), z
-    while True:
-        trials = []
-        for name, own in columns:
-            u, s, _ = np.linalg.svd(own - used @ (used.T @ own), full_matrices=False)
-            basis = u[:, s > RANK_RTOL * np.linalg.norm(own)]
-            gain = float(np.sum((basis.T @ left) ** 2))
-            trials.append((gain - MIN_REDUCTION * basis.shape[1], name, gain, basis))
-        score, name, gain, basis = max(trials, key=lambda trial: trial[0])
-        if score <= 0:
-            return named
-        named[name] = named.get(name, 0.0) + gain
-        used = np.hstack([used, basis])
-        left = left - basis @ (basis.T @ left)

@@ -32,6 +32,7 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..robot.chain import Chain
+from ..robot.conditions import Conditions
 from .uncertainty import UNBOUNDED_TOL, Uncertainty
 
 # Configurations at which the effects of undetermined directions are compared with those of base and tool.
@@ -120,10 +121,10 @@ def _effects(uncertainty: Uncertainty, directions: Array, q: Array, lever: float
     return twists.reshape(-1, directions.shape[1])
 
 
-def frame_effects(chain: Chain, q: Array, lever: float) -> Array:
+def frame_effects(chain: Chain, q: Array | Conditions, lever: float) -> Array:
     """Return the displacements of the tool by twists of base and tool at q, (6m, 12) [m]."""
     poses = chain.poses(q)
-    out = np.zeros((len(q), 6, 12))
+    out = np.zeros((len(poses), 6, 12))
     out[:, :3, :3] = out[:, 3:, 3:6] = np.eye(3)
     # v = ω × p
     out[:, :3, 3:6] = -se3.skew(poses[:, :3, 3])

@@ -37,8 +37,9 @@ def difference_table(difference: Difference) -> Table:
 def difference_page(names: Sequence[str], difference: Difference, inputs: Mapping[str, str]) -> str:
     """Render the page of a difference of two robot files."""
     table = difference_table(difference)
-    joints = [[name, f"{value:.0f}"] for name, value in difference.joints.items()]
-    tables = [table, *([Table(["joint", "part of chi-square"], joints)] if joints else [])]
+    joints = [[name, part.text, f"{part.chi_square:.0f}"] for name, part in difference.joints.items()]
+    header = ["joint or link", "largest difference", "part of chi-square"]
+    tables = [table, *([Table(header, joints, n_text_columns=2)] if joints else [])]
     sections = [
         Section("difference", "Distance of the tools", difference.sentences, tables=tables),
         Section("map", "Over the workspace", figures=partial(_maps, difference)),
@@ -53,7 +54,8 @@ def difference_page(names: Sequence[str], difference: Difference, inputs: Mappin
 def _maps(difference: Difference) -> list[FigureGroup]:
     """Draw maps of the distance of the tools."""
     a, b = difference.first, difference.second
-    points, others = (chain.poses(difference.q)[:, :3, 3] for chain in (a, b))
+    at = difference.q if difference.at is None else difference.at
+    points, others = (chain.poses(at)[:, :3, 3] for chain in (a, b))
     distances, base = np.linalg.norm(points - others, axis=1), se3.inverse(a.base)
     points = se3.transform_points(base, points)
     levels, panels = plots.std_levels(distances), []
