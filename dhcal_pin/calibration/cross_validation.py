@@ -344,6 +344,10 @@ def measured_region(fit: FittedModel) -> MeasuredRegion | None:
     if not len(q) or not fit.has_joint_values:
         return None
     region = MeasuredRegion.from_configurations(q, fit.chain.is_prismatic)
+    known = [item.recorded.payload for item in fit.inliers if item.recorded]
+    if len(known) == len(fit.inliers) and (stated := [each for each in known if each is not None]):
+        masses = np.concatenate(stated)
+        region = replace(region, payloads=(float(masses.min()), float(masses.max())))
     folds = region_folds(fit)
     return region.with_reach(q, samples_held_out(folds, samples)) if folds else region
 

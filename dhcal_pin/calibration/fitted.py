@@ -398,7 +398,7 @@ class FittedModel:
             np.concatenate([of_all(scale * root), errors.priors[:, None] * held_axes], 1),
             of_all(unbounded),
             self.problem.temperature,
-            self._model_std if self.problem.temperature > 1 else (0.0, 0.0),
+            self._residual_std(is_without_noise=True) if self.problem.temperature > 1 else (0.0, 0.0),
         )
         uncertainty = replace(uncertainty, fit=self._model_fit)
         if len(self.x) > MAX_COLUMNS and not held:
@@ -459,7 +459,12 @@ class FittedModel:
         has_chi_square = is_stated and np.isfinite(chi_square)
         is_tested = self.degrees_of_freedom > 0 and len(self.x) <= MAX_TESTED
         gains = family_gains(self.problem, self.x, self.weights) if is_tested else {}
-        return ModelFit(float(chi_square) if has_chi_square else None, float(self.degrees_of_freedom), gains)
+        return ModelFit(
+            float(chi_square) if has_chi_square else None,
+            float(self.degrees_of_freedom),
+            gains,
+            self._residual_std(is_without_noise=False),
+        )
 
     def _information(self, scale: float, root: Array) -> Information | None:
         """Return what the covariance scale²·root·rootᵀ of the parameters follows from."""
@@ -494,10 +499,10 @@ class FittedModel:
         """
         return self.uncertainty.relative
 
-    @property
-    def _model_std(self) -> tuple[float, float]:
-        """Standard deviation of what the model lacks, per axis, of lengths [m] and of angles [rad]."""
-        # It is that of the residuals of the inliers, without the stated noise of the instrument.
+    def _residual_std(self, is_without_noise: bool) -> tuple[float, float]:
+        """Return the standard deviation of residuals per axis, of lengths [m] and of angles [rad]."""
+        # The residuals are those of the inliers. Without the stated noise of the instrument, they are what the
+        # model lacks.
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
         n_rows = sum(count for _, _, count in self._row_counts)
         per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
@@ -507,7 +512,7 @@ class FittedModel:
             whitened = residual_of(item, self.chain, self.instruments)
             for name, group in item.residual_groups.items():
                 share = 1.0
-                if item.has_stated_sigma:
+                if is_without_noise and item.has_stated_sigma:
                     noise = 1 / (per_freedom * max(float(np.mean(whitened[group.rows] ** 2)), 1.0))
                     share = max(1 - noise, MIN_MODEL_SHARE)
                 squares.get(group.unit, []).append(share * np.ravel(errors[name]) ** 2)

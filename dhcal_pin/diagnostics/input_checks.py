@@ -79,14 +79,20 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     return [*_check_fit(chain, file), *repeated]
 
 
-def find_unstated_conditions(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Name the joint errors of a robot whose condition a file does not state."""
-    known = known_conditions([file.data])
+def find_unstated_conditions(
+    chain: Chain, data: Measurement, payloads: tuple[float, float] | None = None
+) -> list[str]:
+    """Name the joint errors of a robot whose condition samples do not state, with the missing column."""
+    # The payload is that of the model, unless the calibration had several, from the least to the largest.
+    is_loaded = payloads is not None and payloads[0] < payloads[1]
+    needed = [(family, family.condition) for family in chain.error_families if family.condition]
+    needed += [(f, "payload") for f in chain.error_families if f.name == COMPLIANCE and is_loaded]
+    known = known_conditions([data])
     return [
-        f"the {CONDITIONS[family.condition].description} is not stated, on which the {family.description} "
-        "of the robot depends"
-        for family in chain.error_families
-        if family.condition and family.condition not in known
+        f"the {CONDITIONS[name].description} is not stated, on which the {family.description} of the robot "
+        f"depends: add the column {CONDITIONS[name].header}"
+        for family, name in needed
+        if name not in known
     ]
 
 

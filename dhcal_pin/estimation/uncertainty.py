@@ -132,6 +132,8 @@ class ModelFit:
     freedom: float  # Degrees of freedom of the residuals
     # Families of joint errors that the model lacks, by name, and what they would explain.
     gains: Mapping[str, FamilyGain]
+    # Standard deviation of the residuals per axis, of lengths [m] and of angles [rad]; None if not known.
+    residual_std: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

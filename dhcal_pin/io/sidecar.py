@@ -48,6 +48,8 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     model_std_rad = 1e-4               # the same of the orientation
     chi_square = 512.3                 # of the residuals with the stated noise; absent if it is not stated
     degrees_of_freedom = 498.0         # of the residuals
+    residual_std_m = 5e-5              # standard deviation of the residuals per axis: of lengths
+    residual_std_rad = 0.0             # the same of angles; 0 without
     left_out = [["harmonics", 31.2, 24, 474]]   # families that the model lacks: `estimation.FamilyGain`
 
     [uncertainty.information]          # in place of the three arrays: `estimation.information`
@@ -224,6 +226,8 @@ _UNCERTAINTY_KEYS = {
     "model_std_rad": toml.number(0, default=0.0),
     "chi_square": toml.number(0, is_optional=True),
     "degrees_of_freedom": toml.number(0, is_optional=True),
+    "residual_std_m": toml.number(0, is_optional=True),
+    "residual_std_rad": toml.number(0, is_optional=True),
     "left_out": toml.list_of(_FAMILY_GAIN, default=()),
 }
 _MEASURED_KEYS = {
@@ -232,6 +236,8 @@ _MEASURED_KEYS = {
     **{key: toml.list_of(toml.number()) for key in ("lower", "upper", "spread")},
     "radius": toml.number(0),
     "reach": toml.number(0),
+    # Smallest and largest payload; absent if none is stated.
+    "payload_kg": toml.vector(2, is_optional=True),
     # Rows of 32-bit floats; former files have doubles.
     "centres": replace(_BASE64, is_optional=True),
     "configurations": replace(_BASE64, is_optional=True),
@@ -520,7 +526,9 @@ def read_uncertainty(path: PathLike, chain: Chain) -> Uncertainty | None:
     nothing = np.empty((n_rows, 0))
     gains = {name: FamilyGain(*numbers) for name, *numbers in values["left_out"]}
     freedom = values["degrees_of_freedom"]
-    fit = None if freedom is None else ModelFit(values["chi_square"], freedom, gains)
+    residual_std = values["residual_std_m"], values["residual_std_rad"]
+    noise = None if None in residual_std else residual_std
+    fit = None if freedom is None else ModelFit(values["chi_square"], freedom, gains, noise)
     known = Uncertainty(chain, entries, nothing, nothing, values["temperature"], model_std, fit=fit)
     if values["information"] is not None:
         return _read_information(table.table("information"), values["information"], known)
@@ -639,8 +647,9 @@ def read_measured_region(path: PathLike, chain: Chain) -> MeasuredRegion | None:
     if not rows.size:
         raise table.error(key, "expected at least one configuration")
     lower, upper, spread = (np.array(values[key]) for key in sides)
+    payloads = None if values["payload_kg"] is None else tuple(values["payload_kg"])
     return MeasuredRegion(
-        chain.is_prismatic, lower, upper, spread, rows.T.copy(), values["radius"], values["reach"]
+        chain.is_prismatic, lower, upper, spread, rows.T.copy(), values["radius"], values["reach"], payloads
     )
 
 
@@ -808,6 +817,7 @@ def _fit_content(fit: ModelFit | None) -> dict[str, Any]:
     return {
         **({} if fit.chi_square is None else {"chi_square": fit.chi_square}),
         "degrees_of_freedom": float(fit.freedom),
+        **dict(zip(("residual_std_m", "residual_std_rad"), fit.residual_std or (), strict=False)),
         **({"left_out": left_out} if left_out else {}),
     }
 
@@ -840,6 +850,7 @@ def _measured_content(chain: Chain, region: MeasuredRegion | None) -> dict[str, 
         "spread": region.spread.tolist(),
         "radius": region.radius,
         "reach": region.reach,
+        **({} if region.payloads is None else {"payload_kg": list(region.payloads)}),
         "centres": _encode(region.configurations.T, "<f4"),
     }
 

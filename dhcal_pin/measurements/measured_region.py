@@ -46,6 +46,8 @@ class MeasuredRegion:
     radius: float  #: Largest distance from the nearest of them inside the region.
     #: Largest distance at which the accuracy was judged by leaving out regions; at least the radius.
     reach: float
+    #: Smallest and largest payload of the samples [kg]; None if it is not stated.
+    payloads: tuple[float, float] | None = None
 
     @classmethod
     def from_configurations(cls, q: Array, is_prismatic: Array) -> MeasuredRegion:

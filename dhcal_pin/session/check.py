@@ -18,6 +18,10 @@ residuals that are drawn from N(0, Σ). The change is named if its share of the 
 
 Changes may be large: the model is linearized again at the estimate of each hypothesis.
 
+If the noise is not known, any one change explains the samples with enough noise. What a named change leaves
+of the residuals is therefore compared with the noise of the calibration. If it is larger, a second change is
+looked for.
+
 Reference: R. E. Kass and A. E. Raftery, Bayes Factors, J. American Statistical Association 90, 1995.
 
 Shapes: N samples of k rows, c coefficients of a hypothesis, p columns of the linear model.
@@ -31,6 +35,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy import special
 from scipy.linalg import block_diag
 
 from .. import se3
@@ -40,10 +45,11 @@ from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import make_problem
 from ..estimation.uncertainty import Uncertainty
 from ..exceptions import InvalidArgumentError
-from ..formatting import format_quantity
+from ..formatting import format_quantity, join_names
 from ..measurements.base import Measurement, Noise, instrument_values, residual_of
 from ..robot.chain import Chain
-from ..robot.conditions import Conditions
+from ..robot.conditions import CONDITIONS, MAX_RISE, Conditions
+from ..robot.error_families import COMPLIANCE, THERMAL
 from .causes import Block, Cause, Constant
 from .facts import cause_size
 from .linear_model import Layout, measures_positions, whitened_rows
@@ -80,6 +86,15 @@ MAX_UNEXPLAINED = 1e-6
 # Change of a joint that must have this effect, in standard deviations, to count as visible [rad or m].
 LARGEST_CHANGE, MIN_EFFECT = 0.1, 5.0
 MAX_ITERATIONS = 6
+# Turn of base or tool that is stated beside its motion [rad].
+LARGE_TURN = 0.01
+# Ratio of what remains of the residuals to the noise that is stated, or to that of the calibration, from
+# which on something else changed; smallest noise [m, rad].
+MAX_NOISE_RATIO, MIN_NOISE = 1.5, 1e-6
+# Difference of chi-square up to which two changes explain the samples equally well.
+MAX_EQUAL = 12.0
+# Standard deviation of a temperature that is not stated, from the reference of the calibration [K].
+TEMPERATURE_STD = MAX_RISE
 # Step below which a linearization is kept, as a displacement of the tool [m].
 STEP_TOL = 1e-6
 
@@ -96,6 +111,8 @@ class Hypothesis:
     unit: str  #: "m" or "rad"
     revealed: float  #: Smallest displacement of the tool by this change that the check reveals [m]
     imitators: tuple[str, ...] = ()  #: Names of other hypotheses that have every effect of this one
+    angle: float = 0.0  #: Turn of base or tool [rad]; 0 for other changes
+    angle_std: float = 0.0  #: Standard deviation of the turn [rad]
 
     @property
     def name(self) -> str:
@@ -104,7 +121,20 @@ class Hypothesis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the hypothesis for a JSON document."""
-        return {key: getattr(self, key) for key in ("kind", "of", "size", "std", "unit", "share")}
+        return {key: getattr(self, key) for key in ("kind", "of", "size", "std", "unit", "share")} | (
+            {"angle": self.angle, "angle_std": self.angle_std} if self.kind in ("base", "tool") else {}
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What one or several changes leave of the residuals."""
+
+    values: Array  # Coefficients of the changes, (c,)
+    covariance: Array  # Their covariance, (c, c)
+    rms: float  # RMS distance of the measured positions from those of the changed robot [m]
+    chi_square: float  # Sum of the squared residuals in units of noise and uncertainty
+    p_value: float  # Probability of a larger one if nothing else changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +151,12 @@ class Recheck:
     residual_rms: float  # RMS distance of the measured positions from those of the robot [m]
     # RMS distance that noise and uncertainty of the calibration explain [m]; NaN if the noise is not known.
     expected_rms: float
+    has_several: bool = False  # Whether all of the changes happened, not one of them
 
     @property
     def what(self) -> str:
-        """What changed, such as "joint elbow_joint" or "joint shoulder_joint or base"."""
-        return " or ".join(each.name for each in self.changes)
+        """What changed, such as "joint elbow_joint", "joint shoulder_joint or base" or "base and tool"."""
+        return (" and " if self.has_several else " or ").join(each.name for each in self.changes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the answer for a JSON document."""
@@ -154,10 +185,12 @@ def recheck(
     known: Mapping[str, float] | None = None,
     noise: Noise | None = None,
     size: float = DEFAULT_SIZE,
+    payloads: tuple[float, float] | None = None,
 ) -> Recheck:
     """Check whether a robot is still calibrated, by five to ten positions or poses of its tool."""
     # The noise is that of instrument and robot together [m, rad]; without it, unstated noise of the
     # measurements is estimated. The check must be able to reveal a displacement of the tool by `size` [m].
+    # `payloads` are the smallest and the largest payload of the calibration [kg].
     if not can_have_session(data) or not measures_positions(data):
         kinds = ", ".join(dict.fromkeys(item.kind for item in data))
         raise InvalidArgumentError(
@@ -171,7 +204,7 @@ def recheck(
         )
     if noise is not None:
         data = [_with_noise(item, noise) for item in data]
-    model = _CheckModel(chain, tuple(data), uncertainty, known or {})
+    model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
     return _answer(model, *model.judged(), size)
 
 
@@ -192,9 +225,11 @@ class _CheckModel:
         data: tuple[Measurement, ...],
         uncertainty: Uncertainty | None,
         known: Mapping[str, float],
+        payloads: tuple[float, float] | None = None,
     ):
         """Linearize the model at the calibrated robot."""
         self.chain, self.data = chain, data
+        self.uncertainty, self.known, self.payloads = uncertainty, known, payloads
         self.problem = make_problem(ErrorModel(chain, ()), data, np.zeros(0), known)
         self.layout = Layout.of(self.problem)
         self.x = np.zeros(len(self.problem.instrument_parameters))
@@ -243,16 +278,18 @@ class _CheckModel:
         """Return the root of the whitened covariance of what calibration and samples leave open, (n, ·)."""
         shared, own = [], []
         for item in self.data:
-            # Unknown directions, and errors that the model lacks, differ from sample to sample.
-            parts = [self._unknown_directions(item)]
+            # Unknown directions, and errors that the model lacks, differ from sample to sample. An unknown
+            # temperature or payload may be that of all samples, or differ.
+            conditions = self._unknown_conditions(item)
+            common, parts = [conditions.reshape(-1, conditions.shape[2])], [conditions]
+            parts.append(self._unknown_directions(item))
             if uncertainty is not None:
-                common, model = self._uncertain_rows(item, uncertainty)
-                shared.append(common)
+                uncertain, model = self._uncertain_rows(item, uncertainty)
+                common.append(uncertain)
                 parts.append(model)
+            shared.append(np.concatenate(common, 1))
             own += list(np.concatenate(parts, 2))
-        return np.concatenate(
-            [*([np.concatenate(shared)] if shared else []), np.asarray(block_diag(*own))], 1
-        )
+        return np.concatenate([np.concatenate(shared), np.asarray(block_diag(*own))], 1)
 
     def _uncertain_rows(self, item: Measurement, uncertainty: Uncertainty) -> tuple[Array, Array]:
         """Return the whitened effects of uncertain parameters, (m·k, ·), and of model errors, (m, k, 6)."""
@@ -278,14 +315,53 @@ class _CheckModel:
             return np.zeros((len(item.rows), item.residual_dim, 0))
         known = item.recorded or Conditions(item.q)
         approach = np.zeros(item.q.shape) if known.approach is None else known.approach
-
-        def residual(directions: Array) -> Array:
-            other = item.replace(recorded=replace(known, approach=directions))
-            return residual_of(other, self.chain, self.problem.instruments(self.x))
-
         joints = np.eye(self.chain.n_joints)
-        moved = [residual(np.where(approach == 0, joint, approach)) for joint in joints]
-        return (np.stack(moved, 2) - residual(approach)[..., None]).swapaxes(0, 1)
+        moved = [self._residual(item, approach=np.where(approach == 0, joint, approach)) for joint in joints]
+        return (np.stack(moved, 2) - self._residual(item, approach=approach)[..., None]).swapaxes(0, 1)
+
+    def _unknown_conditions(self, item: Measurement) -> Array:
+        """Return the whitened effects of temperature and payload where they are unknown, (m, k, 2)."""
+        out = np.zeros((len(item.rows), item.residual_dim, 2))
+        for i, (name, (value, std)) in enumerate(self._condition_spreads.items()):
+            if self.is_unknown(item, name):
+                moved, at = (
+                    self._residual(item, **{name: np.full(len(item.rows), each)})
+                    for each in (value + std, value)
+                )
+                out[..., i] = (moved - at).T
+        return out
+
+    def is_unknown(self, item: Measurement, condition: str) -> bool:
+        """Return whether a condition of samples, on which the positions of the robot depend, is unknown."""
+        known = item.recorded.names if item.recorded else ()
+        return self._condition_spreads[condition][1] > 0 and condition not in known
+
+    @cached_property
+    def _condition_spreads(self) -> dict[str, tuple[float, float]]:
+        """Value of each condition with which the robot is modelled where it is unknown, and its spread."""
+        families = {family.name for family in self.chain.error_families}
+        mass = self.chain.payload.mass if self.chain.payload else 0.0
+        low, high = self.payloads or (mass, mass)
+        # A uniform distribution has the standard deviation of its width by √12.
+        spread = np.hypot((high - low) / np.sqrt(12), (low + high) / 2 - mass) if high > low else 0.0
+        return {
+            "temperature": (
+                self.chain.reference_temperature,
+                TEMPERATURE_STD if THERMAL in families else 0.0,
+            ),
+            "payload": (mass, float(spread) if COMPLIANCE in families else 0.0),
+        }
+
+    def _residual(self, item: Measurement, **conditions: Array) -> Array:
+        """Return the whitened residual with other conditions, (k, m)."""
+        other = item.replace(recorded=replace(item.recorded or Conditions(item.q), **conditions))
+        return residual_of(other, self.chain, self.problem.instruments(self.x))
+
+    @property
+    def unknown_columns(self) -> list[str]:
+        """Columns of conditions that are not stated, and that the positions of the robot depend on."""
+        names = [n for n in self._condition_spreads if any(self.is_unknown(item, n) for item in self.data)]
+        return [CONDITIONS[name].header for name in names]
 
     @property
     def has_backlash(self) -> bool:
@@ -463,13 +539,53 @@ class _CheckModel:
         covariance[np.ix_(used, used)] = unit_covariance * np.outer(block.sizes[used], block.sizes[used])
         size, std, unit = 0.0, 0.0, "m"
         if block.kind != "robot":
-            cause = Cause(block, Constant(), values, covariance)
-            size, std, unit = cause_size(cause, RobotChanges(), self.chain, order_samples(self.data, ()))
-            if block.kind == "joint":
-                size = float(values[0])
+            size, std, unit = self._size(block, values, covariance)
         imitators = [f"{b.kind} {b.of}".strip() for b in self.blocks if self._has_effects_of(b, block)]
         revealed = self._revealed(block, covariance)
-        return Hypothesis(block.kind, block.of, share, size, std, unit, revealed, tuple(imitators))
+        turn = _turn(block, values, covariance)
+        return Hypothesis(block.kind, block.of, share, size, std, unit, revealed, tuple(imitators), *turn)
+
+    def _size(self, block: Block, values: Array, covariance: Array) -> tuple[float, float, str]:
+        """Return the size of a change of base, tool or joint, its standard deviation and its unit."""
+        cause = Cause(block, Constant(), values, covariance)
+        size, std, unit = cause_size(cause, RobotChanges(), self.chain, order_samples(self.data, ()))
+        if block.kind == "joint":
+            size = float(values[0])
+        elif unit == "m":
+            origin = np.asarray(block.origin)
+            moved = se3.transform_points(se3.exp6(values), origin[None])[0] - origin
+            size = float(np.linalg.norm(moved))
+        return size, std, unit
+
+    def explained(self, blocks: Sequence[Block], start: Array) -> Explained:
+        """Fit several changes, from the values (p,) of the first one, and return what they leave."""
+        columns, sizes = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("columns", "sizes"))
+        values, effects, undone = self.estimate(Block("robot", "", columns, sizes), start)
+        used = sizes > 0
+        scaled_values = np.divide(values, sizes, out=np.zeros_like(values), where=used)
+        left = undone - effects @ scaled_values
+        a, r = self._scaled(effects[:, used], self.usual_noise), self._scaled(left[:, None], self.usual_noise)
+        inverse = np.linalg.pinv(a, rcond=1e-9)
+        covariance = np.zeros((len(values),) * 2)
+        covariance[np.ix_(used, used)] = inverse @ inverse.T * np.outer(sizes[used], sizes[used])
+        freedom, chi_square = len(left) - np.linalg.matrix_rank(a), float(np.sum(r**2))
+        p_value = float(special.chdtrc(freedom, chi_square / MAX_NOISE_RATIO**2)) if freedom > 0 else 1.0
+        rows, sigma = self._positions
+        rms = float(np.sqrt(np.sum((left[rows] * sigma) ** 2) / (self.numbers[-1] + 1)))
+        return Explained(values, covariance, rms, chi_square, p_value)
+
+    def with_known_noise(self) -> _CheckModel | None:
+        """Return a model with the noise of the calibration where none is stated; None if it is not known."""
+        if all(item.has_stated_sigma for item in self.data):
+            return self
+        stated = self.uncertainty.fit.residual_std if self.uncertainty and self.uncertainty.fit else None
+        if stated is None or not stated[0]:
+            return None
+        if not stated[1] and any(hasattr(item, "rotation_sigma") for item in self.data):
+            return None
+        noise = Noise(*(max(each, MIN_NOISE) for each in stated))
+        data = [item if item.has_stated_sigma else _with_noise(item, noise) for item in self.data]
+        return _CheckModel(self.chain, tuple(data), self.uncertainty, self.known, self.payloads)
 
     def _has_effects_of(self, block: Block, other: Block) -> bool:
         """Return whether a change has all effects of another one."""
@@ -504,6 +620,7 @@ def _answer(
 ) -> Recheck:
     """Decide, and say why."""
     changes: tuple[Hypothesis, ...] = ()
+    has_several = False
     best = hypotheses[0]
     group = [
         best,
@@ -529,12 +646,102 @@ def _answer(
             "poses, as `dhcal plan --recheck` chooses them."
         ]
     else:
-        verdict, changes = "changed", tuple(group)
-        reasons = [_sentence(group)]
+        verdict, reasons, changes, has_several = _verified(model, group)
+    if verdict == "cannot say" and (columns := model.unknown_columns):
+        reasons = [*reasons, f"State the conditions of the samples: {join_names(columns)}."]
     residual, expected = model.position_rms()
     return Recheck(
-        verdict, tuple(reasons), changes, tuple(hypotheses), total - limit, n_samples, residual, expected
+        verdict,
+        tuple(reasons),
+        changes,
+        tuple(hypotheses),
+        total - limit,
+        n_samples,
+        residual,
+        expected,
+        has_several,
     )
+
+
+Finding = tuple[str, list[str], tuple[Hypothesis, ...], bool]
+
+
+def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
+    """Compare what a change leaves of the residuals with the noise; look for a second change if needed."""
+    best, judge = group[0], model.with_known_noise()
+    unverified = "changed", [_sentence(group)], tuple(group), False
+    *parts, _ = model.blocks
+    # Changes of several parts may be those of two: an instrument that was set up anew, and another one.
+    first = ("base", "") if best.kind == "robot" else (best.kind, best.of)
+    block = next((each for each in parts if (each.kind, each.of) == first), None)
+    if judge is None or block is None:
+        return unverified
+    start = np.zeros(model.layout.n_columns)
+    start[block.columns] = model.estimate(block)[0]
+    alone = judge.explained([block], start)
+    if best.kind != "robot" and alone.p_value >= MAX_FALSE_ALARMS:
+        if best.kind == "base":
+            unverified[1].append(
+                "The arm itself did not change: with the new base the positions differ by "
+                f"{_text_of_error(alone.rms)} RMS, as noise and uncertainty explain."
+            )
+        return unverified
+    trials = [(each, judge.explained([block, each], start)) for each in parts if each is not block]
+    trials = sorted(
+        (pair for pair in trials if pair[1].p_value >= MAX_FALSE_ALARMS), key=lambda pair: pair[1].chi_square
+    )
+    rivals = [each for each, fit in trials if fit.chi_square < trials[0][1].chi_square + MAX_EQUAL]
+    if len(rivals) == 1:
+        changes = _both_changes(judge, block, *trials[0])
+        return "changed", [_sentence([change]) for change in changes], changes, True
+    if best.kind == "robot":
+        return unverified
+    expected = _text_of_error(judge.position_rms()[1])
+    return (
+        "cannot say",
+        [
+            f"{_sentence(group)} Something else changed, too: {_text_of_error(alone.rms)} RMS remain, and "
+            f"noise and uncertainty explain {expected}.",
+            *(f"These samples do not show which: {names}." for names in [_names(rivals)] if names),
+            "Measure more poses, as `dhcal plan --recheck` chooses them, or calibrate again.",
+        ],
+        (),
+        False,
+    )
+
+
+def _names(blocks: Sequence[Block]) -> str:
+    """List the names of what may have changed."""
+    return ", ".join(f"{each.kind} {each.of}".strip() for each in blocks)
+
+
+def _both_changes(
+    model: _CheckModel, block: Block, other: Block, fit: Explained
+) -> tuple[Hypothesis, Hypothesis]:
+    """Describe two changes that happened together."""
+    at, found = 0, []
+    for each in (block, other):
+        own = slice(at, at + len(each.columns))
+        values, covariance = fit.values[own], fit.covariance[own, own]
+        size = model._size(each, values, covariance)
+        turn = _turn(each, values, covariance)
+        found.append(Hypothesis(each.kind, each.of, 1.0, *size, 0.0, (), *turn))
+        at = own.stop
+    return found[0], found[1]
+
+
+def _turn(block: Block, values: Array, covariance: Array) -> tuple[float, float]:
+    """Return the angle of a turn of base or tool and its standard deviation [rad]; 0 for other changes."""
+    if block.kind not in ("base", "tool"):
+        return 0.0, 0.0
+    angle = float(np.linalg.norm(values[3:]))
+    along = values[3:] / (angle or 1.0)
+    return angle, float(np.sqrt(along @ covariance[3:, 3:] @ along))
+
+
+def _text_of_error(value: float) -> str:
+    """Return the text of a length."""
+    return format_quantity(value, "m", value / 10)
 
 
 def _unchanged(hypotheses: list[Hypothesis], size: float, hidden_joints: list[str]) -> tuple[str, list[str]]:
@@ -563,6 +770,10 @@ def _sentence(group: list[Hypothesis]) -> str:
         return "More than one part of the robot changed: calibrate again."
     size = format_quantity(abs(best.size), best.unit, best.std, small=best.unit == "m")
     verb = "turned" if best.unit == "rad" else "moved"
-    what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {best.kind} {verb}"
+    part = "base or the instrument" if best.kind == "base" else best.kind
+    what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {part} {verb}"
+    if best.unit == "m" and best.angle > max(LARGE_TURN, 5 * best.angle_std):
+        size += f" and turned by {format_quantity(best.angle, 'rad', best.angle_std)}"
+    expected = ", as expected if the instrument was set up anew" if best.kind == "base" else ""
     rivals = " or ".join(each.name for each in others)
-    return f"{what} by {size}." + (f" The same effect has a change of {rivals}." if rivals else "")
+    return f"{what} by {size}{expected}." + (f" The same effect has a change of {rivals}." if rivals else "")

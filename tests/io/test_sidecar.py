@@ -105,10 +105,11 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     }
     n_rows = 6 * (len(scara.moving_joints) + 1)
     rows = np.random.default_rng(0).normal(size=(2, n_rows, 3))
-    stated = ModelFit(12.3, 45.6, {"harmonics": FamilyGain(31.2, 4, 40)})
+    stated = ModelFit(12.3, 45.6, {"harmonics": FamilyGain(31.2, 4, 40)}, (5.4e-5, 0.0))
     known = Uncertainty(scara, np.array([], int), rows[0], rows[1], fit=stated)
     q = np.random.default_rng(1).normal(size=(9, scara.n_joints))
     region = MeasuredRegion.from_configurations(q, scara.is_prismatic).with_reach(q, q.T > 0)
+    region = replace(region, payloads=(0.0, 0.1 + 0.2))
     for path, content in urdf_files(scara, tmp_path / "out.urdf", Findings(values, known, region)).items():
         write(tmp_path, str(path), content)
     side = tmp_path / "out.calibration.toml"
@@ -124,6 +125,7 @@ def test_numbers_are_read_back_bit_identical(tmp_path, scara):
     assert region_again is not None
     for name in ("lower", "upper", "spread", "configurations", "radius", "reach", "is_prismatic"):
         np.testing.assert_array_equal(getattr(region_again, name), getattr(region, name))
+    assert region_again.payloads == region.payloads
     assert side.read_text().startswith("# ")
     # Texts without escapes are read faster.
     assert "sqrt_covariance = '''\n" in side.read_text()

@@ -15,10 +15,14 @@ from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
 
 from dhcal_pin import Result, calibrate, select_parameters
 from dhcal_pin.cli.main import main
+from dhcal_pin.diagnostics import find_unstated_conditions
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
 from dhcal_pin.planning import change_options, plan
+from dhcal_pin.robot import Chain
+from dhcal_pin.robot.conditions import Conditions
+from dhcal_pin.robot.transmission import Payload
 from dhcal_pin.session import Recheck, recheck
 from dhcal_pin.session.check import WIDTHS, _CheckModel
 
@@ -125,7 +129,7 @@ def test_large_changes_have_the_right_size():
     first = result.changes[0]
     assert first.kind == "base"
     assert abs(first.size - 0.05) < 4 * first.std + 1e-5
-    assert result.reasons[0].startswith("The base moved by ")
+    assert result.reasons[0].startswith("The base or the instrument moved by ")
 
 
 def test_a_turn_about_the_first_axis_names_joint_and_base():
@@ -221,9 +225,102 @@ def test_a_new_base_does_not_hide_a_changed_zero(arm):
         zeros = 5e-3 * np.eye(sim.chain.n_joints)[joint]
         data = measured(sim, q, Position, True, base=new, zeros=zeros)
         result = recheck(fit.chain, [data], fit.uncertainty)
-        assert (result.verdict, result.what) == ("changed", "robot"), joint
+        assert (result.verdict, result.what) == ("changed", f"base and joint {sim.chain.joint_names[joint]}")
+        assert abs(result.changes[1].size - 5e-3) < 4 * result.changes[1].std
+        assert abs(result.changes[0].angle - np.linalg.norm([0.4, -0.8, 0.5])) < 1e-3
     result = recheck(fit.chain, [measured(sim, q, Position, True, base=new)], fit.uncertainty)
     assert result.what == "base"
+    # The arm itself is said to be unchanged, as its residuals are those of the noise.
+    assert abs(result.changes[0].size - moved_length(sim, new)) < 1e-3
+    assert "and turned by 58.7" in result.reasons[0]
+    assert result.reasons[1].startswith(
+        "The arm itself did not change: with the new base the positions differ"
+    )
+
+
+def moved_length(sim: Simulation, motion: pin.SE3) -> float:
+    """Return by how much a motion in the frame of the base moves the base link."""
+    return float(np.linalg.norm(motion.translation))
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.3])
+def test_a_changed_zero_beside_a_new_base_is_found_without_stated_noise(angle):
+    """Eight poses: a fit of the base alone leaves residuals that are larger than those of the calibration."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    new = pin.SE3(pin.exp3(np.array([0.4, -0.8, 0.5])), np.array([0.6, -0.7, 0.3]))
+    zeros = np.deg2rad(angle) * np.eye(6)[2]
+    for seed in range(4):
+        q = np.random.default_rng(seed).uniform(-2.5, 2.5, (8, 6))
+        data = measured(sim, q, Position, False, base=new, zeros=zeros)
+        result = recheck(fit.chain, [data], fit.uncertainty)
+        assert result.what == "base and joint elbow_joint"
+        assert abs(result.changes[1].size - zeros[2]) < 5 * result.changes[1].std
+        unchanged = recheck(fit.chain, [measured(sim, q, Position, False, base=new)], fit.uncertainty)
+        assert unchanged.what == "base"
+        assert unchanged.reasons[1].startswith("The arm itself did not change")
+
+
+def test_what_remains_beside_a_named_change_is_no_single_second_change():
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    new = pin.SE3(pin.exp3(np.array([0.4, -0.8, 0.5])), np.array([0.6, -0.7, 0.3]))
+    zeros = np.deg2rad([0.0, 0.15, -0.2, 0.3, 0.2, 0.0])
+    for seed in range(4):
+        q = np.random.default_rng(seed).uniform(-2.5, 2.5, (7, 6))
+        data = measured(sim, q, Position, False, base=new, zeros=zeros)
+        result = recheck(fit.chain, [data], fit.uncertainty)
+        assert not any(change.kind == "joint" for change in result.changes)
+        assert "did not change" not in " ".join(result.reasons)
+
+
+def test_missing_columns_are_named():
+    """Elasticity needs the payload only if the calibration had several."""
+    chain, _ = conditional("compliance", -3e-5)
+    data = Position(np.zeros((2, 6)), np.zeros((2, 3)), NOISE)
+    assert find_unstated_conditions(chain, data) == []
+    assert find_unstated_conditions(chain, data, (5.0, 5.0)) == []
+    (note,) = find_unstated_conditions(chain, data, (0.0, 5.0))
+    assert "the mass at the tip is not stated" in note
+    assert note.endswith("add the column payload[kg]")
+    stated = data.with_conditions(payload=np.array([1.0, 2.0]))
+    assert find_unstated_conditions(chain, stated, (0.0, 5.0)) == []
+    chain, _ = conditional("thermal", 2e-5)
+    assert find_unstated_conditions(chain, data)[0].endswith("add the column temperature[degC]")
+
+
+def conditional(family: str, size: float) -> tuple[Chain, np.random.Generator]:
+    """Return an UR10 with errors of a family."""
+    chain = nominal_arm("ur10").with_payload(Payload(5.0, (0.0, 0.0, 0.1)))
+    tool = pin.SE3(np.eye(3), np.array([0.05, -0.04, 0.1])).homogeneous
+    errors = select_parameters(chain.with_base_and_tool(np.eye(4), tool), family)
+    return errors.at(np.full(len(errors.parameters), size)), np.random.default_rng(3)
+
+
+@pytest.mark.parametrize(
+    ("family", "size", "condition", "values"),
+    [
+        ("compliance", -3e-5, "payload", (0.0, 0.0)),
+        ("compliance", -3e-5, "payload", (0.0, 10.0)),
+        ("thermal", 2e-5, "temperature", (36.0, 40.0)),
+    ],
+)
+def test_unknown_conditions_count_as_uncertainty(family, size, condition, values):
+    """An arm that did not change, with a payload or temperature that is not stated."""
+    chain, rng = conditional(family, size)
+    for _ in range(5):
+        q = rng.uniform(-2, 2, (12, 6))
+        conditions = {condition: rng.choice(values, 12)}
+        if condition == "temperature":
+            conditions[condition] += chain.reference_temperature - 25
+        points = chain.poses(Conditions(q, **conditions))[:, :3, 3] + rng.normal(0, NOISE, (12, 3))
+        unstated = Position(q, points, NOISE)
+        keywords = {"payloads": (0.0, 10.0), "size": 5e-3}
+        assert recheck(chain, [unstated.with_conditions(**conditions)], **keywords).verdict == "ok"
+        assert recheck(chain, [unstated], **keywords).verdict == "ok"
+        # With one payload in the calibration, it is that of the model.
+        if condition == "payload":
+            assert recheck(chain, [unstated], size=5e-3).verdict != "ok"
+        moved = Position(q, points + [0.02, 0.0, 0.0], NOISE)
+        assert recheck(chain, [moved], **keywords).what == "base"
 
 
 @pytest.mark.parametrize("n_known", [0, 9, 10])

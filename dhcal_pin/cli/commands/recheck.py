@@ -85,8 +85,16 @@ def run(args: Namespace) -> int:
     data, known = [file.data for file in files], io.read_instrument(sidecar)
     used = {parameter.name for item in data for parameter in item.instrument_parameters}
     known = {name: value for name, value in known.items() if name in used}
+    region = io.read_measured_region(sidecar, chain)
+    payloads = region.payloads if region else None
     result = session.recheck(
-        chain, data, io.read_uncertainty(sidecar, chain), known=known, noise=noise, size=size
+        chain,
+        data,
+        io.read_uncertainty(sidecar, chain),
+        known=known,
+        noise=noise,
+        size=size,
+        payloads=payloads,
     )
     mistakes = {} if result.verdict == "ok" else _find_mistakes(chain, files)
     if any(mistakes.values()) and any(change.kind == "robot" for change in result.changes):
@@ -96,7 +104,7 @@ def run(args: Namespace) -> int:
     notes = [
         f"{file.source}: {text}"
         for file in files
-        for text in (*file.notes, *diagnostics.find_unstated_conditions(chain, file))
+        for text in (*file.notes, *diagnostics.find_unstated_conditions(chain, file.data, payloads))
     ]
     now = Check.of(result, args.robot, args.data)
     document: dict[str, Any] = result.to_dict() | {

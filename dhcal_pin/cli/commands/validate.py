@@ -108,10 +108,11 @@ def run(args: Namespace) -> int:
         points = [file.iso_points for file in given.files]
         characteristics = iso9283.pose_characteristics(judged.chain, data, points, judged.known)
     warnings = _input_warnings(args, given, judged, sidecar)
+    payloads = given.region.payloads if given.region else None
     notes = [
         f"{file.source}: {text}"
         for file in given.files
-        for text in (*file.notes, *diagnostics.find_unstated_conditions(given.chain, file))
+        for text in (*file.notes, *diagnostics.find_unstated_conditions(given.chain, file.data, payloads))
     ]
     extrapolation = given.region and diagnostics.find_extrapolation(
         given.region, judged.chain, data, judged.known

@@ -355,7 +355,8 @@ def difference_screen(difference: Difference, files: Iterable[object]) -> Screen
     )
 
 
-# Styles of the verdicts of a check, and smallest share of the evidence of a sample that is shown.
+# Styles of the verdicts of a check. Smallest share of the evidence of a sample that is shown, and of another
+# change whose size is shown: the samples do not determine the size of what did not happen.
 MIN_SHOWN_SHARE = 0.01
 VERDICT_STYLES = {"ok": "green", "changed": "red", "cannot say": "yellow"}
 
@@ -368,8 +369,11 @@ def recheck_screen(
         [
             each.name,
             f"{100 * each.share:.0f} %",
-            Quantity(each.size, each.unit, each.std, is_small=True) if each.std else "",
-            Quantity.error(each.std, each.unit) if each.std else "",
+            *(
+                (Quantity(each.size, each.unit, each.std, is_small=True), Quantity.error(each.std, each.unit))
+                if each.std and each.share >= MIN_SHOWN_SHARE
+                else ("", "")
+            ),
         ]
         for each in result.hypotheses
         if each.kind != "sample" or each.share >= MIN_SHOWN_SHARE
