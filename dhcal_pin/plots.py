@@ -248,7 +248,8 @@ def plot_checks(
     ax = _axes(ax)
     factor, unit_name = shown_unit("m")
     ax.plot(days, factor * residuals, color=COLORS["grid"], linewidth=1.2)
-    ax.plot(days, factor * expected, color=COLORS["text"], linewidth=1.2, linestyle="--")
+    # A single check has no line.
+    ax.plot(days, factor * expected, color=COLORS["text"], linewidth=1.2, linestyle="--", marker="_")
     for verdict, color in CHECK_COLORS.items():
         chosen = np.array([each == verdict for each in verdicts])
         plot_dots(ax, days[chosen], factor * residuals[chosen], COLORS[color], DOT_SIZES[1], label=verdict)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -613,3 +614,22 @@ def test_exports_without_a_target_are_refused(place, capsys):
     assert main.main([*BASE, "--export", "moves.script"]) == 2
     assert "no target is reached" in capsys.readouterr().err
     assert not Path("out.csv").exists()
+
+
+def test_missing_conditions_are_named(place, capsys):
+    """A joint with a backlash of 10 mrad lags by 5 mrad, if the targets state its direction."""
+    _, true = place
+    sidecar = Path("true.calibration.toml")
+    sidecar.write_text(f"{sidecar.read_text()}\n[joint.elbow_joint]\nbacklash_rad = 0.01\n")
+    target = true.poses(np.array([[0.3, -1.2, 1.4, -0.6, 0.8, 0.2]]))[0, :3, 3]
+    values = ",".join(f"{1e3 * value:.6f}" for value in target)
+    for column, value, lag in (("", "", 0.0), (",approach_elbow_joint", ",1", 0.005)):
+        Path("targets.csv").write_text(f"x[mm],y[mm],z[mm]{column}\n{values}{value}\n")
+        assert main.main((*COMMAND, "--json", "-")) == 0
+        said = capsys.readouterr()
+        is_missing = any("add the column approach_JOINT" in text for text in json.loads(said.out)["warnings"])
+        assert is_missing == (not column)
+        assert ("approach_JOINT" in said.err) == (not column)
+        q = np.array([[float(rows()[0][f"{name}[rad]"]) for name in true.joint_names]])
+        reached = true.poses(q - lag * np.eye(6)[2])[0, :3, 3]
+        np.testing.assert_allclose(reached, target, atol=1e-7)

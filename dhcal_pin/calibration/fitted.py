@@ -501,8 +501,8 @@ class FittedModel:
 
     def _residual_std(self, is_without_noise: bool) -> tuple[float, float]:
         """Return the standard deviation of residuals per axis, of lengths [m] and of angles [rad]."""
-        # The residuals are those of the inliers. Without the stated noise of the instrument, they are what the
-        # model lacks.
+        # The residuals are those of the inliers. Without the stated noise of the instrument, they are what
+        # the model lacks.
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
         n_rows = sum(count for _, _, count in self._row_counts)
         per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0

@@ -10,6 +10,8 @@ from .difference import compare as compare
 from .extrapolation import Extrapolation as Extrapolation
 from .extrapolation import find_extrapolation as find_extrapolation
 from .frames import FRAMES_WARNING as FRAMES_WARNING
+from .frames import ISO_FITTED_WARNING as ISO_FITTED_WARNING
+from .frames import ISO_FRAMES_WARNING as ISO_FRAMES_WARNING
 from .frames import fit_frames as fit_frames
 from .frames import frames_differ as frames_differ
 from .input_checks import find_input_warnings as find_input_warnings

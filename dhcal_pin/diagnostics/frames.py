@@ -9,6 +9,7 @@ import numpy as np
 
 from ..calibration import Result, accuracy, calibrate
 from ..measurements.base import Measurement
+from ..measurements.configurations import group_by_configuration
 from ..robot.chain import Chain
 
 # Base and tool are taken to be those of another set-up if fitting them to the measurements divides the error
@@ -16,10 +17,17 @@ from ..robot.chain import Chain
 ERROR_RATIO = 10.0
 # Smaller errors [m or rad] show no difference of the frames.
 MIN_ERROR = 1e-6
-# Number of samples from which this is found out; with fewer than the least number it is unknown.
-MIN_SAMPLES, MAX_SAMPLES = 12, 1000
+# Number of samples from which this is found out, or of measured values in different configurations: base and
+# tool have up to 12 parameters. With fewer it is unknown.
+MIN_SAMPLES, MIN_VALUES, MAX_SAMPLES = 12, 20, 1000
 
 FRAMES_WARNING = "the frames (base, tool) differ: run again with --fit-frames"
+# The same for accuracy by ISO 9283, which --fit-frames changes.
+ISO_FRAMES_WARNING = (
+    "the frames (base, tool) differ, and the accuracy AP contains it: write the measured base and reflector "
+    "into the sidecar; repeatability is right"
+)
+ISO_FITTED_WARNING = "base and tool are fitted to these poses: AP is less than that of ISO 9283"
 
 
 def fit_frames(
@@ -39,7 +47,8 @@ def fit_frames(
 def frames_differ(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> bool:
     """Check whether fitting base and tool to the measurements would reduce the error many times."""
     n_samples = sum(len(item.rows) for item in data)
-    if n_samples < MIN_SAMPLES:
+    n_values = sum(len(np.unique(group_by_configuration(item.q))) * item.residual_dim for item in data)
+    if n_samples < MIN_SAMPLES and n_values < MIN_VALUES:
         return False
     group, error = next(iter(accuracy(chain, data, known).groups.items()))
     if error.rms < MIN_ERROR:

@@ -19,7 +19,7 @@ from ..estimation.parameters import PARAMETER_SETS
 from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
-from ..measurements.base import Measurement, known_conditions
+from ..measurements.base import Measurement
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
@@ -80,14 +80,13 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
 
 
 def find_unstated_conditions(
-    chain: Chain, data: Measurement, payloads: tuple[float, float] | None = None
+    chain: Chain, known: Container[str], payloads: tuple[float, float] | None = None
 ) -> list[str]:
-    """Name the joint errors of a robot whose condition samples do not state, with the missing column."""
+    """Name the joint errors of a robot whose condition is not known, with the missing column."""
     # The payload is that of the model, unless the calibration had several, from the least to the largest.
     is_loaded = payloads is not None and payloads[0] < payloads[1]
     needed = [(family, family.condition) for family in chain.error_families if family.condition]
     needed += [(f, "payload") for f in chain.error_families if f.name == COMPLIANCE and is_loaded]
-    known = known_conditions([data])
     return [
         f"the {CONDITIONS[name].description} is not stated, on which the {family.description} of the robot "
         f"depends: add the column {CONDITIONS[name].header}"

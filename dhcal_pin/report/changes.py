@@ -106,7 +106,9 @@ def _history_figures(checks: Sequence[Check]) -> list[FigureGroup]:
     legend = [
         LegendEntry(name, color, "dots") for name, color in plots.CHECK_COLORS.items() if name in verdicts
     ]
-    return [FigureGroup([panel], legend=[*legend, LegendEntry("expected", "text", "dashes")], layout="wide")]
+    if np.isfinite(expected).any():
+        legend.append(LegendEntry("expected", "text", "dashes"))
+    return [FigureGroup([panel], legend=legend, layout="wide")]
 
 
 def _history_table(checks: Sequence[Check]) -> Table:

@@ -126,3 +126,29 @@ def test_wrong_points_of_a_validation(run, robot_folder):
     status, _, err = run("validate", "arm.urdf", "data.csv", "--iso9283")
     assert status == 2
     assert "point P1 has one cycle" in unfolded(err)
+
+
+def test_no_fit_of_frames_is_advised(run, tmp_path, monkeypatch):
+    """With fitted frames, AP is not that of the standard; RP is the same."""
+    monkeypatch.chdir(tmp_path)
+    labels = [f"P{point}:{cycle}" for cycle in (1, 2, 3, 4) for point in (1, 2, 3, 4, 5)]
+    rng = np.random.default_rng(0)
+    q = np.tile(rng.uniform(-1.5, 1.5, (5, 6)), (4, 1))
+    measured = 1e3 * tool_poses(q)[:, :3, 3] + [500.0, 0.0, 0.0] + rng.normal(0, 0.02, (20, 3))
+    names = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+    header = ["iso_point", *(f"{name}_joint[rad]" for name in names), "x[mm]", "y[mm]", "z[mm]"]
+    with open("measured.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([a, *b, *c] for a, b, c in zip(labels, q, measured, strict=True))
+    found = [
+        json_of(run("validate", *ARM, "measured.csv", "--iso9283", "--json", "-", *options))
+        for options in ((), ("--fit-frames",))
+    ]
+    given, fitted = (" ".join(each["warnings"]) for each in found)
+    assert "--fit-frames" not in given
+    assert "the frames (base, tool) differ, and the accuracy AP contains it" in given
+    assert "AP is less than that of ISO 9283" in fitted
+    accuracy = [[point["AP_p_m"] for point in each["iso9283"]["points"]] for each in found]
+    assert min(accuracy[0]) > 0.49
+    assert max(accuracy[1]) < 1e-3

@@ -278,3 +278,14 @@ def test_all_columns_count_the_same_samples_and_outliers_are_named(run, robot_fo
         # √(6/60)·20 mm
         assert document["after"]["position_rms_m"] == pytest.approx(6.3e-3, rel=0.03)
         assert "frames (base, tool) differ" not in text
+
+
+@pytest.mark.parametrize(("count", "is_said"), [(5, False), (8, True)])
+def test_frames_of_few_samples_are_compared(run, robot_folder, count, is_said):
+    """Five positions have fewer values than needed; eight of a tracker that moved by 2 m show it."""
+    rows = np.loadtxt("data.csv", delimiter=",", skiprows=1)[:count]
+    for shift in (0.0, 2000.0):
+        moved = rows + np.repeat([0.0, shift], 3)
+        np.savetxt("few.csv", moved, "%.9f", ",", header=HEADER, comments="")
+        warnings = json_of(run("validate", "arm.urdf", "few.csv", "--json", "-"))["warnings"]
+        assert any("--fit-frames" in text for text in warnings) == (is_said and shift > 0)

@@ -14,6 +14,8 @@ from robots import URDF
 
 from dhcal_pin.cli.main import main
 from dhcal_pin.io import read_configurations, read_robot
+from dhcal_pin.io.check_history import Check
+from dhcal_pin.report import history_page
 
 ROBOT, TRUTH = URDF / "sim_6dof.dh.toml", URDF / "sim_6dof_actual.dh.toml"
 
@@ -106,3 +108,22 @@ def test_a_report_with_another_ending_is_refused(command, data, capsys):
     assert main([command, str(ROBOT), *words, "--report", "report.md"]) == 2
     assert "report.md: unknown ending" in capsys.readouterr().err
     assert not Path("report.md").exists()
+
+
+@pytest.mark.parametrize("expected", [None, 9e-5])
+def test_checks_over_time_fill_the_page(window, tmp_path, expected):
+    """Beside contents of 200 px, a page has 1080 of 1280 px; the table has lines, not cards for phones."""
+    times = [f"2026-0{month}-01T10:00:00+00:00" for month in (1, 2)]
+    checks = [
+        Check(time, "a.urdf", ["b.csv"], "ok", "", None, None, None, 1e-4, expected, 8) for time in times
+    ]
+    path = tmp_path / "h.html"
+    path.write_text(history_page("a", checks))
+    window.page.set_viewport_size({"width": 1280, "height": 800})
+    window.page.goto(path.as_uri())
+    width = "document.querySelector('main').getBoundingClientRect().width"
+    assert window.page.evaluate(width) == pytest.approx(1080)
+    row = "getComputedStyle(document.querySelector('tbody tr')).display"
+    assert window.page.evaluate(row) == "table-row"
+    legend = window.page.locator(".legend li").all_inner_texts()
+    assert legend == ["ok", *(["expected"] if expected else [])]

@@ -19,6 +19,7 @@ from dhcal_pin.diagnostics import find_unstated_conditions
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import measurement_text, read_robot, read_uncertainty, write_urdf
 from dhcal_pin.measurements import Inclination, Measurement, Noise, Pose, Position
+from dhcal_pin.measurements.base import known_conditions
 from dhcal_pin.planning import change_options, plan
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
@@ -276,15 +277,17 @@ def test_missing_columns_are_named():
     """Elasticity needs the payload only if the calibration had several."""
     chain, _ = conditional("compliance", -3e-5)
     data = Position(np.zeros((2, 6)), np.zeros((2, 3)), NOISE)
-    assert find_unstated_conditions(chain, data) == []
-    assert find_unstated_conditions(chain, data, (5.0, 5.0)) == []
-    (note,) = find_unstated_conditions(chain, data, (0.0, 5.0))
+    assert find_unstated_conditions(chain, known_conditions([data])) == []
+    assert find_unstated_conditions(chain, known_conditions([data]), (5.0, 5.0)) == []
+    (note,) = find_unstated_conditions(chain, known_conditions([data]), (0.0, 5.0))
     assert "the mass at the tip is not stated" in note
     assert note.endswith("add the column payload[kg]")
     stated = data.with_conditions(payload=np.array([1.0, 2.0]))
-    assert find_unstated_conditions(chain, stated, (0.0, 5.0)) == []
+    assert find_unstated_conditions(chain, known_conditions([stated]), (0.0, 5.0)) == []
     chain, _ = conditional("thermal", 2e-5)
-    assert find_unstated_conditions(chain, data)[0].endswith("add the column temperature[degC]")
+    assert find_unstated_conditions(chain, known_conditions([data]))[0].endswith(
+        "add the column temperature[degC]"
+    )
 
 
 def conditional(family: str, size: float) -> tuple[Chain, np.random.Generator]:
@@ -319,7 +322,7 @@ def test_unknown_conditions_count_as_uncertainty(family, size, condition, values
         # With one payload in the calibration, it is that of the model.
         if condition == "payload":
             assert recheck(chain, [unstated], size=5e-3).verdict != "ok"
-        moved = Position(q, points + [0.02, 0.0, 0.0], NOISE)
+        moved = Position(q, points + np.array([0.02, 0.0, 0.0]), NOISE)
         assert recheck(chain, [moved], **keywords).what == "base"
 
 

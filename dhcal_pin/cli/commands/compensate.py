@@ -69,6 +69,7 @@ def run(args: Namespace) -> int:
     for path in args.export:
         contents[path] = program_text(_program(result, nominal), path)
     frame = f"the root link {calibrated.urdf.root}" if args.frame == BASE else "the measuring frame"
+    notes = [f"{targets.source}: {text}" for text in _unstated_conditions(args, calibrated, targets)]
     warning = exchange_warning(args.nominal, args.calibrated, nominal, calibrated)
     write_with_json(
         contents,
@@ -78,13 +79,14 @@ def run(args: Namespace) -> int:
         targets=len(result.status),
         reached=int(result.reached.sum()),
         status=list(result.status),
-        warnings=[f"{args.nominal}: {warning}"] if warning else [],
+        warnings=[*notes, *([f"{args.nominal}: {warning}"] if warning else [])],
     )
     screen = screens.compensation_screen(
         f"targets: {_tool_text(args, calibrated)} in {frame}",
         result,
         calibrated,
         targets,
+        notes,
         {args.nominal: [warning]} if warning else {},
         _frame_hint(args, result),
         contents,
@@ -120,6 +122,16 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
             for chain in chains
         )
     return chains[0], chains[1]
+
+
+def _unstated_conditions(args: Namespace, calibrated: robot.Chain, targets: io.TargetPoses) -> list[str]:
+    """Name the conditions that the calibrated robot depends on, and that the targets do not state."""
+    from ... import diagnostics  # lazy import: slow to load
+
+    sidecar = io.existing_sidecar(args.calibrated)
+    region = io.read_measured_region(sidecar, calibrated) if sidecar else None
+    known = targets.conditions.names if targets.conditions else ()
+    return diagnostics.find_unstated_conditions(calibrated, known, region and region.payloads)
 
 
 def _tool_text(args: Namespace, chain: robot.Chain) -> str:

@@ -54,6 +54,7 @@ def run(args: Namespace) -> int:
     from ...io.check_history import Check, history_text, read_history  # lazy import, as the following
     from ...io.measurement_files.reading import has_image_coordinates
     from ...measurements import Noise
+    from ...measurements.base import known_conditions
     from ...units import parse_noise
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
@@ -104,7 +105,10 @@ def run(args: Namespace) -> int:
     notes = [
         f"{file.source}: {text}"
         for file in files
-        for text in (*file.notes, *diagnostics.find_unstated_conditions(chain, file.data, payloads))
+        for text in (
+            *file.notes,
+            *diagnostics.find_unstated_conditions(chain, known_conditions([file.data]), payloads),
+        )
     ]
     now = Check.of(result, args.robot, args.data)
     document: dict[str, Any] = result.to_dict() | {

@@ -91,7 +91,8 @@ OUTPUTS = {
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ..output_table import file_contents, paths_by_name  # lazy import, as the following
+    from ...measurements.base import known_conditions  # lazy import, as the following
+    from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
 
     sidecar = args.sidecar or io.existing_sidecar(args.robot)
@@ -112,7 +113,10 @@ def run(args: Namespace) -> int:
     notes = [
         f"{file.source}: {text}"
         for file in given.files
-        for text in (*file.notes, *diagnostics.find_unstated_conditions(given.chain, file.data, payloads))
+        for text in (
+            *file.notes,
+            *diagnostics.find_unstated_conditions(given.chain, known_conditions([file.data]), payloads),
+        )
     ]
     extrapolation = given.region and diagnostics.find_extrapolation(
         given.region, judged.chain, data, judged.known
@@ -332,7 +336,10 @@ def _input_warnings(
     if (tip := given.calibrated_tip) != given.chain.tip:
         warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
     elif not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
-        warnings[args.robot] = [diagnostics.FRAMES_WARNING]
+        warning = diagnostics.ISO_FRAMES_WARNING if args.iso9283 else diagnostics.FRAMES_WARNING
+        warnings[args.robot] = [warning]
+    elif args.fit_frames and args.iso9283:
+        warnings[args.robot] = [diagnostics.ISO_FITTED_WARNING]
     return warnings
 
 

@@ -408,6 +408,7 @@ def compensation_screen(
     result: Compensation,
     chain: Chain,
     targets: TargetPoses,
+    unstated: Sequence[str],
     warnings: Mapping[str, Sequence[str]],
     hint: str,
     files: Iterable[object],
@@ -434,8 +435,7 @@ def compensation_screen(
             for row in rows
         ]
         lines.append(Block(items, "yellow", title=f"{status}:", noun=f"target {status}", rank=1, n_kept=3))
-    notes = list(targets.notes)
-    notes = [f"{targets.source}: {text}" for text in notes]
+    notes = [*(f"{targets.source}: {text}" for text in targets.notes), *unstated]
     if chain.n_joints > 6:
         notes.append(
             f"{chain.n_joints} joints reach a target in many ways, and the corrected targets hold only "
