@@ -509,11 +509,11 @@ class FittedModel:
         for item, errors in zip(
             self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
         ):
-            whitened = residual_of(item, self.chain, self.instruments)
             for name, group in item.residual_groups.items():
                 share = 1.0
                 if is_without_noise and item.has_stated_sigma:
-                    noise = 1 / (per_freedom * max(float(np.mean(whitened[group.rows] ** 2)), 1.0))
+                    whitened = residual_of(item, self.chain, self.instruments)[group.rows]
+                    noise = 1 / (per_freedom * max(float(np.mean(whitened**2)), 1.0))
                     share = max(1 - noise, MIN_MODEL_SHARE)
                 squares.get(group.unit, []).append(share * np.ravel(errors[name]) ** 2)
         length, angle = (
