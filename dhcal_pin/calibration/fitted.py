@@ -20,7 +20,7 @@ Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -398,7 +398,7 @@ class FittedModel:
             np.concatenate([of_all(scale * root), errors.priors[:, None] * held_axes], 1),
             of_all(unbounded),
             self.problem.temperature,
-            self._residual_std(is_without_noise=True) if self.problem.temperature > 1 else (0.0, 0.0),
+            self._residual_std(self._model_share) if self.problem.temperature > 1 else (0.0, 0.0),
         )
         uncertainty = replace(uncertainty, fit=self._model_fit)
         if len(self.x) > MAX_COLUMNS and not held:
@@ -463,7 +463,7 @@ class FittedModel:
             float(chi_square) if has_chi_square else None,
             float(self.degrees_of_freedom),
             gains,
-            self._residual_std(is_without_noise=False),
+            self._residual_std(lambda *_: 1.0),
         )
 
     def _information(self, scale: float, root: Array) -> Information | None:
@@ -499,28 +499,34 @@ class FittedModel:
         """
         return self.uncertainty.relative
 
-    def _residual_std(self, is_without_noise: bool) -> tuple[float, float]:
-        """Return the standard deviation of residuals per axis, of lengths [m] and of angles [rad]."""
-        # The residuals are those of the inliers. Without the stated noise of the instrument, they are what
-        # the model lacks.
+    def _residual_std(self, share: Callable[[Measurement, slice], float]) -> tuple[float, float]:
+        """Return the standard deviation of a share of the residuals per axis [m], [rad]."""
+        # The residuals are those of the inliers. The share of their squares is given by measurement and rows.
         squares: dict[str, list[Array]] = {"m": [], "rad": []}
-        n_rows = sum(count for _, _, count in self._row_counts)
-        per_freedom = n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
-        for item, errors in zip(
-            self.inliers, compute_errors(self.chain, self.inliers, self.instruments), strict=True
-        ):
+        errors = compute_errors(self.chain, self.inliers, self.instruments)
+        for item, by_group in zip(self.inliers, errors, strict=True):
             for name, group in item.residual_groups.items():
-                share = 1.0
-                if is_without_noise and item.has_stated_sigma:
-                    whitened = residual_of(item, self.chain, self.instruments)[group.rows]
-                    noise = 1 / (per_freedom * max(float(np.mean(whitened**2)), 1.0))
-                    share = max(1 - noise, MIN_MODEL_SHARE)
-                squares.get(group.unit, []).append(share * np.ravel(errors[name]) ** 2)
+                part = share(item, group.rows) * np.ravel(by_group[name]) ** 2
+                squares.get(group.unit, []).append(part)
         length, angle = (
-            float(np.sqrt(per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
+            float(np.sqrt(self._rows_per_freedom * np.mean(np.concatenate(parts)))) if parts else 0.0
             for parts in squares.values()
         )
         return length, angle
+
+    def _model_share(self, item: Measurement, rows: slice) -> float:
+        """Return the share of squared residuals that the stated noise of the instrument does not explain."""
+        if not item.has_stated_sigma:
+            return 1.0
+        whitened = residual_of(item, self.chain, self.instruments)[rows]
+        noise = 1 / (self._rows_per_freedom * max(float(np.mean(whitened**2)), 1.0))
+        return max(1 - noise, MIN_MODEL_SHARE)
+
+    @property
+    def _rows_per_freedom(self) -> float:
+        """Number of rows per degree of freedom."""
+        n_rows = sum(count for _, _, count in self._row_counts)
+        return n_rows / self.degrees_of_freedom if self.degrees_of_freedom else 1.0
 
     def predict(self, q: Array) -> Prediction:
         """Predict tool poses and their covariance.

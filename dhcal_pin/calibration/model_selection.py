@@ -567,6 +567,17 @@ def _region_errors(problem: Problem, x: Array, noise: float, temperature: float)
     return _RegionErrors(n_rows, squares / noise**2, temperature * variances, noise)
 
 
+@dataclass(frozen=True, eq=False)
+class _Selection:
+    """Selected families, and the fit with them."""
+
+    fit: Fit  # Fit of the geometry, without the outliers that the families show
+    trials: tuple[FamilyTrial, ...]  # Trials of all families
+    random_ratio: float  # Error of random folds relative to that of the geometry
+    extended: Fit  # Fit with the selected families; that of the geometry without any
+    noise: float  # Standard deviation of its whitened residuals
+
+
 @UnbufferedRows()
 def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Progress | None) -> ExtendedFit:
     """Add the families of joint errors that the measurements support, and find how much the samples count."""
@@ -579,9 +590,10 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
     if n_configurations < MIN_CONFIGURATIONS or not _noise(judged) > 0:
         return fit, Extension(n_configurations=n_configurations)
     report = progress or no_progress
-    core, trials, random_ratio, extended, noise = _select_and_fit(fit, families, max_iterations, report)
+    selection = _select_and_fit(fit, families, max_iterations, report)
+    trials, extended, noise = selection.trials, selection.extended, selection.noise
+    core, is_extended = selection.fit, any(trial.is_selected for trial in trials)
     has_outliers, judged = core is not fit, core.without_rejected()
-    is_extended = any(trial.is_selected for trial in trials)
     report(PHASE, 3, _N_STEPS)
     temperature, scale, region_ratio = 1.0, 1.0, float("nan")
     if _are_residuals_correlated(extended, noise):
@@ -595,7 +607,7 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
         region_ratio = errors.rms / geometry.rms
         if temperature > 1:
             scale = float(np.clip(errors.prediction_scale, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
-    extension = Extension(trials, temperature, n_configurations, scale, random_ratio, region_ratio)
+    extension = Extension(trials, temperature, n_configurations, scale, selection.random_ratio, region_ratio)
     problem = extended.problem
     n_groups = sum(len(item.residual_groups) for item in problem.data)
     problem = problem.with_data(with_sigma_scales(problem.data, np.full(n_groups, noise)))
@@ -613,10 +625,8 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
 
 def _select_and_fit(
     fit: Fit, families: Sequence[str], max_iterations: int, report: Progress, n_left: int = MAX_SELECTIONS
-) -> tuple[Fit, tuple[FamilyTrial, ...], float, Fit, float]:
+) -> _Selection:
     """Select families and fit them; again without the outliers that they show, which hide other families."""
-    # Returned are the fit that is extended, the trials, the error of random folds relative to that of the
-    # geometry, the extended fit and its noise.
     judged = fit.without_rejected()
     report(PHASE, 1, _N_STEPS)
     trials, model, random_ratio, selected = select_families(judged, families)
@@ -629,7 +639,7 @@ def _select_and_fit(
         if n_left > 1 and is_new:
             without = fit.solved_with_weights(weights, max_iterations)
             return _select_and_fit(without, families, max_iterations, report, n_left - 1)
-    return fit, trials, random_ratio, extended, noise
+    return _Selection(fit, trials, random_ratio, extended, noise)
 
 
 def _outliers_shown(fit: Fit, extended: Fit) -> tuple[Array, ...]:

@@ -1,9 +1,10 @@
 """Parts of a robot that explain the difference of two calibrations, with the sizes of their differences.
 
-Parameters of joints and links are named in turn (forward selection): that which reduces chi-square most. In
-the end, those whose difference the others explain are left out (backward elimination). All that remain
-therefore differ by more than three standard deviations. Zeros may differ by degrees: those that are named are
-undone, and what remains of the difference is computed again.
+Parameters of joints and links are selected one after the other: each time the parameter that reduces
+chi-square most (forward selection). At the end, parameters are removed if the others explain their difference
+(backward elimination). All remaining parameters therefore differ by more than three standard deviations.
+Zeros may differ by degrees. A selected zero is therefore undone, and the remaining difference is computed
+again.
 
 Shapes: m configurations, n joints, p parameters, w whitened displacements.
 """
@@ -30,8 +31,8 @@ MIN_REDUCTION, MIN_REDUCTION_PART = 12.0, 1e-3
 # A zero is named before other parameters if it reduces chi-square by this part of the largest reduction:
 # others have the effects of second order of a large change of a zero.
 ZERO_PREFERENCE = 0.9
-# Smallest part of the effect of a parameter that others do not have.
-MIN_OWN_EFFECT = 0.05
+# Smallest part of the effect of a parameter that those selected before it do not have.
+MIN_NEW_EFFECT = 0.05
 # Zeros are undone again until they change by less than this [rad or m], at most a few times.
 ZERO_TOL, MAX_ITERATIONS = 1e-7, 4
 
@@ -134,7 +135,7 @@ def _best(candidates: Sequence[Parameter], chosen: Sequence[Parameter], left: Ar
     effects, used = _joined(candidates, left), np.linalg.qr(_joined(chosen, left))[0]
     own = effects - used @ (used.T @ effects)
     lengths = np.linalg.norm(own, axis=0)
-    is_new = lengths > MIN_OWN_EFFECT * np.linalg.norm(effects, axis=0)
+    is_new = lengths > MIN_NEW_EFFECT * np.linalg.norm(effects, axis=0)
     gains = np.where(is_new, left @ own / np.where(is_new, lengths, 1.0), 0.0) ** 2
     is_zero = np.array([each.joint is not None for each in candidates])
     best = int(np.argmax(np.where(is_zero & (gains >= ZERO_PREFERENCE * gains.max()), np.inf, gains)))

@@ -35,7 +35,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import special
 from scipy.linalg import block_diag
 
 from .. import se3
@@ -559,6 +558,8 @@ class _CheckModel:
 
     def explained(self, blocks: Sequence[Block], start: Array) -> Explained:
         """Fit several changes, from the values (p,) of the first one, and return what they leave."""
+        from scipy.special import chdtrc  # lazy import: slow
+
         columns, sizes = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("columns", "sizes"))
         values, effects, undone = self.estimate(Block("robot", "", columns, sizes), start)
         used = sizes > 0
@@ -569,7 +570,7 @@ class _CheckModel:
         covariance = np.zeros((len(values),) * 2)
         covariance[np.ix_(used, used)] = inverse @ inverse.T * np.outer(sizes[used], sizes[used])
         freedom, chi_square = len(left) - np.linalg.matrix_rank(a), float(np.sum(r**2))
-        p_value = float(special.chdtrc(freedom, chi_square / MAX_NOISE_RATIO**2)) if freedom > 0 else 1.0
+        p_value = float(chdtrc(freedom, chi_square / MAX_NOISE_RATIO**2)) if freedom > 0 else 1.0
         rows, sigma = self._positions
         rms = float(np.sqrt(np.sum((left[rows] * sigma) ** 2) / (self.numbers[-1] + 1)))
         return Explained(values, covariance, rms, chi_square, p_value)
@@ -697,17 +698,14 @@ def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
     if best.kind == "robot":
         return unverified
     expected = _text_of_error(judge.position_rms()[1])
-    return (
-        "cannot say",
-        [
-            f"{_sentence(group)} Something else changed, too: {_text_of_error(alone.rms)} RMS remain, and "
-            f"noise and uncertainty explain {expected}.",
-            *(f"These samples do not show which: {names}." for names in [_names(rivals)] if names),
-            "Measure more poses, as `dhcal plan --recheck` chooses them, or calibrate again.",
-        ],
-        (),
-        False,
-    )
+    which = [f"These samples do not show which: {_names(rivals)}."] if rivals else []
+    reasons = [
+        f"{_sentence(group)} Something else changed, too: {_text_of_error(alone.rms)} RMS remain, and noise "
+        f"and uncertainty explain {expected}.",
+        *which,
+        "Measure more poses, as `dhcal plan --recheck` chooses them, or calibrate again.",
+    ]
+    return "cannot say", reasons, (), False
 
 
 def _names(blocks: Sequence[Block]) -> str:
