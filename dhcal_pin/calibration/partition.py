@@ -40,8 +40,10 @@ _MIN_RELATIVE_SPREAD = 1e-6
 
 def _merge_groups(labels: Array, others: Array) -> Array:
     """Merge groups (m,) that have samples of one group (m,) of the others in common; keep their order."""
+    different, others = np.unique(others, return_inverse=True)
+    if len(different) == len(others):
+        return labels
     values, groups = np.unique(labels, return_inverse=True)
-    _, others = np.unique(others, return_inverse=True)
     connected = connect_nodes(len(values) + len(others), groups, len(values) + others)
     _, first, merged = np.unique(connected[: len(values)], return_index=True, return_inverse=True)
     return values[first[merged]][groups]

@@ -88,8 +88,9 @@ MAX_CONTINUED = 500
 # A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
 # standard errors, and by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
-# Probability that chance makes a robot appear better that is not.
-MAX_CHANCE = 0.025
+# Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
+# probability and one degree of freedom. That with more is closer to 0.
+MAX_CHANCE, MIN_T = 0.025, -12.71
 # Outliers spoil a fit if the error without them is smaller by this factor.
 MAX_SPOILED_RATIO = 1.5
 # Largest number of hold-out samples with which is checked what changed before them.
@@ -647,9 +648,11 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return [Finding("refused", text)]
     # Left-out regions have shown already that the arm is wrong if images change it, and without estimates of
     # cameras and boards the nominal arm would fit worse than before.
+    if fit.camera_stages or change < MIN_T:
+        return []
     from scipy.special import stdtrit  # lazy import: slow
 
-    if fit.camera_stages or change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
+    if change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]

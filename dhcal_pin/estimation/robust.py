@@ -65,6 +65,12 @@ FAR_THRESHOLD = 12.0
 # Number of equally likely parts of the distribution of squares, and largest χ² of the counts in them. It is
 # exceeded by two in a hundred sets of good samples.
 N_PARTS, MAX_PARTS_CHI_SQUARE = 10, 20.0
+# Bounds between these parts of χ²_k/k for the usual numbers k of residuals.
+CHI_SQUARE_DECILES = {
+    1: (0.015791, 0.064185, 0.148472, 0.274996, 0.454936, 0.708326, 1.074194, 1.642374, 2.705543),
+    2: (0.105361, 0.223144, 0.356675, 0.510826, 0.693147, 0.916291, 1.203973, 1.609438, 2.302585),
+    3: (0.194791, 0.335058, 0.474551, 0.623056, 0.788658, 0.982055, 1.221624, 1.547209, 2.083796),
+}
 # Stages that reject outliers that are set apart from all other samples, and only those that are very far off:
 # where residuals of all sizes occur, and where outliers lie together in joint space.
 REJECTED, FAR_REJECTED, REGIONAL = "reject", "reject_far", "reject_regional"
@@ -160,9 +166,11 @@ def standardize_ratios(ratios: Array, k: int | Array) -> Array:
 
 def is_chi_square(mean_squares: Array, k: int) -> bool:
     """Return whether mean squares of residuals follow the distribution χ²_k/k (Pearson's test)."""
-    from scipy.special import gammaincinv  # lazy import: slow
+    bounds = CHI_SQUARE_DECILES.get(k)
+    if bounds is None:
+        from scipy.special import gammaincinv  # lazy import: slow
 
-    bounds = gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
+        bounds = gammaincinv(k / 2, np.arange(1, N_PARTS) / N_PARTS) * 2 / k
     counts = np.bincount(np.searchsorted(bounds, mean_squares), minlength=N_PARTS)
     expected = len(mean_squares) / N_PARTS
     return bool(np.sum((counts - expected) ** 2) / expected <= MAX_PARTS_CHI_SQUARE)

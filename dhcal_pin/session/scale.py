@@ -19,6 +19,7 @@ Reference: A. Gelman et al., Bayesian Data Analysis, 3rd edition 2013, section 1
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -86,9 +87,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
         or max(weights[-1].sum(), weights[:, -1].sum()) > EDGE
     ):
         return None
-    from scipy.special import ndtr  # lazy import: slow
-
-    chance = 2 * float(np.sum(weights * ndtr(-np.sign(change) * changes * np.sqrt(information))))
+    # Probability that the change has the other sign, of both tails.
+    z = np.sign(change) * changes * np.sqrt(information)
+    chance = float(sum(w * math.erfc(t / math.sqrt(2)) for w, t in zip(weights.flat, z.flat, strict=True)))
     if chance > MAX_CHANCE:
         return None
     variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))

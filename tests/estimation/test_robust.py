@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.summary import headline
 from dhcal_pin.estimation import LOSSES, linearize_and_factor
 from dhcal_pin.estimation.robust import (
+    CHI_SQUARE_DECILES,
     FAR_REJECTED,
     FAR_THRESHOLD,
     KEPT,
@@ -278,6 +280,12 @@ def test_a_sample_that_no_weight_agrees_with_stays_rejected():
         assert weights[0][1] == 1
     assert found == [False, True, *[False] * 6]
     assert last.size == 0
+
+
+def test_deciles_of_chi_square():
+    """The stored deciles are those of SciPy."""
+    for k, deciles in CHI_SQUARE_DECILES.items():
+        np.testing.assert_allclose(deciles, stats.chi2.ppf(np.arange(1, 10) / 10, k) / k, atol=1e-6)
 
 
 def test_pearsons_test_of_squares():
