@@ -16,13 +16,14 @@ Shapes: m targets, n joints, c starts of a target.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import se3
+from ._frozen import frozen
 from ._typing import Array
 from .exceptions import InvalidArgumentError
 from .robot.chain import Chain
@@ -73,7 +74,7 @@ _CHUNK_SIZE = 512
 _ROTATION_TOL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Compensation:
     """Joint positions and corrected targets for m targets; NaN for targets that are not reached.
 
@@ -208,7 +209,7 @@ def _mid_range(chain: Chain) -> Array:
         return np.where(has_both, (chain.lower + chain.upper) / 2, np.clip(0.0, chain.lower, chain.upper))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Search:
     """Search for joint positions that bring the tool of a chain to targets."""
 

@@ -11,10 +11,11 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from ._frozen import frozen
 
 if TYPE_CHECKING:
     import jinja2
@@ -116,7 +117,7 @@ def format_below(value: float, limit: float) -> str:
     return next(text for decimals in itertools.count(1) if float(text := f"{value:.{decimals}f}") < limit)
 
 
-@dataclass(frozen=True)
+@frozen
 class Quantity:
     """Value with its unit; its text is rounded according to its standard deviation."""
 
@@ -137,7 +138,7 @@ class Quantity:
         return text if self.has_unit else text.removesuffix(SMALL_UNITS[self.unit][1])
 
 
-@dataclass(frozen=True)
+@frozen
 class Table:
     """Table of texts and quantities; it can be rendered as HTML, Markdown or console text."""
 

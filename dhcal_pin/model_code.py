@@ -24,7 +24,6 @@ import os
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from string import Template
@@ -34,6 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 from . import se3
+from ._frozen import frozen
 from ._typing import Array, PathLike
 from .exceptions import InvalidArgumentError
 from .robot.chain import Chain
@@ -50,7 +50,7 @@ _Constants = Mapping[str, Array | float | Mapping[str, Array]]
 _LINE_LENGTH = 120
 
 
-@dataclass(frozen=True)
+@frozen
 class Language:
     """How a language states constants and the terms of joint errors.
 

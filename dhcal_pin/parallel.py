@@ -13,10 +13,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ._frozen import frozen
 from .exceptions import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def _blas_libraries() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="blas")
 
 
-@dataclass(frozen=True)
+@frozen
 class TaskExecutor:
     """Ordered, memory-bounded `map` on a `concurrent.futures` executor or in the calling thread."""
 

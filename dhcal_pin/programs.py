@@ -17,11 +17,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from . import se3
+from ._frozen import frozen
 from ._typing import Array, PathLike
 from .exceptions import InvalidArgumentError
 from .robot.chain import Chain
@@ -38,7 +38,7 @@ DECIMALS = 9
 _N_UR_JOINTS = 6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Stop:
     """Configuration at which the arm rests, and the way to it."""
 
@@ -50,7 +50,7 @@ class Stop:
     is_way_free: bool = True  # Whether the way has no collision as far as that was checked
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Program:
     """Sequence of stops."""
 

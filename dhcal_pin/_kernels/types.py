@@ -6,15 +6,15 @@ per sample, r residuals per sample. The samples are on the last axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointState:
     """Positions of a chain's joints at m configurations.
 
@@ -27,7 +27,7 @@ class JointState:
     sin: Array  # Sines of `positions`, shape (k, m)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class FrameBatch:
     """Frames of a chain at m samples."""
 
@@ -52,7 +52,7 @@ class FrameBatch:
         return out
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservationMatrix:
     """Sparse matrix H of a measurement: maps tool velocities to the r residual rows of each of m samples.
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tornado.httputil
 
+from .._frozen import frozen
 from ..exceptions import InvalidArgumentError
 from ..messages import quote
 
@@ -35,7 +35,7 @@ _SWITCHES = ("skip-bad-rows", "force")
 _LIST_OPTIONS = ("mend",)
 
 
-@dataclass(frozen=True)
+@frozen
 class Upload:
     """Files and options of one request."""
 

@@ -17,11 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.bare_geometry import BareGeometry
@@ -58,7 +59,7 @@ MAX_REFIT_ITERATIONS = 100
 _MIN_SPREAD_RATIO = 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class FoldErrors:
     """Errors of the held-out samples of a fold."""
 
@@ -106,7 +107,7 @@ def cross_validate_folds(
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CrossValidation:
     """Errors of held-out samples."""
 
@@ -178,7 +179,7 @@ def _counted_in(fold: Fold, is_counted: Sequence[Array]) -> list[Array]:
 # --- accuracy within and beyond the measured region ------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class FoldComparison:
     """Accuracy of the held-out samples of folds before and after a calibration."""
 
@@ -275,7 +276,7 @@ def _comparison(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Generalization:
     """Accuracy on configurations that are not fitted: within the measured region and beyond it.
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.error_model import ErrorParameter, frame_name
 from ..formatting import format_quantity
@@ -21,7 +21,7 @@ from ..measurements.base import InstrumentParameter
 from ..robot.chain import BASE_FRAME, Chain
 
 
-@dataclass(frozen=True)
+@frozen
 class Estimate:
     """Estimate of one parameter, in its unit (m, rad, or a rate)."""
 

@@ -16,11 +16,12 @@ the measurements before the errors are computed.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
@@ -40,7 +41,7 @@ MIN_RATIO_BEFORE = 0.5
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorStatistics:
     """Statistics of the error norms of one group."""
 
@@ -71,7 +72,7 @@ class ErrorStatistics:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Accuracy(Mapping[str, Any]):
     """Error statistics of each group of errors that was measured.
 
@@ -252,7 +253,7 @@ def take_errors(errors: Iterable[Mapping[str, Array]], masks: Iterable[Array]) -
     ]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PairedErrors:
     """Mean squared errors of the same configurations before and after a calibration."""
 
@@ -301,7 +302,7 @@ class PairedErrors:
         return float(np.mean(change) / error) if error > 0 else 0.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Comparison:
     """Accuracy before and after a calibration on the same samples."""
 

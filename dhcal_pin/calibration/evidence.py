@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import plausibility
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import CHUNK_SIZE
@@ -64,7 +65,7 @@ def count_geometric_directions(fit: FittedModel, r: Array) -> int:
     return max(rank(r[:, _is_geometric(fit)]), 1)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class Evidence(FittedModel):
     """Fitted model with what the measurements say of its accuracy."""
 

@@ -21,12 +21,13 @@ Reference: D. J. C. MacKay, Bayesian interpolation, Neural Computation 4 (1992) 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.bare_geometry import BareGeometry
@@ -63,7 +64,7 @@ MIN_MODEL_SHARE = 0.5
 MAX_TESTED = 200
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class FittedModel:
     """Model that was fitted to measurements, with the uncertainty of its parameters."""
 

@@ -43,11 +43,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation import robust
 from ..estimation.problem import Problem, linearize_and_factor, whitened_residuals
@@ -239,7 +239,7 @@ def _draw_samples(m: int) -> Array:
     return np.sort(np.random.default_rng(0).permutation(m)[:MAX_SAMPLES])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Core:
     """Fit of the samples that agree with each other."""
 

@@ -66,11 +66,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._kernels.work_arrays import UnbufferedRows
 from .._typing import Array, Progress, no_progress
 from ..estimation import robust
@@ -152,7 +153,7 @@ FactorFolds = Callable[[Problem, Array, Sequence[Fold]], tuple[NoisyRows, tuple[
 FULL_SET = "minimal,base,tool"
 
 
-@dataclass(frozen=True)
+@frozen
 class FamilyTrial:
     """Effect of a family on top of those selected before it."""
 
@@ -202,7 +203,7 @@ def trial_table(trials: Sequence[FamilyTrial]) -> Table:
     return Table(header, rows, n_text_columns=2)
 
 
-@dataclass(frozen=True)
+@frozen
 class Extension:
     """What a calibration added to the geometry, and how much its samples count."""
 
@@ -273,7 +274,7 @@ class Extension:
 ExtendedFit = tuple[Fit, Extension]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Model:
     """Selected families, with the hyperparameters of greatest evidence."""
 
@@ -284,7 +285,7 @@ class Model:
     values: Mapping[str, float]  # Values of its parameters by name
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Candidates:
     """Linear model around a fit with the columns of further families."""
 
@@ -530,7 +531,7 @@ def _have_lines(problem: Problem, x: Array, orders: range) -> bool:
     return bool(z2.max() > MAX_WHITE_LINE or z2.sum() > n_lines + SCREENING_SIGMAS * np.sqrt(2 * n_lines))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _RegionErrors:
     """Errors of left-out regions of joint space, with their prediction."""
 
@@ -567,7 +568,7 @@ def _region_errors(problem: Problem, x: Array, noise: float, temperature: float)
     return _RegionErrors(n_rows, squares / noise**2, temperature * variances, noise)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Selection:
     """Selected families, and the fit with them."""
 

@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from .. import plausibility
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
@@ -222,7 +223,7 @@ def calibrate(
     return replace(result, **settings)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Options:
     """Options of `calibrate`."""
 
@@ -240,7 +241,7 @@ class _Options:
     executor: TaskExecutor
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Setup:
     """Robot, measurements and unknowns of a calibration, which its options determine."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import formatting
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.bare_geometry import fit_bare_geometry
 from ..estimation.initialization import fit_frames
@@ -32,7 +33,7 @@ from .reweighting import Fit
 from .verdict import Verdict, judge
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class Result(Evidence, ResultPlots):
     """Calibrated robot with the uncertainty of its parameters and its accuracy.
 

@@ -32,11 +32,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.priors import PriorGroups, effective_parameters, update_prior_scales
@@ -64,7 +65,7 @@ MIN_WEIGHT = 1e-300
 LostFreedom = Callable[[SolvedProblem, Array], Array]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Fit:
     """Solved least-squares problem with the sample weights that it was solved with."""
 
@@ -111,7 +112,7 @@ class Fit:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ReweightState:
     """State between two rounds of `reweight`."""
 

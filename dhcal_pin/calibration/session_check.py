@@ -14,10 +14,11 @@ without changes. They are kept only if the measurements support them beside all 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation.error_model import ErrorModel
 from ..estimation.problem import Problem
@@ -58,7 +59,7 @@ MAX_WIDTH = 8.0
 Extend = Callable[[Fit], ExtendedFit]
 
 
-@dataclass(frozen=True)
+@frozen
 class SessionFit:
     """First fit of measurements, with what happened during the session."""
 
@@ -68,7 +69,7 @@ class SessionFit:
     diagnosis: Diagnosis | None = None  # Diagnosis of mistakes in the measurements; None if none was made
 
 
-@dataclass(frozen=True)
+@frozen
 class SessionModels:
     """Fits that are compared to decide whether changes are believed."""
 

@@ -12,12 +12,12 @@ instrument does not state and the widths of the default priors. Outliers are not
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.priors import Priors
 from ..estimation.problem import Chunk, Problem
@@ -37,7 +37,7 @@ from .procedure import Method, calibrate
 _Value = TypeVar("_Value")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StreamProblem(Problem):
     """Least-squares problem whose samples are read again, part by part, whenever they are needed."""
 
@@ -66,7 +66,7 @@ def _read(part: Part) -> Measurement:
     return part() if callable(part) else part
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StreamResult:
     """Calibration from a stream of samples."""
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.parameters import fold_harmonics
 from ..estimation.qr import TriangularSystem
@@ -148,7 +149,7 @@ def file_table(names: Sequence[str], comparisons: Sequence[Comparison]) -> Table
     return Table(["error of each file, RMS", "samples", "outliers", "before", "after"], rows)
 
 
-@dataclass(frozen=True)
+@frozen
 class Headline:
     """Most important figure of a calibration."""
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
+from .._frozen import frozen
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
 from ..estimation.parameters import select_parameters
@@ -124,7 +125,7 @@ MAX_ROWS_PER_DIRECTION = 4.0
 MIN_STATED_ROWS_PER_DIRECTION = 1.5
 
 
-@dataclass(frozen=True)
+@frozen
 class Finding:
     """Something about a calibration that its user must know."""
 
@@ -133,7 +134,7 @@ class Finding:
     keeps_nominal: bool = False  # Whether the nominal robot should be used in place of the calibrated one
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """Whether a calibrated robot may be used."""
 

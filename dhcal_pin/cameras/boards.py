@@ -11,11 +11,12 @@ along a column, and z = 0. Corners are numbered row by row, as OpenCV does:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 
 # Kinds of boards in rig files.
@@ -24,7 +25,7 @@ BOARD_TYPES = ("checkerboard", "charuco", "aprilgrid", "points")
 RULER = 0.15
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Board:
     """Board of a rig."""
 

@@ -23,10 +23,10 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 
 # Distortion of image coordinates (2, m) by coefficients (d,): distorted coordinates (2, m), derivatives by
@@ -47,7 +47,7 @@ _INVERSION_TOLERANCE = 1e-14
 _BLOCK = 10_000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Lens:
     """Lens model."""
 

@@ -24,11 +24,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..subsampling import evenly_spaced_indices
 from .intrinsics import intrinsics_candidates, undetermined_focal_length
@@ -57,7 +58,7 @@ View = tuple[Array, Array]
 Pose = tuple[Array, float]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LensFit:
     """Lens of a camera with the poses of boards in its images."""
 
@@ -142,7 +143,7 @@ def _find_poses(
     return estimate_poses([(view[0], part) for view, part in zip(views, parts, strict=True)], known)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _LensProblem:
     """Problem in the f free values of a lens, with the poses of v views of boards with m corners in all."""
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from .boards import Board
 from .lens import LENSES, Lens
@@ -20,7 +21,7 @@ PIXEL_PRIORS = {"prior": 50.0, "free": 1e5}
 DISTORTION_PRIORS = {"prior": 0.3, "free": 1e2}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Camera:
     """Camera of a rig."""
 
@@ -44,7 +45,7 @@ class Camera:
         return 0.5 * np.array([self.width - 1, self.height - 1])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Rig:
     """Cameras and boards of a set-up."""
 

@@ -25,9 +25,10 @@ from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import Field, field, fields
 from typing import Any
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
 from ..io import toml_table as toml
@@ -49,7 +50,7 @@ from .screens.screen import Block, Screen
 OK, CAUTION, REFUSED, FAILED = "ok", "caution", "refused", "failed"
 
 
-@dataclass(frozen=True)
+@frozen
 class FleetJob:
     """One job of a manifest."""
 
@@ -57,7 +58,7 @@ class FleetJob:
     job: Job  # Its options, with paths relative to the manifest
 
 
-@dataclass(frozen=True)
+@frozen
 class FleetJobOutcome:
     """Outcome of one job of a manifest."""
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..formatting import Table
@@ -34,7 +35,7 @@ _NAMES = "recheck repeat kind sigma rig criterion task parameters priors data ht
 _EXCLUDED = {"-n": "count", "--from": "candidates_from"} | {f"--{name}": name for name in _NAMES.split()}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class IsoPlanned:
     """Planned test, from which its output files are made."""
 

@@ -16,9 +16,10 @@ from __future__ import annotations
 import shlex
 from argparse import Namespace
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import Field, field, fields
 from typing import Any
 
+from .._frozen import frozen
 from ..exceptions import InvalidArgumentError
 from . import job_outputs, options
 from .output_table import Output, OutputFile, chosen_files
@@ -38,7 +39,7 @@ def job_option(text: str, metavar: str = "", *, default: Any = None, **more: Any
     return field(default=default, metadata={"help": text, **placeholder, **more})
 
 
-@dataclass(frozen=True)
+@frozen
 class Job:
     """Options of `dhcal calibrate` for one robot, explained by `dhcal calibrate --help`."""
 

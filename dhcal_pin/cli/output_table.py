@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from .._frozen import frozen
 from ..exceptions import InvalidArgumentError
 from .options import STDOUT
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Makers = Mapping[str, Callable[[str], str | bytes]]
 
 
-@dataclass(frozen=True)
+@frozen
 class Output:
     """Output file of a command."""
 
@@ -26,7 +26,7 @@ class Output:
     is_written_if_refused: bool = False  # Whether the file is written for a refused calibration, too
 
 
-@dataclass(frozen=True)
+@frozen
 class OutputFile:
     """File that an option names."""
 

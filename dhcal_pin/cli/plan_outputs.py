@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 from argparse import Namespace
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..io.measurement_files import configurations_text
 from ..io.robot import robot_name
@@ -23,7 +24,7 @@ from ..robot.chain import Chain
 from .output_table import Makers, Output, chosen_files, paths_by_name
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Planned:
     """Plan of a command, from which its output files are made."""
 

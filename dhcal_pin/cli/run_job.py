@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
 from .. import io, plausibility, report, visualization
+from .._frozen import frozen
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure
 from ..calibration.cameras import MIXED_SETS, default_sets, has_images
@@ -81,7 +82,7 @@ NO_CORRECTIONS = (
 MAX_FILE_ROWS = 200_000
 
 
-@dataclass(frozen=True)
+@frozen
 class JobData:
     """Measurements of a job, and what was found when they were read."""
 
@@ -94,7 +95,7 @@ class JobData:
     notes: dict[str, list[str]]  # What of the input is not used, by file
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CalibrationOutcome:
     """Result of a calibration job whose files are written."""
 

@@ -12,11 +12,12 @@ import os
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..cameras.boards import Board
 from ..cameras.pose_from_points import direct_linear_transform
@@ -42,7 +43,7 @@ MIN_SHARPNESS = 0.05
 MAX_WHITE, WHITE = 0.5, 254
 
 
-@dataclass(frozen=True)
+@frozen
 class Layout:
     """Layout in which a board was printed."""
 
@@ -59,7 +60,7 @@ class Layout:
         return ", ".join(parts)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DetectedImage:
     """Corners that were found in an image."""
 

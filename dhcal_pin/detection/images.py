@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..cameras.boards import Board
 from ..cameras.rig import Camera, Rig
@@ -24,7 +24,7 @@ N_LAYOUT_IMAGES = 8
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BoardDetection:
     """Corners of one board in all images."""
 

@@ -8,12 +8,12 @@ centres are whole numbers, as in OpenCV. Blur and noise of a real camera are add
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.rig import Camera
@@ -26,7 +26,7 @@ BLACK, WHITE, BACKGROUND = 25.0, 230.0, 120.0
 _MIN_COSINE = 1e-3
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageQuality:
     """How a rendered image differs from an ideal one."""
 
@@ -35,7 +35,7 @@ class ImageQuality:
     n_points: int = 6  # Number of points per pixel along each axis
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Print:
     """Print of a flat board as a table of grey values between edges."""
 

@@ -9,11 +9,12 @@ They do not show errors of the robot: joint values have no influence.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.lens_fit import fit_camera
@@ -24,7 +25,7 @@ from .corners import DetectedImage
 from .images import BoardDetection
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Reprojection:
     """Corners of a board in the pose that explains the detected ones best."""
 

@@ -36,13 +36,14 @@ Shapes: m configurations, n joints, c components of a displacement: 3, or 6 with
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 from scipy import special
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.frame_gauge import frame_effects
 from ..estimation.uncertainty import ModelFit, Uncertainty
@@ -85,7 +86,7 @@ MAX_ITERATIONS = 10
 STEP_TOL = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Calibrated:
     """Robot with what its calibration says of it."""
 
@@ -95,7 +96,7 @@ class Calibrated:
     source: str = ""  #: File of the robot
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Distances:
     """Distances of two tools in m configurations."""
 
@@ -124,7 +125,7 @@ STATISTICS = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class ChiSquare:
     """Chi-square of a hypothesis."""
 
@@ -168,7 +169,7 @@ class ChiSquare:
         }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Difference:
     """Difference of two calibrations of one robot."""
 

@@ -8,11 +8,11 @@ outside, see `measurements.measured_region`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from ..calibration.evaluation import Accuracy, compute_errors, take_errors
 from ..formatting import format_quantity
 from ..measurements.base import Measurement
@@ -26,7 +26,7 @@ _MIN_EXCESS = 1e-6
 _MAX_JOINTS = 3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Extrapolation:
     """Samples inside and outside the measured region of a calibration."""
 

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..formatting import Table
@@ -44,7 +45,7 @@ SESSION_PARAMETERS = "minimal,base,tool"
 _MIN_NUMERIC_SHARE = 0.5
 
 
-@dataclass(frozen=True)
+@frozen
 class ColumnSummary:
     """Content of a column."""
 
@@ -63,7 +64,7 @@ class ColumnSummary:
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@frozen
 class FileInspection:
     """Content of a measurement file."""
 

@@ -13,7 +13,6 @@ import tempfile
 import time
 import webbrowser
 from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Literal
@@ -21,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from .. import _kernels
+from .._frozen import frozen
 from ..calibration.procedure import calibrate
 from ..io import read_dh, read_robot, shipped_file, write_urdf
 from ..measurements import Noise, Pose
@@ -39,7 +39,7 @@ MAX_SELF_TEST_ERROR = 1e-7
 _N_POSES = 40
 
 
-@dataclass(frozen=True)
+@frozen
 class InstallationCheck:
     """Result of one check."""
 

@@ -12,11 +12,12 @@ Shapes: m configurations, n joints, p parameters, w whitened displacements.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.uncertainty import Uncertainty
 from ..formatting import SMALL_UNITS, format_fixed, significant_decimals
@@ -37,7 +38,7 @@ MIN_NEW_EFFECT = 0.05
 ZERO_TOL, MAX_ITERATIONS = 1e-7, 4
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Parameter:
     """Parameter of a joint or link that may differ."""
 
@@ -48,7 +49,7 @@ class Parameter:
     joint: int | None = None  # Number of the joint whose zero it is
 
 
-@dataclass(frozen=True)
+@frozen
 class PartDifference:
     """Difference of a joint or link of two robots."""
 

@@ -11,11 +11,10 @@ would reach it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..io.measurement_files import MeasurementFile
 from ..robot.chain import Chain
@@ -39,7 +38,7 @@ N_RANDOM_STARTS, START_RANGE = 63, 1.5
 SOLUTION_TOL = 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class UnreachableRow:
     """Row of a file that is impossible."""
 

@@ -13,10 +13,10 @@ A wave over the range is an error of the joint that the model lacks, such as an 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.evaluation import compute_errors, fit_instrument_parameters
 from ..calibration.result import Result
@@ -33,7 +33,7 @@ N_BINS, MIN_BIN_SAMPLES = 12, 5
 MAX_PROFILE_STD = 0.02
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Outlier:
     """Sample whose residual is too large for its standard deviation."""
 
@@ -78,7 +78,7 @@ def median_sigmas(fit: Result) -> list[dict[str, float]]:
     return out
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointProfile:
     """Residual joint error over the joint position."""
 

@@ -13,12 +13,13 @@ complete model adds to these origins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..measurements.measured_region import draw_joint_space
@@ -38,7 +39,7 @@ LEVER = 0.1
 UNIT = 1e-5
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BareGeometry:
     """Geometric errors that fit best without joint errors."""
 

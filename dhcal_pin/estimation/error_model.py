@@ -21,11 +21,12 @@ constant twists, and come last in the list.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
+from .._frozen import frozen
 from .._kernels import perturb_frames
 from .._typing import Array
 from ..formatting import format_fixed
@@ -38,7 +39,7 @@ AXIS_NAME_TOL = 1e-6
 AXIS_POINT_TOL = 5e-7
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorParameter:
     """Scalar kinematic error.
 
@@ -67,7 +68,7 @@ class ErrorParameter:
         return frame_name(chain, self.error_frame), self.quantity or direction_name(self.twist)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ErrorModel:
     """Nominal chain and p unknown errors."""
 

@@ -29,12 +29,12 @@ Shapes: p unknowns, c columns (unknowns that are free), m samples of a measureme
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 from scipy.linalg import lstsq
 
+from .._frozen import frozen
 from .._typing import Array
 from . import qr
 from .normal_equations import NormalEquations
@@ -53,7 +53,7 @@ _NONLINEARITY_TOL = 1e-3
 _UNBOUNDED_TOL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class FoldSystems:
     """Triangular systems of the fitted and of the held-out samples of a fold, at one x."""
 
@@ -182,7 +182,7 @@ def solve_fold(
     return refit(fitted, candidate if candidate_cost <= fitted.cost(x) else x)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NoiseClass:
     """Rows of one variance."""
 
@@ -195,7 +195,7 @@ class NoiseClass:
         return 1 - self.share + self.share * noise**2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NoisyRows:
     """Rows of all classes, at one x (p,)."""
 
@@ -239,7 +239,7 @@ class NoisyRows:
         return float(np.sqrt(max(total / max(weight, smallest), 0.0)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class NoisyFold:
     """Rows of the fitted and of the held-out samples of a fold, at one x (p,)."""
 

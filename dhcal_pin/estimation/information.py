@@ -14,10 +14,11 @@ Shapes: m samples, p parameters of the robot, b of them geometry, g gauge direct
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import instrument_values
 from ..robot.conditions import Conditions, concatenate_conditions
@@ -35,7 +36,7 @@ def _nothing() -> Array:
     return np.empty((0, 0))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Samples:
     """Samples and their information M about the tool."""
 
@@ -76,7 +77,7 @@ class Samples:
         return np.einsum("ijm,...jm->...im", roots * self.units[:, None], twists)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Information:
     """What determines the covariance of a calibrated robot; see the equation of this module."""
 

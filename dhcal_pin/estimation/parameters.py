@@ -29,11 +29,12 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from ..exceptions import DhcalError, InvalidArgumentError, UnknownNameError
 from ..robot.chain import BASE_FRAME, Chain, extract_dh_table, joint_frame, link_frame, without_mimics
 from ..robot.dh import Convention
@@ -276,7 +277,7 @@ def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
     ]
 
 
-@dataclass(frozen=True)
+@frozen
 class ParameterSet:
     """Parameter set that users select by name; calling it returns its parameters."""
 

@@ -23,11 +23,11 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from .error_model import ErrorModel
@@ -85,7 +85,7 @@ def has_default_prior(errors: ErrorModel, priors: Priors) -> Array:
     return np.fromiter(is_default, bool)
 
 
-@dataclass(frozen=True)
+@frozen
 class PriorGroup:
     """Parameters whose priors share one scale."""
 

@@ -23,12 +23,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property, partial, reduce
 from typing import Any, TypeVar
 
 import numpy as np
 
+from .._frozen import frozen
 from .._kernels import apply_observation_matrix, factor_jacobian
 from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
 from .._kernels.work_arrays import UnbufferedRows, work_array
@@ -53,7 +54,7 @@ ACTIVE_BOUND_TOL = 1e-12
 _Output = TypeVar("_Output")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Problem:
     """Least-squares problem in p robot errors and s instrument parameters.
 
@@ -195,7 +196,7 @@ class Problem:
         return self.executor.map(function, self.chunks)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Chunk:
     """Some samples of one measurement, with the joint state that is the same at every x."""
 
@@ -218,7 +219,7 @@ class Chunk:
         return chain.forward_kinematics(self.joint_state, work_array("frames", k + 2, 7, 3, m))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Linearization:
     """Model of a problem at one x, without data, so that it can be sent to the process that holds a chunk."""
 
@@ -320,7 +321,7 @@ class Linearization:
         return observation
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StructuredRows:
     """Whitened rows [J | r] of m samples of k residuals, whose transmission columns are not multiplied out.
 

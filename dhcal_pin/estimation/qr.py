@@ -26,12 +26,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack, svd
 
+from .._frozen import frozen
 from .._kernels import append_diagonal, r_factor
 from .._typing import Array
 from .solver_rules import EPS_MODEL
@@ -102,7 +102,7 @@ def euclidean_norm(a: Array) -> float:
     return math.sqrt(sum_of_squares(a))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TriangularSystem:
     """R factor of the whitened rows [J | r] at one x: ‖J·δ - r‖² = ‖R·δ - z‖² + min_cost.
 

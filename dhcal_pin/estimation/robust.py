@@ -33,11 +33,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from .normal_equations import NormalEquations
@@ -111,7 +112,7 @@ WEIGHT_FUNCTIONS: dict[str, tuple[Callable[[Array], Array], float]] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Loss:
     """Robust loss that a user can choose."""
 
@@ -212,7 +213,7 @@ def reject_groups(weights: Array, t: Array, item: Measurement) -> Array:
     return np.where(is_wrong[labels], ZERO_WEIGHT, weights)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class WeightChange:
     """Change of the weights in one round of IRLS, before damping."""
 
@@ -261,7 +262,7 @@ def weight_change(weights: Sequence[Array], previous: Sequence[Array]) -> Weight
     return WeightChange(max(float(np.abs(step).max(initial=0.0)) for step in steps), steps)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SolvedProblem:
     """Problem with its solution, and the uncertainty of its predictions."""
 

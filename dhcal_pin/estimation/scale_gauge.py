@@ -31,10 +31,9 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..robot.chain import Chain
 
@@ -42,7 +41,7 @@ from ..robot.chain import Chain
 _N_SAMPLES = 100
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ScaleGauge:
     """Size of a robot and its rates of growth and rotation."""
 

@@ -42,11 +42,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import ConvergenceError, UnknownNameError
 from . import solver_rules as rules
@@ -69,7 +69,7 @@ LOOSE_RTOL = 0.1
 BOUND_TOL = 1e-15
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DampingState:
     """State of a Levenberg-Marquardt iteration that a continuation starts from."""
 
@@ -79,7 +79,7 @@ class DampingState:
     last_step: Array | None = None  # Last step (p,); None if it does not show a direction of slow steps
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SolverResult:
     """Result of `minimize`."""
 

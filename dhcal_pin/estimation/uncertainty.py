@@ -30,7 +30,7 @@ Shapes: m samples, k moving joints, e uncertain transmission coefficients, r col
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -38,6 +38,7 @@ import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
 from .. import se3
+from .._frozen import frozen
 from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..robot.chain import Chain, link_frame, twists_in_bodies
@@ -61,7 +62,7 @@ MAX_ERROR = 2e-3
 FRAME_RTOL = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Prediction:
     """Tool poses of a calibrated robot and their covariance.
 
@@ -108,7 +109,7 @@ class Predictor(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@frozen
 class FamilyGain:
     """What a family of joint errors that a model lacks would explain of the residuals."""
 
@@ -122,7 +123,7 @@ class FamilyGain:
         return float(np.sqrt((self.remaining + self.added) / (self.remaining + self.gain)))
 
 
-@dataclass(frozen=True)
+@frozen
 class ModelFit:
     """How well a model explains the measurements that it was fitted to."""
 
@@ -136,7 +137,7 @@ class ModelFit:
     residual_std: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Uncertainty:
     """Calibrated chain and the covariance of its errors.
 

@@ -18,11 +18,12 @@ cameras and boards are redundant with those of base and tool in all images. Thei
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.error_model import ErrorParameter
@@ -141,7 +142,7 @@ def _explain_propagation(chain: Chain, way: Propagation, parameters: Sequence[Er
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Explainer:
     """Sentences on the unobservable directions of one problem."""
 

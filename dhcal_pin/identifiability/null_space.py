@@ -21,13 +21,14 @@ Springer Handbook of Robotics, 2016.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation import qr
 from ..estimation.problem import Problem, linearize_and_factor
@@ -54,7 +55,7 @@ _PROBE_SIGMA = 1e-3
 _POINT_OFFSET = (0.11, 0.07, 0.05)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class UnobservableGroup:
     """Unobservable directions with the same cause and on the same part of the chain."""
 
@@ -84,7 +85,7 @@ def _unobservable_part(space: Array, r: Array) -> Array:
     return space @ vt[int(np.sum(s > _RTOL * norm)) :].T
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ObservabilityProbe:
     """Problem with its measurements, and Jacobians of hypothetical measurements."""
 

@@ -15,11 +15,11 @@ errors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..robot.chain import Chain, joint_frame, link_frame
@@ -32,7 +32,7 @@ NEGLIGIBLE = 1e-3
 _ALONG_AXIS_TOL = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlainErrors:
     """Chain with its geometric errors, which are constant twists (no transmission errors)."""
 
@@ -54,7 +54,7 @@ class PlainErrors:
         return cls(chain, errors.parameters[:count], bodies[:count], twists[:count])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Propagation:
     """Joints that a combination of errors passes unchanged, and its effect on the tool."""
 

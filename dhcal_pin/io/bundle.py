@@ -19,9 +19,9 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..exceptions import FileFormatError
 from ..messages import quote
@@ -39,7 +39,7 @@ _TIME, _MODE = (1980, 1, 1, 0, 0, 0), 0o644 << 16
 _TYPES = {"options": dict, "versions": dict, "joints": list, "tip": str, "sha256": dict}
 
 
-@dataclass(frozen=True)
+@frozen
 class Bundle:
     """Content of a bundle."""
 

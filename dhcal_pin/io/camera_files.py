@@ -8,12 +8,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..cameras.rig import TIP, Camera
 from ..formatting import Quantity
@@ -25,7 +25,7 @@ from .tabular import yaml_number
 _ROS_MODELS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CameraFrame:
     """Frame of a calibrated camera on a robot."""
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from typing import Any
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..exceptions import FileFormatError
 from ..session import Recheck
@@ -36,7 +37,7 @@ _TYPES: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Check:
     """One check of a robot."""
 

@@ -9,16 +9,16 @@ written from a `RobotSource`, the robot that is to be converted.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..robot.chain import Chain
 from ..robot.dh import Convention, DHTable
 from ..robot.urdf import Urdf
 
 
-@dataclass(frozen=True)
+@frozen
 class RobotSource:
     """Robot that is to be written in another format."""
 
@@ -34,7 +34,7 @@ class ConvertedRobot(NamedTuple):
     notes: Sequence[str] = ()  #: One sentence each.
 
 
-@dataclass(frozen=True)
+@frozen
 class RobotFormat:
     """File format of a robot."""
 

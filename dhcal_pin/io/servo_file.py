@@ -31,12 +31,13 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import tomli_w
 
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError, UnknownNameError
 from ..messages import quote
@@ -81,7 +82,7 @@ MOTOR_KEYS: Mapping[str, Key] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Servo:
     """Motor of a joint."""
 
@@ -104,7 +105,7 @@ class Servo:
         return (counts - self.zero) * self.step
 
 
-@dataclass(frozen=True)
+@frozen
 class ServoFile:
     """Servos of an arm."""
 

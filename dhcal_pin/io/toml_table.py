@@ -19,10 +19,11 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..exceptions import FileFormatError
 from ..messages import quote
@@ -127,7 +128,7 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
 
 
-@dataclass(frozen=True)
+@frozen
 class Key:
     """Declaration of the value of a key; the functions below make those of each type."""
 
@@ -154,7 +155,7 @@ class Key:
         return self.converted(value)
 
 
-@dataclass(frozen=True)
+@frozen
 class ListKey(Key):
     """Declaration of a list of `size` entries, each as `entry` declares it."""
 
@@ -177,7 +178,7 @@ class ListKey(Key):
         return [self.entry.converted(value) for value in values]
 
 
-@dataclass(frozen=True)
+@frozen
 class TableKey(Key):
     """Declaration of a table: its keys, or `each` if its keys are names that the user chooses."""
 

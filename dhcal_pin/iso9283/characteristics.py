@@ -16,12 +16,12 @@ rotation vector are the rotations about x, y and z. The drift compares groups k 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.evaluation import compute_errors
 from ..exceptions import InvalidArgumentError
@@ -47,7 +47,7 @@ MAX_JOINT_DIFFERENCE = 1e-3
 DISTANCE_TOL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PointCycles:
     """Attained poses of one point, in the order of the cycles."""
 
@@ -90,7 +90,7 @@ class PointCycles:
         return PointCycles(self.name, self.cycles[index], self.commanded, self.attained[index], rotations)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseCharacteristics:
     """Test of pose characteristics according to ISO 9283."""
 

@@ -14,11 +14,12 @@ value of the Jacobian, with angles times the characteristic length of the arm, i
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Noise
@@ -52,7 +53,7 @@ _N_AXIS_STEPS = 101
 TURNING_NOTE = "the orientation of the tool differs from point to point: the arm cannot keep it in the cube"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class IsoCube:
     """Cube of a test according to ISO 9283, with its points."""
 

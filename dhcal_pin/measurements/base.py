@@ -31,6 +31,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._frozen import frozen
 from .._kernels import apply_observation_matrix
 from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
@@ -51,7 +52,7 @@ POINT_PRIOR = 10.0
 OFFSET_PRIOR = 1.0
 
 
-@dataclass(frozen=True)
+@frozen
 class InstrumentParameter:
     """Unknown scalar of an instrument, which is estimated together with the robot."""
 
@@ -64,7 +65,7 @@ class InstrumentParameter:
     is_local: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class Noise:
     """Standard deviations of simulated measurement noise.
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import se3
+from .._frozen import frozen
 from .._kernels.types import FrameBatch, ObservationMatrix
 from .._typing import Array
 from ..cameras.boards import Board
@@ -63,7 +64,7 @@ _TERMS = (np.repeat([0, 1], 6), np.tile(np.arange(6), 2))
 _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Projection:
     """Model of all corners at one state; derivatives by the unknowns are computed on first use."""
 

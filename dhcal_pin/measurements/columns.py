@@ -8,11 +8,11 @@ standard deviations. Values are in metres and radians; units are the concern of 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 
@@ -42,7 +42,7 @@ def instrument_range(reach: float) -> tuple[float, float]:
     return MIN_LENGTH, reach + MAX_INSTRUMENT_DISTANCE
 
 
-@dataclass(frozen=True)
+@frozen
 class Column:
     """Column of a measurement file."""
 

@@ -10,12 +10,12 @@ Shapes: m samples.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 
 #: Notation of rotation vectors, which are three numbers, too.
@@ -50,7 +50,7 @@ EULER_NOTATIONS: dict[str, str] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EulerAngles:
     """Euler angles that a file has."""
 

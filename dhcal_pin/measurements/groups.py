@@ -11,10 +11,11 @@ common statistics: each group has its own, but all measured lengths share `LENGT
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+
+from .._frozen import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorGroup:
     """Errors that have common statistics."""
 
@@ -29,7 +30,7 @@ class ErrorGroup:
 LENGTHS = ErrorGroup("residual", "m", "residual")
 
 
-@dataclass(frozen=True)
+@frozen
 class Group:
     """Rows of the residual of a sample that share a unit and a standard deviation."""
 

@@ -12,10 +12,11 @@ Shapes: m configurations, k representatives, n joints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..robot.chain import Chain
 
@@ -34,7 +35,7 @@ N_CONFIGURATIONS = 2000
 _CHUNK_SIZE = 128
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MeasuredRegion:
     """Region of joint space around measured configurations."""
 

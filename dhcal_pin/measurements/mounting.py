@@ -7,11 +7,12 @@ them, directly or by a link that no joint moves against it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..cameras.boards import Board
 from ..cameras.rig import TIP, WORLD, Camera, Rig
@@ -19,7 +20,7 @@ from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Mount:
     """How a camera or a board is fixed to a chain."""
 
@@ -27,7 +28,7 @@ class Mount:
     link_pose: Array  # Pose of its link in the tool frame or in the measuring frame, shape (4, 4) [m]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MountedRig:
     """Rig on a chain."""
 

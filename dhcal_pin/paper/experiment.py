@@ -9,11 +9,12 @@ row under the fit to all other rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from ..calibration.evaluation import Accuracy, Comparison, accuracy, compute_errors
 from ..calibration.procedure import calibrate
 from ..calibration.result import Result
@@ -51,7 +52,7 @@ def leave_one_out(fit: Callable[[Measurement], Result], data: Measurement) -> Ac
     return Accuracy.from_errors(errors)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PaperExperiment:
     """Result of the paper's experiment."""
 

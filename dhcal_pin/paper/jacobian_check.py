@@ -14,12 +14,13 @@ Shapes: m configurations, n joints, p parameters. Jacobians are (m, 6, p), twist
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import select_parameters
@@ -35,7 +36,7 @@ _STEP = 1e-5
 _KINDS = ("theta", "d", "a", "alpha")
 
 
-@dataclass(frozen=True)
+@frozen
 class Agreement:
     """Agreement of one route with the paper's R."""
 

@@ -8,10 +8,9 @@ poses, because several sets of parameters can fit the same joint sets.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.parameters import select_parameters
@@ -64,7 +63,7 @@ SIMULATION_REMARKS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Simulation:
     """Runs of the paper's loop on a simulated arm.
 

@@ -26,11 +26,11 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 
 # Exponent that makes the weighted sum of variances in the gains of `EOptimality` follow the largest one.
@@ -80,7 +80,7 @@ def _solve_factor(rows: Array, factor: Array) -> Array:
     return rows
 
 
-@dataclass(frozen=True)
+@frozen
 class DOptimality:
     """D-optimality: volume of the confidence ellipsoid of all unknowns."""
 
@@ -94,7 +94,7 @@ class DOptimality:
         return 2 * np.log(np.einsum("iim->im", factor)).sum(0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class AOptimality:
     """A- or I-optimality: sum of the variances of combinations of the unknowns."""
 
@@ -114,7 +114,7 @@ class AOptimality:
         return np.einsum("wkm,wkm->m", change, change)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class EOptimality:
     """E-optimality: largest variance of any observable direction."""
 
@@ -133,7 +133,7 @@ class EOptimality:
         return AOptimality(weighted).gains(rows, sqrt_covariance)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BiasVarianceCriterion:
     """Robust design: variance, and bias by unknowns that the fit omits, in equal parts.
 

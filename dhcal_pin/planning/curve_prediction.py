@@ -8,10 +8,10 @@ curve at the joint value q. It is averaged over the bins that the candidates of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..robot.coverage import BIN_CENTRES, joint_coverage
 from ..robot.error_families import CURVE_ORDERS
@@ -19,7 +19,7 @@ from .exchange import compute_sqrt_covariance
 from .information import Information
 
 
-@dataclass(frozen=True)
+@frozen
 class CurvePrediction:
     """Expected knowledge of the joint correction curves after some poses."""
 

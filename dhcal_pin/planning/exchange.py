@@ -24,11 +24,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from scipy.linalg import lapack
 
+from .._frozen import frozen
 from .._typing import Array
 from .bin_filling import filling_cost, filling_gains
 from .criteria import Criterion
@@ -48,7 +49,7 @@ def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
     return lapack.dtrtri(r)[0]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CandidateSet:
     """Candidates of a design."""
 

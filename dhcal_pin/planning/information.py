@@ -14,11 +14,12 @@ the R factor of all J_t, divided by the square root of their number.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.cameras import held_values, image_sets, split_sets
 from ..calibration.procedure import calibrate
@@ -47,7 +48,7 @@ JOINT_SCATTER = Noise(5e-5, np.deg2rad(1 / 60))
 ZERO_STD_RTOL = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlannedCalibration:
     """Calibration whose measurements are planned; the options are those of `calibrate`."""
 
@@ -75,7 +76,7 @@ class PlannedCalibration:
         return replace(self, images=self.images.with_free_points(boards))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Information:
     """Knowledge before a measurement, and the information of measurements at any configurations.
 
@@ -226,7 +227,7 @@ class Information:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Before:
     """Robot, instrument and existing measurements before a plan."""
 

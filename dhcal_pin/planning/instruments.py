@@ -16,12 +16,13 @@ Shapes: m configurations, n joints, k rows of a measurement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.frame_gauge import position_frame_effects
 from ..exceptions import InvalidArgumentError
@@ -37,7 +38,7 @@ _CHUNK = 200
 _FREE_CHUNK = 10
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PresentModel:
     """Robot and instrument at the present values of their parameters."""
 
@@ -47,7 +48,7 @@ class PresentModel:
     values: Array  # Values of the s instrument parameters, shape (s,) [m, rad, px or 1]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SimulatedInstrument:
     """Instrument of a kind of measurement, in a sensible place."""
 
@@ -92,7 +93,7 @@ class SimulatedInstrument:
         return position_frame_effects(model.chain, q).transpose(2, 1, 0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CameraInstrument:
     """Cameras that see boards; a measurement is all images of one configuration."""
 
@@ -261,7 +262,7 @@ class CameraInstrument:
         return (eye, plate) if rig.camera_mounts[camera].moves else (plate, eye)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _End:
     """Camera or board at an end of the robot, and how k instrument parameters move it."""
 

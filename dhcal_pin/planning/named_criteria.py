@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import UnknownNameError
 from ..robot.error_families import COMPLIANCE, GAIN, HARMONICS
@@ -35,7 +35,7 @@ def _robust_criterion(
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class CriterionOption:
     """Criterion that users select by name."""
 

@@ -16,12 +16,13 @@ decides, and step 4 also predicts the standard deviation of the curves (`curve_p
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, Progress
 from ..calibration.cameras import judged_boards, split_sets
 from ..estimation.parameters import LOW_COST
@@ -73,7 +74,7 @@ PHASES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Plan:
     """Configurations to measure, and the accuracy to expect.
 
@@ -312,7 +313,7 @@ def _report_phases(progress: Progress | None) -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Pool:
     """Configurations from which the poses are selected."""
 

@@ -6,10 +6,9 @@ replaces it if that lowers the criterion. The neighbourhood shrinks from round t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..robot.sampling import ConfigurationSampler, scale_joint_units
 from .bin_filling import filling_cost, filling_gains
@@ -26,7 +25,7 @@ N_NEIGHBOURS = 24
 STEP, SHRINK_FACTOR = 0.15, 0.65
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DesignGoal:
     """Knowledge before the measurements, and what to optimize."""
 
@@ -40,7 +39,7 @@ class DesignGoal:
     bin_columns: Array  # Joints whose bins are filled evenly before the criterion decides, shape (j,)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Selection:
     """Poses that the search has found for a goal."""
 

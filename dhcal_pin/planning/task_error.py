@@ -6,15 +6,16 @@ Shapes: p unknowns, m configurations, n joints.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from .information import Information
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TaskError:
     """Position error over a task."""
 

@@ -19,11 +19,11 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..robot.collision import CollisionChecker
 from ..robot.sampling import scale_joint_units, shortest_tour
@@ -40,7 +40,7 @@ N_ORDERS = 12
 N_EXTENSIONS, EXTENSION_RAD = 300, 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Tour:
     """Order of poses and the ways between them."""
 
@@ -144,7 +144,7 @@ def connected(
     return part, part[:0], False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Tree:
     """Tree of configurations with free moves between each node and its parent."""
 

@@ -14,12 +14,13 @@ Shapes: m configurations, n joints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..measurements.images import ViewLimits
@@ -37,7 +38,7 @@ _N_ERRORS = 6
 _BOARD_SHARE = 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ViewSampler(ConfigurationSampler):
     """Sampler of configurations in which a camera sees a board."""
 

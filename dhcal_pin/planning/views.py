@@ -10,12 +10,13 @@ Shapes: m configurations, c corners of a board.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.procedure import calibrate
 from ..cameras.boards import Board
@@ -43,7 +44,7 @@ _BATCH, _MAX_ROUNDS, _MAX_EMPTY_ROUNDS = 1000, 200, 20
 _N_CELLS = (10, 10)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlannedImages:
     """Cameras, boards and images that a plan is for.
 
@@ -222,7 +223,7 @@ def draw_views(
     return out
 
 
-@dataclass(frozen=True)
+@frozen
 class CameraViews:
     """Planned images of a camera."""
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._frozen import frozen
 from ..formatting import format_quantity
 from .evidence import Evidence
 
@@ -22,7 +22,7 @@ _SUSPICIOUS_WIDTH, _SUSPICIOUS_LENGTH, _SUSPICIOUS_ANGLE = 4.0, 2e-3, 1e-2
 _MIN_NAMED_RATIO = 2.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Diagnosis:
     """Hypotheses that explain measurements decisively better than the measurements as they were read."""
 

@@ -11,11 +11,12 @@ The same displacements of robots with random errors, drawn from the default prio
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..robot.chain import Chain
@@ -28,7 +29,7 @@ _N_CONFIGURATIONS, _N_ROBOTS = 32, 24
 _MIN_RELATIVE = 0.5
 
 
-@dataclass(frozen=True)
+@frozen
 class CorrectionSize:
     """Largest displacement by a correction."""
 

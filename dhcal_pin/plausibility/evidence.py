@@ -25,10 +25,11 @@ Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.initialization import initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
@@ -63,7 +64,7 @@ _MIN_SCALE, _MAX_SCALE = 1e-4, 1e7
 _OUTLIER_RATIO = 4.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Evidence:
     """Evidence of measurements for a robot with small errors."""
 
@@ -124,7 +125,7 @@ def _with_equal_sigmas(item: Measurement) -> Measurement:
     return item.replace(**values)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Noise:
     """Noise of measurements as estimated from the residuals of a fit."""
 

@@ -13,7 +13,6 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, permutations, product
 from typing import Literal, Protocol
@@ -21,6 +20,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..measurements.base import Measurement, label_stops
@@ -63,7 +63,7 @@ class Change(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@frozen
 class JointChange:
     """Other joint columns: q_j becomes sign_j · factor_j · q_source_j + offset_j."""
 
@@ -109,7 +109,7 @@ class JointChange:
         return item.resample(item.configurations()[:, sources] * factors + offsets)
 
 
-@dataclass(frozen=True)
+@frozen
 class RowShift:
     """Joint positions belong to the measured values `step` rows below them; of images, `step` images."""
 
@@ -146,7 +146,7 @@ def _are_renamed(before: Array, after: Array) -> bool:
     return len(pairs) == len({*before.tolist()}) == len({*after.tolist()})
 
 
-@dataclass(frozen=True)
+@frozen
 class LengthChange:
     """Other unit of measured lengths."""
 
@@ -161,7 +161,7 @@ class LengthChange:
         return None
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisScale:
     """Measured coordinate that is too long by a factor."""
 
@@ -177,7 +177,7 @@ class AxisScale:
         return _with_positions(item, item.positions() * factors)
 
 
-@dataclass(frozen=True)
+@frozen
 class LagChange:
     """Joint positions that are earlier than the measured values."""
 
@@ -195,7 +195,7 @@ class LagChange:
         return item.resample(joint_path(times[order], item.q[order])(times + self.lag))
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisChange:
     """Other axes of measured positions, rotations unchanged: axis i is sign_i times axis source_i as read."""
 
@@ -219,7 +219,7 @@ class AxisChange:
         return _with_positions(item, item.positions()[:, self.sources] * np.array(self.signs))
 
 
-@dataclass(frozen=True)
+@frozen
 class MirroredPoses:
     """Positions and rotations in a left-handed measuring frame."""
 
@@ -229,7 +229,7 @@ class MirroredPoses:
         return _with_poses(item, mirror @ item.poses @ mirror) if isinstance(item, Pose) else None
 
 
-@dataclass(frozen=True)
+@frozen
 class QuaternionOrder:
     """Other order of the components of measured quaternions."""
 
@@ -247,7 +247,7 @@ class QuaternionOrder:
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class InversePose:
     """Poses of the measuring frame in the tool frame, in place of the tool in the measuring frame."""
 
@@ -256,7 +256,7 @@ class InversePose:
         return _with_poses(item, se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
 
 
-@dataclass(frozen=True)
+@frozen
 class InverseRotation:
     """Inverse rotations beside correct positions."""
 
@@ -265,7 +265,7 @@ class InverseRotation:
         return _with_rotations(item, lambda rotations: np.swapaxes(rotations, 1, 2))
 
 
-@dataclass(frozen=True)
+@frozen
 class RotationUnit:
     """Rotation vectors or Euler angles in radians that were read as degrees."""
 
@@ -293,7 +293,7 @@ _COMPUTED = {"", ROTATION_VECTOR}
 _USUAL_NOTATIONS = (ROTATION_VECTOR, "xyz", "zyx", "rpy", "zyz")
 
 
-@dataclass(frozen=True)
+@frozen
 class OtherNotation:
     """Rotations by three numbers of one notation that were read in another one."""
 
@@ -353,7 +353,7 @@ def _with_poses(item: PoseMeasurement, poses: Array) -> PoseMeasurement:
     return item.replace(poses=poses, angles=np.full_like(item.angles, np.nan))
 
 
-@dataclass(frozen=True)
+@frozen
 class Hypothesis:
     """Assumption about what was mixed up."""
 
@@ -422,7 +422,7 @@ def _count_lengths(item: Measurement) -> int:
     return 3 * len(item.rows) if isinstance(item, PoseMeasurement) else item.residual_dim * len(item.rows)
 
 
-@dataclass(frozen=True)
+@frozen
 class BothChanges:
     """Two changes, one after the other."""
 

@@ -12,11 +12,12 @@ other.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.parameters import LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR
 from ..exceptions import InvalidArgumentError, UnknownNameError
@@ -48,7 +49,7 @@ _PLAY = np.deg2rad(0.5)
 _MAX_LISTED = 3
 
 
-@dataclass(frozen=True)
+@frozen
 class OpenSigns:
     """Signs that measurements leave open."""
 
@@ -58,7 +59,7 @@ class OpenSigns:
     distance: float  #: Distance of the tools of the two arms there [m].
 
 
-@dataclass(frozen=True)
+@frozen
 class SignDecision:
     """Joints of an arm that turn the other way, and what is open."""
 

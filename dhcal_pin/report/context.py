@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
+from .._frozen import frozen
 from ..calibration.evaluation import Comparison
 from ..calibration.presentation.curves import JointCurve, joint_curves
 from ..calibration.presentation.workspace import WorkspacePrediction, predict_workspace
@@ -15,7 +15,7 @@ from .provenance import Provenance, measurement_names
 from .samples import Samples, result_samples
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ReportContext:
     """A result with everything that its sections and figures need."""
 

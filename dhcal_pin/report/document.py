@@ -8,14 +8,15 @@ know nothing of calibrations.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
+from .._frozen import frozen
 from ..formatting import Table
 from ..plots import PANEL
 
 
-@dataclass(frozen=True)
+@frozen
 class IntervalBar:
     """Mark with an interval around it, on a scale from -1 to 1."""
 
@@ -24,7 +25,7 @@ class IntervalBar:
     high: float  # Upper end of the interval
 
 
-@dataclass(frozen=True)
+@frozen
 class BarTable(Table):
     """Table with columns of bars and groups of rows, which only the HTML page shows."""
 
@@ -35,7 +36,7 @@ class BarTable(Table):
     unchanged: Sequence[int] = ()  # Indices of rows that the page folds, as they report no change
 
 
-@dataclass(frozen=True)
+@frozen
 class Panel:
     """One figure, which is drawn when the page is written."""
 
@@ -51,7 +52,7 @@ class Panel:
     role: str = ""  # Role of the samples, if the figure shows the samples of one role only
 
 
-@dataclass(frozen=True)
+@frozen
 class LegendEntry:
     """Meaning of a colour."""
 
@@ -60,7 +61,7 @@ class LegendEntry:
     mark: str  # Shape of the sample: "area", "cell", "dashes", "dots" or "line"
 
 
-@dataclass(frozen=True)
+@frozen
 class FigureGroup:
     """Figures that belong together and share a legend."""
 
@@ -75,7 +76,7 @@ class FigureGroup:
     scene_title: str = "The robot before and after calibration, in three dimensions"
 
 
-@dataclass(frozen=True)
+@frozen
 class Section:
     """Section of a document; one without content is not shown."""
 
@@ -88,7 +89,7 @@ class Section:
     figures: Callable[[], Sequence[FigureGroup]] | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Document:
     """Head and sections of a document."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration import summary
 from ..calibration.cameras import ImageError, Stage
@@ -27,7 +27,7 @@ _DRAWN_PART, _LARGE_PERCENTILE = 0.06, 95.0
 _WIDTH, _NARROW, _BESIDE, _BELOW = 420.0, 320.0, 60.0, 46.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Image:
     """Corners of one image."""
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from .. import plots, se3
+from .._frozen import frozen
 from ..planning.planner import Plan
 from ..planning.views import views_table
 from ..robot.chain import Chain
@@ -20,7 +20,7 @@ from .provenance import origin_tables
 from .samples import Samples, samples_section
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PlanReport:
     """Plan and what its page shows beside it."""
 

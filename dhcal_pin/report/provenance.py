@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..calibration.evaluation import Comparison
 from ..formatting import Table
 from ..measurements.base import Measurement
 
 
-@dataclass(frozen=True)
+@frozen
 class Provenance:
     """Facts about a calibration that its result does not contain.
 

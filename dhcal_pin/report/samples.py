@@ -9,12 +9,13 @@ Shapes: N samples in the order of their files and lines, n joints.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.result import Result
 from ..formatting import SMALL_UNITS, UNITS, Quantity, Table
@@ -36,7 +37,7 @@ _POSE_DECIMALS, _ERROR_DECIMALS, _MAP_DECIMALS = 12, 9, 5
 ROLES = ("fitted", "hold-out", "measured", "planned")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Samples:
     """Samples that a reader can select on a page."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from .._frozen import frozen
 from ..calibration.evaluation import Accuracy, aligned_norms, compute_errors
 from ..calibration.summary import STATISTIC_LABELS, statistic
 from ..formatting import Table, format_count
@@ -23,7 +23,7 @@ from .provenance import measurement_names, origin_tables
 from .samples import Samples, measured_samples, samples_section
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Validation:
     """Accuracy of a robot on measurements."""
 

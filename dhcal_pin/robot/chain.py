@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +40,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from .. import _kernels, se3
+from .._frozen import frozen
 from .._kernels.kinematics import error_frame_poses
 from .._kernels.types import FrameBatch, twists_before
 from .._typing import Array
@@ -83,7 +84,7 @@ def link_frame(j: int) -> int:
     return 2 * j + 1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@frozen(eq=False)
 class Chain:
     """Kinematic chain from the root link of a robot, or from another link, to a tip link.
 

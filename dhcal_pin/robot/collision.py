@@ -16,7 +16,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 from xml.etree import ElementTree
@@ -27,6 +26,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import FileFormatError
 from ..native_output import discard_native_messages
@@ -47,7 +47,7 @@ _MIN_CAPSULE_LENGTH = 1e-3
 FLOOR, _FLOOR_SIZE = "floor", (100.0, 100.0, 2.0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Obstacle:
     """Body that stands still.
 
@@ -87,7 +87,7 @@ class Obstacle:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class CollisionChecker:
     """Collision checks of a robot."""
 

@@ -13,10 +13,11 @@ Shapes: m samples, n independent joints, k moving joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._kernels.types import JointState
 from .._typing import Array
 from ..units import UNITS
@@ -30,7 +31,7 @@ MAX_RISE = 10.0
 MIN_MOTION = 1e-4
 
 
-@dataclass(frozen=True)
+@frozen
 class Condition:
     """Condition of a sample that a measurement file can state."""
 
@@ -92,7 +93,7 @@ CONDITIONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Conditions:
     """Conditions of m samples; None for a condition that is not known."""
 
@@ -170,7 +171,7 @@ class Conditions:
         return Conditions(**repeated | {"q": q})
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SampleState(JointState):
     """Positions of a chain's joints at samples, with the conditions of the samples."""
 

@@ -12,11 +12,11 @@ on the positions of other joints and cannot be part of such a table; `compensati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import ConvergenceError
 from .chain import Chain
@@ -30,7 +30,7 @@ MAX_LIMIT = 20 * np.pi
 _STEP_TOL, _MAX_STEPS = 1e-15, 50
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointCorrection:
     """Correction of one joint over its range."""
 

@@ -19,10 +19,10 @@ Reference:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from .chain import Chain
 
@@ -42,7 +42,7 @@ _LIMIT_TOL = 1e-6
 _MIN_REPETITIONS = 2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointCoverage:
     """Parts of a turn that a revolute joint visited."""
 

@@ -14,12 +14,13 @@ Lengths are in metres and angles in radians. Shapes: m samples, n joints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 
@@ -44,7 +45,7 @@ def axis_translation(axis: int, length: Array) -> Array:
     return se3.translation(np.asarray(length)[..., None] * np.eye(3)[axis])
 
 
-@dataclass(frozen=True)
+@frozen
 class DHTable:
     """Denavit-Hartenberg table of a serial arm with n joints.
 

@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from .dh import CONVENTIONS, Convention, DHTable, axis_rotation, axis_translation
@@ -54,7 +55,7 @@ QUARTER_TURN_TOL = 5e-15
 _RIGHT_ANGLE_BAND = 0.05
 
 
-@dataclass(frozen=True)
+@frozen
 class Extraction:
     """DH table and the frames of its x axes in the robot.
 
@@ -72,7 +73,7 @@ class Extraction:
     notes: tuple[str, ...]  #: One sentence for every pair of axes whose row has β.
 
 
-@dataclass(frozen=True)
+@frozen
 class _OriginParameters:
     """The seven parameters of an origin [rad and m]; see the module docstring."""
 

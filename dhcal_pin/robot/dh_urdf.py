@@ -8,10 +8,10 @@ those of the drawing are rounded to six digits. A comment at the top of the file
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from .dh import DHTable
 from .dh_extraction import normalize_offsets
@@ -37,7 +37,7 @@ PRISMATIC_SPAN = 10.0
 MASS, INERTIA = 1e-3, 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class _Skeleton:
     """Line segments of a link in its own frame."""
 

@@ -18,11 +18,11 @@ families of link terms.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from .conditions import Conditions
 
@@ -91,7 +91,7 @@ class Coefficient(NamedTuple):
     formula: str  # Its term as a formula; see `Term`
 
 
-@dataclass(frozen=True)
+@frozen
 class Term:
     """Function of the conditions of a sample, and the coefficient that scales it."""
 
@@ -112,7 +112,7 @@ class Term:
     derivative: str = "0"
 
 
-@dataclass(frozen=True)
+@frozen
 class SelectionRule:
     """When a calibration adds a family of joint errors by itself."""
 
@@ -123,7 +123,7 @@ class SelectionRule:
     is_universal: bool = False
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorFamily:
     """Family of joint errors that users select by one name."""
 

@@ -11,16 +11,15 @@ has the same spline, but its import takes longer than most calibrations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_banded
 
+from .._frozen import frozen
 from .._typing import Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointPath:
     """Cubic spline through joint positions; before and after the samples its end pieces go on."""
 

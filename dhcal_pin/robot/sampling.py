@@ -12,12 +12,12 @@ Shapes: m samples, n joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from .chain import Chain
@@ -39,7 +39,7 @@ _MAX_ANGLE, _MAX_STROKE = np.pi, 0.5
 _MIN_TOUR_GAIN = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class WorkspaceConstraints:
     """Constraints of the robot's poses.
 
@@ -111,7 +111,7 @@ def _is_prismatic(chain: Chain) -> Array:
     return np.array([chain.urdf.joint(name).type == "prismatic" for name in chain.joint_names])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ConfigurationSampler:
     """Sampler of configurations that a robot can take."""
 

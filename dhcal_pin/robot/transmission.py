@@ -26,12 +26,13 @@ coefficients, e selected coefficients. Arrays of joint positions are (n, m) in t
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
+from .._frozen import frozen
 from .._typing import Array
 from .conditions import Conditions
 from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER, CoefficientParts
@@ -43,7 +44,7 @@ MAX_CACHED_TORQUES = 256
 _last_terms = threading.local()
 
 
-@dataclass(frozen=True)
+@frozen
 class Payload:
     """Point mass at the tip link, in addition to the masses of the URDF.
 
@@ -56,7 +57,7 @@ class Payload:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class GravityLoads:
     """What joint errors need of a chain: gravity torques on its joints, and its link vectors."""
 
@@ -124,7 +125,7 @@ class GravityLoads:
         return self._cache[key]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Transmission:
     """Transmission errors of a chain's independent joints."""
 

@@ -15,12 +15,13 @@ import difflib
 import html
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..exceptions import UnknownNameError
 from ..messages import quote
@@ -74,14 +75,14 @@ _OTHER_FORMATS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class UrdfTag(XmlTag):
     """Start tag of an element of a URDF."""
 
     children: dict[str, UrdfTag] = field(default_factory=dict)  # Tags of the direct children by element name
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class UrdfJoint:
     """Joint of a URDF."""
 
@@ -105,7 +106,7 @@ class UrdfJoint:
     origin_start: int | None = field(repr=False)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Urdf:
     """URDF file that passed all checks: its links and joints form one tree."""
 

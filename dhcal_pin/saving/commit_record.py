@@ -12,9 +12,10 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..exceptions import FileFormatError
 from .folder_locks import lock_folders
@@ -24,7 +25,7 @@ RECORD_NAME = ".dhcal-save.json"
 _TEMPORARY = re.compile(r"\.dhcal-[0-9a-f]{16}-\d+\.(?:new|old)")
 
 
-@dataclass(frozen=True)
+@frozen
 class CommitRecord:
     """What a commit does in one folder."""
 

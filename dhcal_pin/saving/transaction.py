@@ -8,8 +8,8 @@ import shutil
 import stat
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
+from .._frozen import frozen
 from .._typing import PathLike
 from ..exceptions import FileFormatError, InvalidArgumentError
 from .commit_record import (
@@ -39,7 +39,7 @@ def write_files(
         _save(contents, before_commit, signals)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Change:
     """Change of one file."""
 

@@ -18,11 +18,11 @@ Shapes: m samples, F functions of time, c columns of a block.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 
 # Size of a change that is held at zero.
@@ -33,7 +33,7 @@ N_FUNCTIONS = 8
 Kind = Literal["base", "tool", "joint", "links", "robot", "lag", "scale"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Block:
     """Columns of the linear model that one cause uses."""
 
@@ -53,7 +53,7 @@ class Block:
         return np.where(is_free, 1 / np.where(is_free, self.sizes, 1.0), 0.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Step:
     """Step between two samples."""
 
@@ -64,7 +64,7 @@ class Step:
         return np.where(numbers < self.number, -1.0, 0.0)[:, None]
 
 
-@dataclass(frozen=True)
+@frozen
 class Drift:
     """Drift from the first to the last sample."""
 
@@ -82,7 +82,7 @@ class Drift:
         return (np.expm1(-rate * share) / np.expm1(-rate) - 1)[:, None]
 
 
-@dataclass(frozen=True)
+@frozen
 class FreeDrift:
     """Drift without a simple law, as a random walk."""
 
@@ -95,7 +95,7 @@ class FreeDrift:
         return np.sqrt(2) * np.sin(rates * (1 - _elapsed(self.begin, self.end, times)[:, None])) / rates
 
 
-@dataclass(frozen=True)
+@frozen
 class Constant:
     """Cause that is the same for all samples."""
 
@@ -113,7 +113,7 @@ Change = Step | Drift | FreeDrift
 Shape = Change | Constant
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Cause:
     """Something that changed during a session."""
 

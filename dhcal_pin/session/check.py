@@ -30,7 +30,7 @@ Shapes: N samples of k rows, c coefficients of a hypothesis, p columns of the li
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -38,6 +38,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from .. import se3
+from .._frozen import frozen
 from .._kernels import apply_observation_matrix
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
@@ -98,7 +99,7 @@ TEMPERATURE_STD = MAX_RISE
 STEP_TOL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Hypothesis:
     """Something that may have changed, with what the measurements say of it."""
 
@@ -125,7 +126,7 @@ class Hypothesis:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Explained:
     """What one or several changes leave of the residuals."""
 
@@ -136,7 +137,7 @@ class Explained:
     p_value: float  # Probability of a larger one if nothing else changed
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Recheck:
     """Answer to the question whether a robot is still calibrated."""
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..formatting import format_fixed, format_quantity, significant_decimals
 from ..measurements.base import Measurement
@@ -28,7 +29,7 @@ MAX_INSTRUMENT_SCALE = 0.1
 _LIKE_BASE = " A motion of the base has the same effect."
 
 
-@dataclass(frozen=True)
+@frozen
 class Event:
     """Sudden change between two samples."""
 
@@ -88,7 +89,7 @@ class Event:
         return f"Both parts were fitted with their own {self.of or self.kind} pose."
 
 
-@dataclass(frozen=True)
+@frozen
 class SlowChange:
     """Drift during a session."""
 
@@ -130,7 +131,7 @@ class SlowChange:
         return "The result is the arm at the end." + _LIKE_BASE * self.is_like_base
 
 
-@dataclass(frozen=True)
+@frozen
 class Lag:
     """Delay between joint values and measured values."""
 
@@ -154,7 +155,7 @@ class Lag:
         return f"{corrected}Record both at the same time, or add --mend lag:{self.value:.4g}."
 
 
-@dataclass(frozen=True)
+@frozen
 class Scale:
     """Factor of measured lengths."""
 
@@ -191,7 +192,7 @@ class Scale:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Session:
     """What happened during a session."""
 
@@ -246,7 +247,7 @@ class Session:
         }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class History:
     """Change of one part of a robot over a session, relative to the end."""
 

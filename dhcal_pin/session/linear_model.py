@@ -9,10 +9,11 @@ Shapes: m samples of at most k residuals, c columns.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._kernels import apply_observation_matrix
 from .._typing import Array
 from ..estimation.parameters import base, tool
@@ -38,7 +39,7 @@ def measures_positions(data: Sequence[Measurement]) -> bool:
     return all(len(item.positions()) == len(item.rows) for item in data)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Layout:
     """Columns of the linear model."""
 

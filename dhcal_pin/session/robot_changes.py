@@ -11,13 +11,14 @@ Shapes: m samples, n joints, k moving joints, S segments.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
@@ -27,7 +28,7 @@ from .causes import Cause, Change, Constant, Drift, FreeDrift, Step
 from .timeline import Timeline
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Motion:
     """Motion of base or tool over time; the identity at the end."""
 
@@ -57,7 +58,7 @@ class Motion:
         return replace(self, steps=ordered, poses=self.poses[self.segments(last)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class RobotChanges:
     """Changes of a robot during a session."""
 

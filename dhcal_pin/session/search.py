@@ -25,12 +25,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array
 from ..estimation.problem import Problem
 from ..estimation.robust import MAD_TO_STD
@@ -103,7 +104,7 @@ MIN_DIFFERENT_ROWS_PER_UNKNOWN = 2.0
 MIN_SIDE = 3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LinearFit:
     """Fit of the linear model with weights of bounded influence."""
 

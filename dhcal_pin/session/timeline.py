@@ -6,16 +6,17 @@ The samples are in the order of the files and of their lines, or of their times 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..measurements.configurations import group_by_configuration
 
 
-@dataclass(frozen=True)
+@frozen
 class Place:
     """Place of a sample: its file, its first and last line, and the name of its photograph, if any."""
 
@@ -25,7 +26,7 @@ class Place:
     photograph: str
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Timeline:
     """Order of the samples of a session of N samples."""
 

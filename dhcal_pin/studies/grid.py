@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, fields
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..estimation.batch import BatchProblem, ChainBatch
 from ..estimation.parameters import select_parameters
@@ -53,7 +54,7 @@ _N_CANDIDATES = 5000
 PLANNED = "planned"
 
 
-@dataclass(frozen=True)
+@frozen
 class Setting:
     """One combination of the grid; every entry can be a list in the file."""
 
@@ -115,7 +116,7 @@ SAMPLERS: dict[str, Callable[[Chain, int, np.random.Generator], Array]] = {
 POSE_SELECTIONS = (*SAMPLERS, PLANNED)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Case:
     """Setting with its robots."""
 
@@ -148,7 +149,7 @@ class Case:
 Task = tuple[Case, int, int]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StudyGrid:
     """Grid of settings with the number of calibrations of each."""
 

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -25,6 +25,7 @@ import umsgpack
 import zmq
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..calibration.result import Result
 from ..exceptions import DhcalError
@@ -94,7 +95,7 @@ def serve(
     return scene
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Live:
     """Running live scene.
 
@@ -177,7 +178,7 @@ def _draw(view: meshcat.Visualizer, style: tuple[int, float], visuals: Visuals, 
     view[f"{tool}/frame"].set_object(g.triad(0.2))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Window:
     """Connection of `meshcat.Visualizer` to the server; the one of MeshCat waits without limit."""
 

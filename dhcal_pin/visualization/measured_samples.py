@@ -7,11 +7,11 @@ positions, such as lengths, have none.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from .._frozen import frozen
 from .._typing import Array
 from ..calibration.result import Result
 from ..measurements.base import Measurement
@@ -23,7 +23,7 @@ SETS = ("fitted", "held out", "outliers")
 FITTED, HELD_OUT, OUTLIER = range(3)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MeasuredSamples:
     """Measured positions of m samples."""
 

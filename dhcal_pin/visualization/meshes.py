@@ -17,7 +17,7 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import lru_cache
 from typing import Any
 from xml.etree import ElementTree
@@ -28,6 +28,7 @@ import numpy as np
 import pinocchio as pin
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..native_output import discard_native_messages
 from ..robot.chain import Chain
@@ -48,7 +49,7 @@ MAX_NAMED = 3
 AXIS_COLORS = [MATERIALS[f"{axis}_axis"] for axis in "xyz"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Visuals:
     """Shapes of a robot."""
 
@@ -105,7 +106,7 @@ def rows(pose: Array) -> list[float]:
 
 
 # --- the URDF's visual geometry --------------------------------------------------------------------
-@dataclass(frozen=True)
+@frozen
 class _Source:
     """A URDF and its meshes, identified by the time stamps of their files."""
 
@@ -114,7 +115,7 @@ class _Source:
     folders: tuple[str, ...] = field(compare=False)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Object:
     """Visual object of a link."""
 
@@ -250,7 +251,7 @@ def _primitive(geometry: Any) -> dict[str, Any] | None:
 
 
 # --- meshes ----------------------------------------------------------------------------------------
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Mesh:
     """Triangle mesh whose vertices lie on a grid."""
 

@@ -23,7 +23,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ import numpy as np
 import pinocchio as pin
 
 from .. import se3
+from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..calibration.presentation.workspace import uncertainty_cells
 from ..calibration.result import Result
@@ -66,7 +67,7 @@ DEFAULT_STROKE_M = 0.5
 PAGE = Path(__file__).with_name("viewer.html")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Preview:
     """Poses that the arm will visit, and what stands around it."""
 
@@ -213,7 +214,7 @@ def reach(chain: Chain) -> float:
     return float(np.linalg.norm(chain.origins[:, :3, 3], axis=1).sum())
 
 
-@dataclass(frozen=True)
+@frozen
 class Scene:
     """Page that notebooks show inline."""
 

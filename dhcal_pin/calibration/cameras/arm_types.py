@@ -7,8 +7,8 @@ more than their noise. The limits of other arms would make outliers of such imag
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
+from ..._frozen import frozen
 from ...estimation.parameters import LOW_COST
 
 # Models of errors of images that the errors of the arm do not explain: corners are displaced independently of
@@ -16,7 +16,7 @@ from ...estimation.parameters import LOW_COST
 CORNERS, IMAGES = "corners", "images"
 
 
-@dataclass(frozen=True)
+@frozen
 class ArmType:
     """Limits of one type of arm."""
 

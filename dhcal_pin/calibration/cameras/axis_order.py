@@ -9,11 +9,12 @@ stated and in every other order. Another order is taken if it explains the image
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.problem import Problem, merge_instrument_parameters
@@ -26,7 +27,7 @@ from ..reweighting import Fit
 from .stages import ImageError, Stage, fitted_error
 
 
-@dataclass(frozen=True)
+@frozen
 class AxisOrder:
     """Order of the values of a camera and of its image coordinates."""
 
@@ -53,7 +54,7 @@ MAX_RATIO, MAX_ERROR_SHARE = 0.5, 0.05
 _MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
 
 
-@dataclass(frozen=True)
+@frozen
 class Exchange:
     """Values of a camera that are exchanged in the rig, or image coordinates in the measurements."""
 

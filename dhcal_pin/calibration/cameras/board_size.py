@@ -13,11 +13,12 @@ number n of lengths that the images determine (MacKay 1992).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.problem import Problem
@@ -38,7 +39,7 @@ MIN_CHANGE = 2e-3
 _MAX_ITERATIONS = 40
 
 
-@dataclass(frozen=True)
+@frozen
 class BoardSize:
     """Size of the boards that makes the correction of the arm far smaller."""
 

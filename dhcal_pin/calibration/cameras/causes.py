@@ -21,11 +21,12 @@ Causes can be combined. The model of some causes is fitted to the same images as
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cache, partial
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.initialization import make_problem
@@ -65,7 +66,7 @@ _N_ROUNDS, _TOLERANCE = 8, 1e-5
 _MAX_ITERATIONS = 40
 
 
-@dataclass(frozen=True)
+@frozen
 class Causes:
     """Combination of causes."""
 
@@ -78,7 +79,7 @@ class Causes:
     has_exchanged_links: bool = False  # Whether cameras and boards are on each other's links
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class HandEyeData:
     """What all models of one hand-eye calibration share."""
 

@@ -15,13 +15,14 @@ another kind, or images with wrong joint values.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array
 from ...cameras.rig import Camera
 from ...estimation.robust import ZERO_WEIGHT
@@ -90,7 +91,7 @@ N_FOLDS, MIN_CONFIGURATIONS, MAX_CAUSES = 5, 5, 3
 MAX_CONFIGURATIONS, MAX_CORNERS = 300, 3000
 
 
-@dataclass(frozen=True)
+@frozen
 class Trial:
     """One cause that was estimated along."""
 
@@ -110,7 +111,7 @@ class Trial:
         }
 
 
-@dataclass(frozen=True)
+@frozen
 class HandEyeDiagnosis:
     """Error of a hand-eye calibration and its likely cause."""
 
@@ -242,7 +243,7 @@ def _error_dict(error: ImageError) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------------------------------------- diagnosis
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class HandEyeFit:
     """Poses of cameras and boards on the nominal arm, and what their diagnosis needs."""
 
@@ -359,7 +360,7 @@ def _wrong_images(hand_eye: HandEyeData, state: _State, item: CameraCorners, wei
     return [rejected.image_labels[i] for i in np.argsort(first) if is_wrong[i]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _State:
     """Fit of a combination of causes."""
 
@@ -389,7 +390,7 @@ class _State:
         return self.fit.problem.instruments(self.fit.solution.x)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Search:
     """Images, fit of the poses alone, and what `_find_causes` returns."""
 

@@ -28,10 +28,11 @@ likelihood of the images after the arm was estimated, the model lacks nothing, a
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.error_model import ErrorModel
 from ...estimation.folds import factor_partition
@@ -65,7 +66,7 @@ _N_JITTER_ROUNDS, _N_EVIDENCE_ROUNDS = 2, 30
 _N_CLUSTER_ROUNDS = 50
 
 
-@dataclass(frozen=True)
+@frozen
 class Gate:
     """Result of the gate."""
 
@@ -116,7 +117,7 @@ class Gate:
         return f"{start} {effect} {format_ratio(self.ratio)}, not below {format_ratio(self.max_ratio)}."
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class GatedFit:
     """Fits with and without errors of the arm, and the gate between them."""
 
@@ -225,7 +226,7 @@ def residual_jitter(fit: Fit) -> Jitter:
     return estimate_jitter(fit.problem, fit.solution.x, fit.data, fit.weights, n_determined)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class _Trial:
     """Arm estimated with one model of the noise, as the gate judges it."""
 

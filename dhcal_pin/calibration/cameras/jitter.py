@@ -21,10 +21,11 @@ J. Royal Statistical Society B 39, 1977.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._kernels.types import FrameBatch
 from ..._typing import Array
 from ...estimation.parameters import LOW_COST
@@ -46,7 +47,7 @@ MAX_RESIDUAL = 1e5
 MIN_LOG_LIKELIHOOD_RATIO = 5.5
 
 
-@dataclass(frozen=True)
+@frozen
 class Jitter:
     """Noise of corners and displacement of images."""
 

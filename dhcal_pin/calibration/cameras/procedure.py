@@ -13,10 +13,11 @@ After the first fit these stages follow:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Progress
 from ...estimation.priors import PriorGroups
 from ...estimation.robust import KEPT
@@ -66,7 +67,7 @@ def with_common_start(chain: Chain, data: tuple[Measurement, ...]) -> tuple[Meas
     return data
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageFitting:
     """Settings of the fits of images."""
 

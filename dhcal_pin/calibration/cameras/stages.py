@@ -10,11 +10,12 @@ holds elsewhere.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.folds import Fold, factor_partition, solve_columns
 from ...measurements.base import errors_of
@@ -22,7 +23,7 @@ from ...measurements.camera import CameraCorners
 from ..reweighting import Fit
 
 
-@dataclass(frozen=True)
+@frozen
 class ImageError:
     """Error of corners in images."""
 
@@ -32,7 +33,7 @@ class ImageError:
     n_corners: int  # Number of corners
 
 
-@dataclass(frozen=True)
+@frozen
 class Stage:
     """Accuracy after one more group of unknowns was freed."""
 

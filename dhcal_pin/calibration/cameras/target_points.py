@@ -9,11 +9,12 @@ of left-out clusters of joint space to less than 0.9. Noise alone raises both er
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from ..._frozen import frozen
 from ...cameras.boards import Board
 from ...estimation.solver import minimize
 from ...measurements.base import Measurement
@@ -27,7 +28,7 @@ from .stages import format_ratio, held_out_error
 MAX_RATIO = 0.9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TargetPoints:
     """Result of a trial of the corners of boards as unknowns."""
 

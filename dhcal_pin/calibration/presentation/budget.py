@@ -13,10 +13,11 @@ A negative difference counts as zero. The combination, the root of the sum of sq
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
+from ..._frozen import frozen
 from ...formatting import Quantity, Table
 from ...measurements.configurations import group_by_configuration
 from ...measurements.pose import Pose
@@ -29,7 +30,7 @@ from ..fitted import FittedModel
 _MAX_PREDICTED = 2000
 
 
-@dataclass(frozen=True)
+@frozen
 class UncertaintyBudget:
     """Contributions to the position error, RMS distances [m]; None for one that is not known apart."""
 

@@ -11,10 +11,9 @@ Shapes: v joint values, n independent joints, e uncertain coefficients, b bins o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.uncertainty import UNBOUNDED_TOL, Uncertainty
 from ...robot.coverage import JointCoverage, bin_indices, joint_coverage, lattice_warnings
@@ -27,7 +26,7 @@ from ..partition import different_configurations
 CURVE_VALUES = np.deg2rad(np.arange(-180.0, 181.0))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointCurve:
     """Correction curve of a joint."""
 

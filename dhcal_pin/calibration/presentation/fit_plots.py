@@ -6,12 +6,12 @@ Long series are thinned evenly, so that a plot of many samples is as fast as one
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from ... import formatting, plots
+from ..._frozen import frozen
 from ..._typing import Array
 from ...exceptions import InvalidArgumentError, UnknownNameError
 from ...measurements.groups import ERROR_GROUPS, in_order
@@ -37,7 +37,7 @@ _PRIOR_BANDS = (2.0, 1.0)
 _MAX_LABEL_CHARS = 25
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class SampleErrors:
     """Errors of N samples before and after a calibration, in one group of errors."""
 

@@ -15,11 +15,11 @@ ones in the order of `Result.holdout`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.robust import ZERO_WEIGHT
 from ...measurements.base import Measurement, instrument_values
@@ -27,7 +27,7 @@ from ..evaluation import fit_instrument_parameters
 from ..evidence import Evidence
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ResidualTable:
     """Residuals of N samples.
 

@@ -16,12 +16,12 @@ come on top of the prediction; the measured errors of a cell contain them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array
 from ...estimation.uncertainty import Predictor
 from ...formatting import round_down
@@ -44,7 +44,7 @@ RELATIVE_TEXT = (
 CHUNK_SIZE = 2000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class WorkspacePrediction:
     """Predicted accuracy in single configurations."""
 
@@ -66,7 +66,7 @@ def predict_workspace(model: Predictor, data: Sequence[Measurement]) -> Workspac
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class WorkspaceMap:
     """Predicted and measured accuracy by cells of the workspace."""
 
@@ -127,7 +127,7 @@ def workspace_map(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class UncertaintyCells:
     """Cells that the tool reaches, for a scene."""
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import unicodedata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from ..._frozen import frozen
 from ...formatting import Table
 from ...messages import escape_control_characters
 
@@ -45,7 +45,7 @@ class Line(NamedTuple):
     style: str = ""
 
 
-@dataclass(frozen=True)
+@frozen
 class Block:
     """Part of a screen: texts or a table."""
 
@@ -62,7 +62,7 @@ class Block:
     is_verbatim: bool = False  # Whether the texts are to be copied, so that no line of them is folded
 
 
-@dataclass(frozen=True)
+@frozen
 class Screen:
     """Result of a command as it is shown."""
 

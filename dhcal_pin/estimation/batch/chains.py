@@ -12,10 +12,11 @@ configurations per sample.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._kernels import cos_sin, perturb_frames, propagate_frames
 from ..._kernels.types import FrameBatch, JointState
 from ..._typing import Array
@@ -25,7 +26,7 @@ from ...robot.error_families import FAMILIES
 from ..error_model import ErrorModel
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class ChainBatch:
     """b chains with the joints and the p error parameters of one model.
 

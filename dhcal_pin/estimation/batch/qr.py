@@ -9,11 +9,11 @@ The formulas are those of `qr`; kernels and NumPy loop over the stack in compile
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._kernels import append_diagonal, solve_triangular
 from ..._typing import Array
 from ..qr import RANK_RTOL
@@ -26,7 +26,7 @@ MAX_CONDITION = 1e-3 / RANK_RTOL
 N_PROBES = 7
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TriangularSystemBatch:
     """R factors of the whitened rows [J | r] of b problems.
 

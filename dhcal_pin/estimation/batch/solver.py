@@ -15,11 +15,12 @@ Shapes: b problems, p unknowns, m samples per problem and measurement, c configu
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._kernels import append_diagonal, factor_jacobian, r_factors
 from ..._kernels.types import twists_before
 from ..._typing import Array
@@ -44,7 +45,7 @@ MAX_LOCKSTEP = 15
 _PADDING_WEIGHT = 1e-40
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BatchProblem:
     """b least-squares problems in p unknown errors of the robot.
 
@@ -207,7 +208,7 @@ def _padded(item: Measurement, count: int) -> Measurement:
     return item.take(indices).with_weights(weights)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BatchResult:
     """Result of `solve_batch`."""
 

@@ -31,10 +31,9 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...measurements.base import Measurement
 from ..problem import CHUNK_SIZE, Problem
@@ -51,7 +50,7 @@ MIN_INFORMATION = 1e-9
 MIN_SCALE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class LinearizedRows:
     """Linearized rows in coordinates y."""
 

@@ -41,9 +41,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+from ..._frozen import frozen
 from ..._typing import PathLike
 from ...exceptions import FileFormatError, UnknownNameError
 from ...messages import quote
@@ -117,7 +117,7 @@ def rotation_keys(convention: str) -> dict[str, Key]:
     }
 
 
-@dataclass(frozen=True)
+@frozen
 class ColumnRule:
     """Rule that makes a column of the project from a column of the vendor: scale * column + offset."""
 
@@ -129,7 +129,7 @@ class ColumnRule:
     offset: float  # Summand, in `unit`
 
 
-@dataclass(frozen=True)
+@frozen
 class Rotation:
     """Notation of a rotation. Keys that the convention does not need are empty."""
 
@@ -141,7 +141,7 @@ class Rotation:
     order: str = ""  # "wxyz" or "xyzw"
 
 
-@dataclass(frozen=True)
+@frozen
 class ColumnMap:
     """Checked content of a column map."""
 

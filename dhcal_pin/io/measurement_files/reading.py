@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, SampleError
 from ...measurements.base import Measurement
@@ -68,7 +69,7 @@ _MIN_SIGMA = 1e-15
 _MAX_NORM_ERROR = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MeasurementFile:
     """Content of a measurement file."""
 

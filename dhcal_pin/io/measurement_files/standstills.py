@@ -15,11 +15,10 @@ Shapes: k joint samples, n joints, p pose samples, m stops.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array
 from ...exceptions import FileFormatError
 
@@ -41,7 +40,7 @@ _MARGIN_SHARE, _MAX_MARGIN_S = 0.15, 0.5
 _MAX_INTERRUPTION_S = 1.0
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class JointSeries:
     """Recorded joint positions."""
 
@@ -50,7 +49,7 @@ class JointSeries:
     q: Array  # Joint positions, shape (k, n) [rad or m]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class PoseSeries:
     """Recorded positions or poses of the tool."""
 
@@ -60,7 +59,7 @@ class PoseSeries:
     frame: str  # Name of the frame that they are measured in
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Stops:
     """Mean joint positions and poses of each stop."""
 

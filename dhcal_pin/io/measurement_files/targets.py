@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ...measurements.pose import Pose
@@ -21,7 +21,7 @@ from .columns import check_columns, check_joint_names, find_kind, value_table
 TARGETS = TextLayout(header_example="x[mm],y[mm],z[mm]")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TargetPoses:
     """Positions or poses that a tool shall reach."""
 

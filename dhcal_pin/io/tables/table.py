@@ -15,13 +15,14 @@ import math
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ...exceptions import DhcalError, FileFormatError, UnknownNameError
 from ...messages import quote
@@ -54,7 +55,7 @@ MAX_LISTED_RUNS = 100
 MEASUREMENT_HEADER = "joint_1[deg],…,x[mm],y[mm],z[mm]"
 
 
-@dataclass(frozen=True)
+@frozen
 class Column:
     """Header entry `name[unit]`."""
 
@@ -74,7 +75,7 @@ class Column:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class DataTable:
     """Table of a file, or of a part of one, with m rows and c columns."""
 

@@ -19,12 +19,13 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
 from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
@@ -52,7 +53,7 @@ _INTEGER = re.compile(r"[+-]?\d+(?:[eE][+-]?\d+)?")
 _DECIMALS = {sign: re.compile(rf"[+-]?(?:\d+\{sign}\d*|\{sign}\d+)(?:[eE][+-]?\d+)?") for sign in ".,"}
 
 
-@dataclass(frozen=True)
+@frozen
 class TextLayout:
     """How a file is divided into cells."""
 

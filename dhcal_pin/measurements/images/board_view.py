@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from ..._frozen import frozen
 from ..._typing import Array
 from ..mounting import MountedRig
 
 
-@dataclass(frozen=True)
+@frozen
 class ViewLimits:
     """Limits of a useful view of a board."""
 

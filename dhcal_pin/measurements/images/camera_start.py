@@ -16,13 +16,13 @@ estimates first values from many subsets of the same images.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array
 from ...cameras.boards import Board
 from ...cameras.hand_eye import choose_poses, mean_pose, solve_hand_eye
@@ -58,7 +58,7 @@ def _remember(function: Callable[[Array, Array], _R]) -> Callable[[Array, Array]
 _agreeing_points = _remember(agreeing_points)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class BoardViews:
     """Boards in images, each from its image alone: the joint values have no influence."""
 
@@ -70,7 +70,7 @@ class BoardViews:
     rms: Array  # RMS distance of its corners in the image with the better one, X/Z and Y/Z, (v,)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Corners:
     """Image coordinates of m corners."""
 

@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ... import se3
+from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...messages import quote
 from ..urdf import MAX_MASS, MAX_ORIGIN, Urdf, parse_urdf, suggest_names, xml_attribute
@@ -48,7 +49,7 @@ _TYPES = {"hinge": "revolute", "slide": "prismatic", "ball": "floating", "free":
 _MIN_NORM = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MjcfTag(XmlTag):
     """Start tag of an element of an MJCF."""
 
@@ -64,7 +65,7 @@ class Place(NamedTuple):
     after: Array  # Pose of the joint frame in the body, shape (4, 4)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Mjcf(Urdf):
     """MJCF that passed all checks, with its translation to a URDF."""
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 from xml.parsers import expat
 
+from ..._frozen import frozen
 from ..._typing import PathLike
 from ...exceptions import FileFormatError
 from ...formatting import format_count
@@ -32,7 +32,7 @@ _ELEMENT = re.compile(rb"<[^ \t\r\n/>]+")
 _ATTRIBUTE = re.compile(rb"""[ \t\r\n]+([^ \t\r\n=/>]+)[ \t\r\n]*=[ \t\r\n]*("[^"]*"|'[^']*')""")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class XmlTag:
     """Start tag of an XML element."""
 

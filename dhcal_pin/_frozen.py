@@ -1,0 +1,101 @@
+"""Frozen dataclasses whose classes are created in a fifth of the time.
+
+`dataclass(frozen=True)` compiles up to six functions per class, which takes 0.15 s for the 200 classes of a
+calibration. `frozen` compiles the constructor only, and all classes share the other functions.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
+from typing import Any, TypeVar, dataclass_transform, overload
+
+_T = TypeVar("_T")
+
+
+@overload
+def frozen(cls: type[_T], /) -> type[_T]: ...
+@overload
+def frozen(*, eq: bool = True) -> Callable[[type[_T]], type[_T]]: ...
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def frozen(cls: Any = None, /, *, eq: bool = True) -> Any:
+    """Make a class a frozen dataclass.
+
+    Args:
+        cls: The class.
+        eq: Whether two objects with equal fields are equal. False for fields that are arrays.
+    """
+    if cls is None:
+        return lambda given: _frozen(given, eq)
+    return _frozen(cls, eq)
+
+
+def _frozen(cls: Any, eq: bool) -> Any:
+    """Make a class a frozen dataclass."""
+    made: Any = dataclass(init=False, repr=False, eq=False)(cls)
+    made.__init__ = _constructor(made)
+    made.__setattr__, made.__delattr__ = _refuse_change, _refuse_change
+    if made.__repr__ is object.__repr__:
+        made.__repr__ = _repr
+    if eq:
+        made._compared_fields = tuple(f.name for f in fields(made) if f.compare)
+        made.__eq__, made.__hash__ = _eq, _hash
+    return made
+
+
+def _constructor(cls: Any) -> Callable[..., None]:
+    """Compile the constructor of a dataclass."""
+    values: dict[str, Any] = {"_set": object.__setattr__, "_missing": MISSING}
+    arguments, lines = ["self"], []
+    for item in fields(cls):
+        name = value = item.name
+        argument = name
+        if item.default is not MISSING:
+            values[f"_default_{name}"] = item.default
+            argument = f"{name}=_default_{name}"
+        elif item.default_factory is not MISSING:
+            values[f"_make_{name}"] = item.default_factory
+            argument, value = f"{name}=_missing", f"_make_{name}() if {name} is _missing else {name}"
+        arguments.append(argument)
+        lines.append(f"_set(self, {name!r}, {value})")
+    if hasattr(cls, "__post_init__"):
+        lines.append("self.__post_init__()")
+    found: dict[str, Any] = {}
+    exec(
+        f"def make({', '.join(values)}):\n"
+        f" def __init__({', '.join(arguments)}):\n  {'; '.join(lines) or 'pass'}\n"
+        " return __init__",
+        vars(sys.modules[cls.__module__]),
+        found,
+    )
+    init = found["make"](**values)
+    init.__qualname__ = f"{cls.__qualname__}.__init__"
+    init.__annotations__ = {item.name: item.type for item in fields(cls)} | {"return": None}
+    return init
+
+
+def _refuse_change(self: Any, name: str, *value: Any) -> None:
+    """Refuse to set or delete an attribute."""
+    raise FrozenInstanceError(f"cannot {'assign to' if value else 'delete'} field {name!r}")
+
+
+def _repr(self: Any) -> str:
+    """Return the class and the fields."""
+    shown = (f"{item.name}={getattr(self, item.name)!r}" for item in fields(self) if item.repr)
+    return f"{type(self).__qualname__}({', '.join(shown)})"
+
+
+def _values(self: Any) -> tuple[Any, ...]:
+    """Return the values of the fields that are compared."""
+    return tuple(map(vars(self).__getitem__, self._compared_fields))
+
+
+def _eq(self: Any, other: object) -> bool:
+    """Return whether another object has the same class and equal fields."""
+    return _values(self) == _values(other) if type(other) is type(self) else NotImplemented
+
+
+def _hash(self: Any) -> int:
+    """Return the hash of the fields."""
+    return hash(_values(self))
