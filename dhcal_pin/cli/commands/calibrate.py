@@ -65,6 +65,9 @@ def _without_collections() -> Iterator[None]:
     try:
         yield
     finally:
+        # All objects become old ones, which are not examined at once.
+        gc.freeze()
+        gc.unfreeze()
         if was_enabled:
             gc.enable()
 
