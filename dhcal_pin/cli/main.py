@@ -52,6 +52,7 @@ class _LazyCommandParser(CommandParser):
     def parse_known_args(self, *args: Any, **options: Any) -> Any:
         """Declare the arguments of the command, then parse. Options may stand between the names of files."""
         self.declare_arguments()
+        self.refuse_unknown_options(args[0])
         found, others = super().parse_known_args(*args, **options)
         last = [action for action in self._actions if not action.option_strings][-1:]
         if others and last and last[0].nargs in ("*", "+") and not any(w.startswith("-") for w in others):

@@ -15,8 +15,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from ..messages import message_line
@@ -43,14 +44,38 @@ class CommandParser(argparse.ArgumentParser):
     """Argument parser that reports an error in one line and takes -300mm and -1,2,3mm as values."""
 
     def __init__(self, *args: Any, **options: Any):
-        super().__init__(*args, **options)
+        super().__init__(*args, allow_abbrev=False, **options)
         # argparse takes a word with a minus sign for a value only if this pattern matches it.
         self._negative_number_matcher = re.compile(r"-\.?\d")
+
+    def refuse_unknown_options(self, words: Sequence[str]) -> None:
+        """Report the first unknown option with two hyphens, before options that are missing."""
+        for word in takewhile(lambda word: word != "--", words):
+            name = word.partition("=")[0]
+            if name.startswith("--") and " " not in word and name not in self._option_string_actions:
+                self.error(f"unrecognized arguments: {name}{_suggestion(name, self._option_string_actions)}")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Suggest a choice in place of a misspelt one."""
+        choices = action.choices
+        if choices and value not in choices and (text := _suggestion(str(value), choices)):
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}{text}")
+        super()._check_value(action, value)
 
     def error(self, message: str) -> NoReturn:
         """Print one line to stderr and exit with status 2."""
         print(f"{self.prog}: {message_line(message)}; see {self.prog} --help", file=sys.stderr)
         sys.exit(2)
+
+
+def _suggestion(word: str, known: Iterable[str]) -> str:
+    """Name the words that begin with an unknown one, or the most similar ones."""
+    from difflib import get_close_matches  # lazy import: only for errors
+
+    # Hyphens would count as similarity.
+    word, names = word.lstrip("-")[:100], {name.lstrip("-"): name for name in known}
+    near = [name for name in names if name.startswith(word)] or get_close_matches(word, names, 1)
+    return f" (did you mean {' or '.join(names[name] for name in near[:3])}?)" if near else ""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

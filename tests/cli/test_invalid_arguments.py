@@ -11,8 +11,17 @@ from robots import URDF
 
 ARGUMENTS = {
     "no command": ([], ["COMMAND", "--help"]),
-    "unknown command": (["calibrat"], ["'calibrat'", "calibrate", "--help"]),
-    "unknown option": ([*CALIBRATE, "--speed", "9"], ["--speed", "--help"]),
+    "unknown command": (["calibrat"], ["'calibrat' (did you mean calibrate?)", "--help"]),
+    "unlike any command": (["foo"], ["'foo'", "calibrate", "--help"]),
+    "unknown option": ([*CALIBRATE, "--xyz", "9"], ["--xyz; see dhcal calibrate --help"]),
+    "abbreviated option": ([*CALIBRATE, "--tool", "f"], ["--tool (did you mean --tool-frame?)"]),
+    "abbreviated options": ([*CALIBRATE, "--re=1"], ["--re (did you mean", " or --report"]),
+    "misspelt option": ([*CALIBRATE, "--methid", "gn"], ["--methid (did you mean --method?)"]),
+    "misspelt required option": (
+        [*CALIBRATE[:-2], "--ouput", "out.urdf"],
+        ["--ouput (did you mean --output?)"],
+    ),
+    "misspelt choice": ([*CALIBRATE, "--arm", "lowcost"], ["'lowcost' (did you mean low-cost?)"]),
     "no output": (["calibrate", "arm.dh.toml", "data.csv"], ["-o", "required", "dhcal calibrate --help"]),
     "no data": (["calibrate", "arm.dh.toml", "-o", "out.urdf"], ["DATA", "required"]),
     "no such robot": (["calibrate", "no.urdf", "data.csv", "-o", "out.urdf"], ["no.urdf", "No such file"]),
