@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
@@ -59,12 +60,19 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
         raise FileFormatError(
             f"{path}: the file is larger than {size_text(max_bytes)}; check the path or shorten the file"
         )
+    return decode_text(path, data, encoding)
+
+
+def decode_text(path: PathLike, data: bytes, encoding: str = "utf-8", first_line: int = 1) -> str:
+    """Decode a text file, or a part of it from a line on."""
     try:
         return data.decode(encoding).removeprefix("\ufeff")
     except UnicodeError as error:
-        name = encoding.upper()
-        where = f"byte {error.start}" if isinstance(error, UnicodeDecodeError) else "the text"
-        raise FileFormatError(f"{path}: {where} is not {name}; save the file as {name}") from error
+        name, start = encoding.upper(), getattr(error, "start", 0)
+        line = first_line + data.count(b"\n", 0, start)
+        is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        found = "the file is UTF-16," if is_utf16 else f"byte 0x{data[start : start + 1].hex()} is"
+        raise FileFormatError(f"{path}:{line}: {found} not {name}; save the file as {name}") from error
 
 
 def size_text(size: int) -> str:

@@ -121,3 +121,6 @@ def test_wrong_streams_are_named(laser, tmp_path, sim_6dof, sim_6dof_actual):
     path.write_text("\n".join(lines))
     with pytest.raises(DhcalError, match=rf"laser\.csv:{number + 1}: column 'joint_1'"):
         calibrate_stream(sim_6dof, partial(iter_measurements, path, sim_6dof, 64), "dh")
+    path.write_bytes(path.read_bytes().replace(b"\nx", b"\n\xfc"))
+    with pytest.raises(DhcalError, match=rf"laser\.csv:{number + 1}: byte 0xfc is not UTF-8; save"):
+        calibrate_stream(sim_6dof, partial(iter_measurements, path, sim_6dof, 64), "dh")

@@ -23,9 +23,13 @@ DATA = {
     "empty": ("", ["data.csv: is empty", "x[mm]"]),
     "only comments": ("# nothing\n\n", ["data.csv: is empty"]),
     "header only": (HEADER + "\n", ["data.csv: no rows", "line 1"]),
-    "not UTF-8": (
+    "UTF-16": (
         b"\xff\xfe" + positions_csv(4).encode("utf-16-le"),
-        ["data.csv: byte 0 is not UTF-8", "save"],
+        ["data.csv:1: the file is UTF-16, not UTF-8; save the file as UTF-8"],
+    ),
+    "Latin-1": (
+        positions_csv(4).encode() + b"# 20 \xb0C\n",
+        ["data.csv:6: byte 0xb0 is not UTF-8; save the file as UTF-8"],
     ),
     "unknown column": (
         with_column("weather", [1, 2]),

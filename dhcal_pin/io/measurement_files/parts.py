@@ -8,12 +8,11 @@ from functools import partial
 
 from ..._typing import PathLike
 from ...estimation.problem import CHUNK_SIZE
-from ...exceptions import FileFormatError
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..tables import parse_lines
 from ..tables.text import BLANK_CHARACTERS
-from ..tabular import unreadable
+from ..tabular import decode_text, unreadable
 from .columns import with_known_spelling
 from .reading import parse_measurements
 
@@ -52,7 +51,7 @@ def iter_measurements(
                 if not line.strip(blank) or line.lstrip().startswith(b"#"):
                     continue
                 if header is None:
-                    header = line_number, line.decode("utf-8-sig").rstrip("\r\n")
+                    header = line_number, decode_text(source, line, first_line=line_number).rstrip("\r\n")
                     start, first_line = end, line_number + 1
                     continue
                 count += 1
@@ -61,8 +60,6 @@ def iter_measurements(
                     start, first_line, count = end, line_number + 1, 0
     except OSError as error:
         raise unreadable(source, error) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{source}: the header is not UTF-8; save the file as UTF-8") from error
     # A file without rows has one empty part, so that reading it raises the error.
     if header is not None and (count or first_line == header[0] + 1):
         yield partial(_read_part, source, chain, header, first_line, start, end)
@@ -75,10 +72,6 @@ def _read_part(
     with open(source, "rb") as file:
         file.seek(start)
         data = file.read(end - start)
-    try:
-        lines = data.decode().splitlines()
-    except UnicodeDecodeError as error:
-        position = start + error.start
-        raise FileFormatError(f"{source}: byte {position} is not UTF-8; save the file as UTF-8") from error
+    lines = decode_text(source, data, first_line=first_line).splitlines()
     table = parse_lines(source, [header, *enumerate(lines, first_line)])
     return parse_measurements(with_known_spelling(table, chain), chain).fit
