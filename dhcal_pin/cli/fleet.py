@@ -33,7 +33,6 @@ from .._typing import PathLike
 from ..exceptions import DhcalError, FileFormatError, InvalidArgumentError
 from ..io import toml_table as toml
 from ..io.robot import robot_name
-from ..io.shipped_files import resolve_robot_file
 from ..io.sidecar import sidecar_path
 from ..io.tabular import csv_text
 from ..io.toml_table import Key, TomlTable
@@ -42,7 +41,7 @@ from ..parallel import end_with_parent
 from .bundled_job import run_any_job
 from .job import DOUBTFUL, Job, option_flags
 from .job_outputs import ROBOT_FORMATS, companion_paths
-from .options import STDOUT, IntegerType
+from .options import STDOUT, IntegerType, find_robot
 from .outputs import forget_written_files, require_writable_outputs, write_outputs, written_files
 from .screens import console
 from .screens.screen import Block, Screen
@@ -99,7 +98,7 @@ def read_fleet(path: PathLike) -> list[FleetJob]:
                 raise FileFormatError(
                     f"{job_table.where}: {key} is missing; every [[job]] needs robot, data and output"
                 )
-        options["robot"] = resolve_robot_file(options["robot"])
+        options["robot"] = find_robot(options["robot"])
         job = Job(**options)
         entries.append(FleetJob(str(name or robot_name(job.robot)), job))
     _require_distinct_files(entries, path)

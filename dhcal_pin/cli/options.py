@@ -116,13 +116,24 @@ POSITIVE_INTEGER = IntegerType(1)
 NON_NEGATIVE_INTEGER = IntegerType(0)
 
 
+def find_robot(text: str) -> str:
+    """Return the path of a robot file, also for `example:NAME` and for a robot that ships, and say which."""
+    from ..io.shipped_files import resolve_robot_file  # lazy import, as the following: only for robots
+    from ..ros_packages import EXAMPLE_PREFIX
+
+    path = resolve_robot_file(text)
+    if path != text and not text.startswith(EXAMPLE_PREFIX):
+        line = f"{text} is not in this folder; the file that ships with dhcal is used: {path}"
+        print(message_line(line), file=sys.stderr)
+    return path
+
+
 def robot_path(text: str) -> str:
-    """Return the path of a robot file, also for `example:NAME` and for a robot that ships."""
-    from ..exceptions import UnknownNameError  # lazy import, as the following: only for robots
-    from ..io.shipped_files import resolve_robot_file
+    """Find a robot file for argparse."""
+    from ..exceptions import UnknownNameError  # lazy import: only for robots
 
     try:
-        return resolve_robot_file(text)
+        return find_robot(text)
     except UnknownNameError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
 

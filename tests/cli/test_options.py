@@ -7,7 +7,7 @@ from argparse import ArgumentTypeError
 import pytest
 
 from dhcal_pin.cli.main import build_parser
-from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders, split_commas
+from dhcal_pin.cli.options import PLACEHOLDERS, IntegerType, expand_placeholders, robot_path, split_commas
 from dhcal_pin.estimation import LOSSES, PARAMETER_SETS, Loss
 from dhcal_pin.estimation.parameters import EXTENSIONS
 from dhcal_pin.io import FORMATS
@@ -94,3 +94,15 @@ def test_words_without_a_meaning_are_refused(words, capsys):
     err = capsys.readouterr().err
     assert "unrecognized arguments" in err
     assert err.endswith(f"; see dhcal {words.split()[0]} --help\n")
+
+
+def test_a_robot_that_ships_is_named(tmp_path, monkeypatch, capsys):
+    """A file of this name in the folder is taken without a message."""
+    monkeypatch.chdir(tmp_path)
+    path = robot_path("flange.urdf")
+    line = f"flange.urdf is not in this folder; the file that ships with dhcal is used: {path}\n"
+    assert capsys.readouterr().err == line
+    (tmp_path / "flange.urdf").touch()
+    assert robot_path("flange.urdf") == "flange.urdf"
+    assert robot_path("example:ur10").endswith("ur10_robot.urdf")
+    assert capsys.readouterr().err == ""
