@@ -259,7 +259,9 @@ def _add_self_collision_pairs(chain: Chain, geometry: Any) -> None:
 
 def _always_colliding_pairs(chain: Chain, geometry: Any, margin: float = 0.0) -> set[tuple[int, int]]:
     """Return the pairs that collide at the neutral configuration and in the middle of the joint limits."""
-    low, high = (np.clip(limit, -np.pi, np.pi) for limit in (chain.lower, chain.upper))
+    # Joints with wider or without limits count with the turn about zero, or the one nearest to it.
+    low = np.maximum(chain.lower, np.minimum(-np.pi, chain.upper - 2 * np.pi))
+    high = np.minimum(chain.upper, np.maximum(np.pi, chain.lower + 2 * np.pi))
     middle = chain.configurations((low + high)[None] / 2)[0]
     found = []
     for configuration in (pin.neutral(chain.model), middle):

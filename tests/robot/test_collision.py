@@ -87,6 +87,17 @@ def test_the_tool_is_checked_too():
     assert CollisionChecker.from_chain(arm(), [beyond]).is_collision_free(np.zeros(3))
 
 
+def test_middle_of_limits_beyond_half_a_turn():
+    """A bar to both sides of the elbow collides with the column at 0 and pi, but not at 4.75 rad."""
+    text = arm().urdf.data.decode().split('<link name="lower">')
+    lower = text[1].replace('xyz="0.25 0 0"', 'xyz="0 0 0"').replace("0.5", "1.1", 1)
+    lower = lower.replace('lower="-3" upper="3"', 'lower="3.5" upper="6"')
+    chain = Chain.from_urdf(parse_urdf('<link name="lower">'.join([text[0], lower]).encode(), "r"))
+    checker = CollisionChecker.from_chain(chain)
+    assert checker.is_collision_free(np.array([0.0, 0.0, 4.75]))
+    assert not checker.is_collision_free(np.array([0.0, 0.0, np.pi]))
+
+
 @pytest.mark.parametrize("height", [0.0, 0.3])
 def test_line_of_sight_counts_in_the_frame_of_the_chosen_root(height):
     """Instrument and tool are given in the frame of the turret, 0.3 m above that of the obstacles."""
