@@ -17,6 +17,7 @@ from .frames import frames_differ as frames_differ
 from .input_checks import find_input_warnings as find_input_warnings
 from .input_checks import find_unstated_conditions as find_unstated_conditions
 from .input_checks import find_value_warnings as find_value_warnings
+from .input_checks import fitted_warning as fitted_warning
 from .input_checks import poorly_fitted_files as poorly_fitted_files
 from .inspection import ColumnSummary as ColumnSummary
 from .inspection import FileInspection as FileInspection

@@ -19,6 +19,8 @@ from ..estimation.parameters import PARAMETER_SETS
 from ..exceptions import FileFormatError
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
+from ..io.measurement_files.fitted_rows import count_fitted_rows
+from ..io.sidecar import Fitted
 from ..measurements.base import Measurement
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..measurements.groups import ERROR_GROUPS, error_group
@@ -42,6 +44,8 @@ _MIN_SPREAD_RATIO = 5.0
 _MAX_PAYLOAD = 2500.0
 # A joint may exceed its limits by this much without a warning [rad or m]; controllers round.
 _LIMIT_SLACK = 1e-3
+# Warning about a file that the calibration fitted.
+_FITTED_WARNING = "by the calibration of this robot; other measurements have larger errors"
 # Largest median error of image coordinates after a fit that gets no warning [px].
 _MAX_CALIBRATED_PX = 10.0
 # Larger standard deviations mean a wrong unit: no instrument is so coarse [m], [rad].
@@ -77,6 +81,15 @@ def find_input_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         # Implausible values explain why measurements do not fit the robot; copied rows do not.
         return values
     return [*_check_fit(chain, file), *repeated]
+
+
+def fitted_warning(item: Measurement, digest: str, fitted: Fitted) -> list[str]:
+    """Return a warning about a file with rows that the calibration fitted."""
+    if count := count_fitted_rows(item, fitted.rows):
+        n_rows = len(item.rows)
+        rows = f"row{'' if n_rows == 1 else 's'} {'was' if count == 1 else 'were'}"
+        return [f"{count} of {n_rows} {rows} fitted {_FITTED_WARNING}"]
+    return [f"was fitted, all of it or a part, {_FITTED_WARNING}"] if digest in fitted.files else []
 
 
 def find_unstated_conditions(

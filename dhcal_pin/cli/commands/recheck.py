@@ -12,7 +12,6 @@ from ... import diagnostics, io, report, session
 from ...exceptions import InvalidArgumentError
 from .. import options, screens
 from ..output_table import Makers, Output
-from .validate import fitted_warning
 
 if TYPE_CHECKING:
     from ...robot import Chain
@@ -142,7 +141,7 @@ def _with_fitted_rows(
     return {
         file.source: [
             *mistakes.get(file.source, ()),
-            *fitted_warning(file.data, digests.get(file.source, ""), fitted),
+            *diagnostics.fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
         for file in files
     }

@@ -14,8 +14,6 @@ from ..output_table import Makers, Output
 if TYPE_CHECKING:
     from ...measurements import MeasuredRegion, Measurement, MountedRig
 
-# Warning about a file that the calibration fitted.
-FITTED_WARNING = "by the calibration of this robot; other measurements have larger errors"
 EXAMPLE = "dhcal validate ur10_calibrated.urdf other.csv --tip tool0 --nominal ur10.urdf --fit-frames"
 
 # Base and tool of two robots are the same if no entry of their poses differs by more than this.
@@ -327,7 +325,7 @@ def _input_warnings(
         warnings[file.source] = [
             *diagnostics.find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
-            *fitted_warning(file.data, digests.get(file.source, ""), fitted),
+            *diagnostics.fitted_warning(file.data, digests.get(file.source, ""), fitted),
         ]
     if args.nominal and not sidecar and (other := io.existing_sidecar(args.nominal)):
         warnings[args.nominal] = [
@@ -341,17 +339,6 @@ def _input_warnings(
     elif args.fit_frames and args.iso9283:
         warnings[args.robot] = [diagnostics.ISO_FITTED_WARNING]
     return warnings
-
-
-def fitted_warning(item: Measurement, digest: str, fitted: io.Fitted) -> list[str]:
-    """Return a warning about a file with rows that the calibration fitted."""
-    from ...io.measurement_files.fitted_rows import count_fitted_rows  # lazy import: loads Pinocchio
-
-    if count := count_fitted_rows(item, fitted.rows):
-        n_rows = len(item.rows)
-        rows = f"row{'' if n_rows == 1 else 's'} {'was' if count == 1 else 'were'}"
-        return [f"{count} of {n_rows} {rows} fitted {FITTED_WARNING}"]
-    return [f"was fitted, all of it or a part, {FITTED_WARNING}"] if digest in fitted.files else []
 
 
 def _predictor(chain: robot.Chain, sidecar: str | None, args: Namespace) -> estimation.Predictor:
