@@ -327,11 +327,13 @@ def _reversed_directions(fit: Evidence) -> list[Finding]:
     ]
     if not names:
         return []
-    text = f"The backlash of {join_names(names)} is negative, which is impossible: the directions of approach"
-    columns = "The columns approach_JOINT are 1 if the joint moved towards larger values before it stopped."
-    return [
-        Finding("caution", f"{text} of {'these joints' if len(names) > 1 else 'it'} are reversed. {columns}")
-    ]
+    text = (
+        f"The backlash of {join_names(names)} is negative, which is impossible: the directions of approach "
+        f"of {'these joints' if len(names) > 1 else 'this joint'} are reversed. Columns approach_JOINT are 1 "
+        "if the joint moved towards larger values before it stopped. Without these columns the directions "
+        "follow from the order of the rows, which must be that of measurement."
+    )
+    return [Finding("caution", text)]
 
 
 def _mixups(diagnosis: Diagnosis) -> list[Finding]:

@@ -193,7 +193,9 @@ def test_samples_approached_from_the_other_side_are_no_outliers(order, seed):
     turned = data.recorded.approach * np.where(np.arange(6) == 1, -1, 1)
     reversed_fit = calibrate(arm, data.replace(recorded=replace(data.recorded, approach=turned)))
     assert reversed_fit.verdict.status == "caution"
-    assert any("backlash of shoulder_lift_joint is negative" in text for text in reversed_fit.verdict.reasons)
+    (reason,) = (text for text in reversed_fit.verdict.reasons if "shoulder_lift_joint is negative" in text)
+    assert "approach_JOINT" in reason
+    assert "the order of the rows, which must be that of measurement" in reason
     more = measured(200, 1e-9, rng.choice([-1.0, 1.0], 200))
     assert fit.validate(more)["position_rms_m"] < 1e-4
 
