@@ -773,6 +773,6 @@ def _sentence(group: list[Hypothesis]) -> str:
     what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {part} {verb}"
     if best.unit == "m" and best.angle > max(LARGE_TURN, 5 * best.angle_std):
         size += f" and turned by {format_quantity(best.angle, 'rad', best.angle_std)}"
-    expected = ", as expected if the instrument was set up anew" if best.kind == "base" else ""
+    like = ", as after a new set-up of the instrument" if best.kind == "base" else ""
     rivals = " or ".join(each.name for each in others)
-    return f"{what} by {size}{expected}." + (f" The same effect has a change of {rivals}." if rivals else "")
+    return f"{what} by {size}{like}." + (f" The same effect has a change of {rivals}." if rivals else "")

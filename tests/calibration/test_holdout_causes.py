@@ -45,6 +45,8 @@ def test_a_change_before_the_hold_out_samples_is_named(what, changes, seed):
     text = text_of(calibrate(sim.chain, fitted, holdout=holdout))
     # Hold-out samples may be of another set-up of the instrument.
     assert what in text.replace("The base or the instrument", "The base")
+    # Nothing says whether the instrument was set up anew.
+    assert (", as after a new set-up of the instrument." in text) == ("base" in what)
     assert "Measure all regions" not in text
     # The advice: both together.
     both = calibrate(sim.chain, [fitted, holdout])

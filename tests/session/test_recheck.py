@@ -131,6 +131,7 @@ def test_large_changes_have_the_right_size():
     assert first.kind == "base"
     assert abs(first.size - 0.05) < 4 * first.std + 1e-5
     assert result.reasons[0].startswith("The base or the instrument moved by ")
+    assert result.reasons[0].endswith(", as after a new set-up of the instrument.")
 
 
 def test_a_turn_about_the_first_axis_names_joint_and_base():
