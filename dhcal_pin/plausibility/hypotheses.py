@@ -485,7 +485,11 @@ def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Meas
                 if first in by_key or _change_of_zero(chain, first):
                     return mend_files(chain, mend_files(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
-            raise UnknownNameError(f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}")
+            kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), "lag", "scale"])
+            raise UnknownNameError(
+                f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}; kinds of changes are "
+                f"{', '.join(kinds)}"
+            )
         change = by_key[key].change
     changed = Hypothesis(key, "", change).apply(data)
     if changed is None:
