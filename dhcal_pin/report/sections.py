@@ -60,6 +60,7 @@ def _accuracy_section(context: ReportContext) -> Section:
             "No parameter of the arm was estimated: before and after are errors of the same arm, with frames "
             "and instruments fitted in both."
         ]
+    sentences.append("All errors contain the noise of the instrument.")
     if generalization.region_holdout:
         sentences.append(_region_sentence(generalization))
         if generalization.region_holdout not in comparisons:

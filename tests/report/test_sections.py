@@ -40,6 +40,10 @@ def test_outliers_are_listed_with_file_row_and_size(sim_3dof, quick):
     assert "laser.csv: x" in text
 
 
+def test_accuracy_is_said_to_contain_the_noise(fit, quick):
+    assert "All errors contain the noise of the instrument." in as_markdown(ReportContext(fit, Provenance()))
+
+
 def joint_section(fit) -> Section:
     sections = sections_of(ReportContext(fit, Provenance()), "html")
     return next(section for section in sections if section.key == "joints")
