@@ -47,7 +47,6 @@ from .partition import (
     blocked_folds,
     configuration_groups,
     contact_groups,
-    different_configurations,
 )
 
 # A fold does not determine the held-out errors if uncertain parameters contribute more to them than this, in
@@ -304,16 +303,17 @@ def estimate_generalization(
     inside: FoldComparison | None,
     region: MeasuredRegion | None,
     region_comparison: Comparison | None,
+    configurations: tuple[Array, Array],
+    folds: tuple[Fold, ...],
 ) -> Generalization:
     """Estimate the accuracy within the measured region, from random folds, and beyond it."""
-    q, samples = different_configurations(fit.inliers)
+    q, samples = configurations
     has_few = 1 < len(q) < MIN_SAMPLES
     beyond = None
     inside_reason = "too few samples" if has_few else "all samples have the same joint values"
     beyond_reason = inside_reason if len(q) else "the samples have no joint values"
     if inside is not None and not has_few:
         inside_reason = "" if inside.is_determined else "too few samples"
-    folds = region_folds(fit) if len(q) else ()
     if folds and not has_few:
         beyond = compare_folds(fit, folds, "region hold-out")
         beyond_reason = _unknown_reason(fit, beyond, q, samples_held_out(folds, samples))
@@ -339,9 +339,11 @@ def region_folds(fit: FittedModel) -> tuple[Fold, ...]:
     return ()
 
 
-def measured_region(fit: FittedModel) -> MeasuredRegion | None:
-    """Describe the region of joint space of the inliers."""
-    q, samples = different_configurations(fit.inliers)
+def measured_region(
+    fit: FittedModel, configurations: tuple[Array, Array], folds: tuple[Fold, ...]
+) -> MeasuredRegion | None:
+    """Describe the region of joint space of the inliers, of which folds leave out parts."""
+    q, samples = configurations
     if not len(q) or not fit.has_joint_values:
         return None
     region = MeasuredRegion.from_configurations(q, fit.chain.is_prismatic)
@@ -349,7 +351,6 @@ def measured_region(fit: FittedModel) -> MeasuredRegion | None:
     if len(known) == len(fit.inliers) and (stated := [each for each in known if each is not None]):
         masses = np.concatenate(stated)
         region = replace(region, payloads=(float(masses.min()), float(masses.max())))
-    folds = region_folds(fit)
     return region.with_reach(q, samples_held_out(folds, samples)) if folds else region
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from .. import plausibility
 from .._frozen import frozen
 from .._typing import Array, Progress
+from ..estimation.folds import Fold
 from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import CHUNK_SIZE
 from ..estimation.qr import TriangularSystem, rank
@@ -30,6 +31,7 @@ from .cross_validation import (
     compare_folds,
     estimate_generalization,
     measured_region,
+    region_folds,
 )
 from .evaluation import (
     Accuracy,
@@ -41,7 +43,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, different_configurations, k_fold
+from .partition import configuration_groups, k_fold
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
@@ -302,7 +304,9 @@ class Evidence(FittedModel):
     @cached_property
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
-        return estimate_generalization(self, self.random_folds, self.measured_region, self.region_comparison)
+        region, comparison = self.measured_region, self.region_comparison
+        configurations, folds = self._different_configurations, self._region_folds
+        return estimate_generalization(self, self.random_folds, region, comparison, configurations, folds)
 
     @cached_property
     def position_std(self) -> float:
@@ -310,7 +314,7 @@ class Evidence(FittedModel):
 
         The configurations are within the measured ranges of the joints.
         """
-        q, _ = different_configurations(self.inliers)
+        q, _ = self._different_configurations
         if (region := self.measured_region) is not None:
             # The errors of joints grow beyond their measured ranges, whatever is measured.
             q = np.clip(region.draw(np.random.default_rng(0), N_PREDICTED), region.lower, region.upper)
@@ -319,7 +323,12 @@ class Evidence(FittedModel):
     @cached_property
     def measured_region(self) -> MeasuredRegion | None:
         """Region of joint space around the fitted configurations; None without joint values."""
-        return measured_region(self)
+        return measured_region(self, self._different_configurations, self._region_folds)
+
+    @cached_property
+    def _region_folds(self) -> tuple[Fold, ...]:
+        """Folds that leave out regions of joint space; empty without different joint values."""
+        return region_folds(self) if len(self._different_configurations[0]) else ()
 
     def _compare_holdout(self) -> Comparison:
         """Compare the accuracy before and after on the hold-out samples."""

@@ -124,15 +124,20 @@ class FittedModel:
         """Values of the instrument parameters that fit `nominal_refitted` best, by name [m or rad]."""
         return self._nominal[1]
 
-    @property
+    @cached_property
     def inlier_problem(self) -> Problem:
         """`problem` without rejected samples; its measurements correspond to `inliers`."""
         return self.problem.with_data(self._without_rejected(self.problem.data))
 
-    @property
+    @cached_property
     def inliers(self) -> list[Measurement]:
         """Fitted measurements without rejected samples."""
         return self._without_rejected(self.data)
+
+    @cached_property
+    def _different_configurations(self) -> tuple[Array, Array]:
+        """Different configurations of the inliers, (m, n) [rad or m], and the number of a sample of each."""
+        return different_configurations(self.inliers)
 
     def _without_rejected(self, data: Sequence[Measurement]) -> list[Measurement]:
         """Remove the samples of zero weight from measurements that correspond to `data`."""
@@ -408,7 +413,7 @@ class FittedModel:
             return uncertainty
         null_space = np.concatenate([of_all(self._system_at_x.null_space), held_axes], 1)
         undetermined = Uncertainty.from_errors(errors, x, self.chain, null_space, null_space[:, :0])
-        q, _ = different_configurations(self.inliers)
+        q, _ = self._different_configurations
         return separate_frames(uncertainty, undetermined.sqrt_covariance, q)
 
     @property

@@ -51,6 +51,18 @@ def _merge_groups(labels: Array, others: Array) -> Array:
 
 def configuration_groups(data: Sequence[Measurement]) -> Array:
     """Label the samples of measurements, those of the same configuration by the same label."""
+    if len(data) != 1:
+        return _find_groups(data)
+    # Labels of one measurement are kept with it: many parts of a calibration need them.
+    known = vars(data[0])
+    if "configuration_groups" not in known:
+        known["configuration_groups"] = _find_groups(data)
+        known["configuration_groups"].flags.writeable = False
+    return known["configuration_groups"]
+
+
+def _find_groups(data: Sequence[Measurement]) -> Array:
+    """Label the samples of measurements by their configuration."""
     # Labels are numbered in the order of the joint values. A sample with several configurations, such as a
     # relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
     # distance between points, has a label of its own; these are the last, in the order of their names.
@@ -88,7 +100,14 @@ def _order_of_joint_values(data: Sequence[Measurement]) -> Array:
         keys.append(np.concatenate([q, names], axis=1))
     width = max(key.shape[1] for key in keys)
     padded = [np.pad(key, ((0, 0), (0, width - key.shape[1]))) for key in keys]
-    return np.lexsort(np.concatenate(padded).T[::-1])
+    return _order_of_rows(np.concatenate(padded))
+
+
+def _order_of_rows(rows: Array) -> Array:
+    """Return the order of rows (m, n) by their first values, equal ones by the second values, and so on."""
+    order = np.argsort(rows[:, 0], kind="stable")
+    first = rows[order, 0]
+    return order if np.all(first[1:] > first[:-1]) else np.lexsort(rows.T[::-1])
 
 
 def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
@@ -102,7 +121,7 @@ def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]
     if len(q) == 1:
         return q[0], samples[0]
     rows, of_rows = np.concatenate(q[1:]), np.concatenate(samples)
-    order = np.lexsort(rows.T[::-1])
+    order = _order_of_rows(rows)
     rows, of_rows = rows[order], of_rows[order]
     first = np.unique(group_by_configuration(rows), return_index=True)[1]
     return rows[first], of_rows[first]
@@ -171,7 +190,7 @@ def k_fold(data: Measurement | Sequence[Measurement], count: int, seed: int = 0)
             f"{count} folds: choose from 2 to {n_configurations}, the number of different configurations"
         )
     fold_of = np.random.default_rng(seed).permutation(n_configurations) % count
-    return leave_one_group_out(data, fold_of[labels])
+    return tuple(_by_measurement(data, fold_of[labels] == fold) for fold in range(count))
 
 
 def leave_one_group_out(data: Measurement | Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:

@@ -68,7 +68,8 @@ def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple
         (near,) = np.nonzero(projection[offset:] - projection[:-offset] <= tol * (1 + 1e-6))
         if not near.size:
             break
-        near = near[np.abs(rows[near + offset] - rows[near]).max(1) <= tol]
+        for joint in rows.T:
+            near = near[np.abs(joint[near + offset] - joint[near]) <= tol]
         first.append(near)
         second.append(near + offset)
     return np.concatenate(first), np.concatenate(second)
@@ -86,8 +87,10 @@ def connect_nodes(count: int, first: Array, second: Array) -> Array:
 
 
 def label_by_appearance(labels: Array) -> Array:
-    """Number labels (m,) from 0 in the order of their first appearance."""
-    if np.array_equal(labels, np.arange(len(labels))):
-        return labels
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse]
+    """Number labels (m,), which are not negative, from 0 in the order of their first appearance."""
+    numbers = np.arange(len(labels))
+    # Of repeated indices the last one counts: the first appearance.
+    first = np.zeros(labels.max(initial=-1) + 1, int)
+    first[labels[::-1]] = numbers[::-1]
+    appearance = first[labels]
+    return (np.cumsum(appearance == numbers) - 1)[appearance]
