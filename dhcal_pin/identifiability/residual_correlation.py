@@ -35,6 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._kernels.work_arrays import work_array
 from .._typing import Array
 from ..estimation.problem import Chunk, Problem
 from ..estimation.qr import TriangularSystem
@@ -110,24 +111,32 @@ def _score_terms(points: Array, residual: Array, effect: Array) -> _ScoreTerms:
     quadratic = np.zeros((len(LENGTHS), n_columns, n_columns))
     for start in range(0, m, BLOCK_SIZE):
         block = np.s_[start : start + BLOCK_SIZE]
-        distances = _squared_distances(points[block], points)
-        kernel = np.exp(distances * (-0.5 / LENGTHS[0] ** 2))
+        # The kernel is symmetric: pairs of different blocks are computed once and counted twice. The effect
+        # needs whole rows.
+        first = 0 if n_columns else start
+        shape = len(points[block]), m - first
+        counts = np.full(shape, 1.0 if n_columns else 2.0)
+        counts[:, :BLOCK_SIZE] = 1.0
+        products = residual[:, block].T @ residual[:, first:] * counts
+        kernel = _squared_distances(points[block], points[first:], work_array("kernel", *shape))
+        is_same = kernel < SAME_CONFIGURATION
+        kernel *= -0.5 / LENGTHS[0] ** 2
+        np.exp(kernel, kernel)
         # Samples of the same configuration may also share noise of the instrument.
-        kernel[distances < SAME_CONFIGURATION] = 0.0
+        kernel[is_same] = 0.0
         for i in range(len(LENGTHS)):
-            if i:
-                # Half the length is the fourth power.
-                np.multiply(kernel, kernel, kernel)
-                np.multiply(kernel, kernel, kernel)
-            square = float(np.vdot(kernel, kernel))
-            sums[i] += np.sum(kernel)
-            squares[i] += square
-            excess[i] += np.vdot(residual[:, block], residual @ kernel.T)
-            variance[i] += 2 * n_components * square
+            sums[i] += np.vdot(kernel, counts)
+            excess[i] += np.vdot(kernel, products)
             if n_columns:
                 product = effect @ kernel.T
                 variance[i] -= 4 * np.vdot(product, product)
                 quadratic[i] += np.tensordot(product, effect[..., block], ((1, 2), (1, 2)))
+            kernel *= kernel
+            square = np.vdot(kernel, counts)
+            squares[i] += square
+            variance[i] += 2 * n_components * square
+            # Half the length is the fourth power.
+            kernel *= kernel
     has_pairs = sums**2 > MIN_PAIRS * squares
     return _ScoreTerms(excess * has_pairs, variance * has_pairs, quadratic * has_pairs[:, None, None])
 
@@ -151,9 +160,9 @@ def _points(q: Array, is_prismatic: Array) -> Array:
     return np.hstack([np.cos(turning), np.sin(turning), sliding[:, std > 0] / std[std > 0]])
 
 
-def _squared_distances(points: Array, others: Array) -> Array:
+def _squared_distances(points: Array, others: Array, out: Array | None = None) -> Array:
     """Return the squared distances (b, m) of points (b, d) from others (m, d)."""
-    out = points @ (-2 * others.T)
+    out = np.matmul(points, -2 * others.T, out)
     out += np.sum(others**2, 1)
     out += np.sum(points**2, 1)[:, None]
     return out

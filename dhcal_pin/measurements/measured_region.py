@@ -32,7 +32,9 @@ MAX_DISTANCES = 1000
 # Number of random configurations from which the covered share of the joint space is computed.
 N_CONFIGURATIONS = 2000
 # Distances are computed for this many configurations at once; those to 200 others then stay in the cache.
-_CHUNK_SIZE = 128
+_CHUNK_SIZE = 256
+# Rounding error of a squared distance of points, relative to their squared distances from the origin.
+_ROUNDING = 1e-9
 
 
 @frozen(eq=False)
@@ -84,19 +86,36 @@ class MeasuredRegion:
 
     def distances(self, q: Array) -> Array:
         """Compute the distances of configurations from the nearest one that represents the region."""
+        # Points are no farther apart than their configurations: only the nearest points are compared.
         centres, out = self.configurations, np.empty(len(q))
+        of_centres = self._points(centres)
+        sizes = np.sum(of_centres**2, 1)
         for start in range(0, len(q), _CHUNK_SIZE):
             part = q[start : start + _CHUNK_SIZE]
-            squares = np.zeros((len(part), len(centres)))
-            for joint, spread in enumerate(np.maximum(self.spread, MIN_SPREAD)):
-                difference = part[:, None, joint] - centres[None, :, joint]
-                if not self.is_prismatic[joint]:
-                    turns = difference / (2 * np.pi)
-                    difference -= np.multiply(np.rint(turns, out=turns), 2 * np.pi, out=turns)
-                difference /= spread
-                squares += np.square(difference, out=difference)
-            out[start : start + _CHUNK_SIZE] = np.sqrt(squares.min(1))
+            points = self._points(part)
+            own_sizes = np.sum(points**2, 1)[:, None]
+            bounds = points @ (-2 * of_centres.T) + sizes + own_sizes
+            squares = self._squared_distances(part, centres[bounds.argmin(1)])
+            limits = squares[:, None] + _ROUNDING * (1 + own_sizes + sizes.max())
+            row, centre = np.divmod(np.flatnonzero(bounds <= limits), len(centres))
+            np.minimum.at(squares, row, self._squared_distances(part[row], centres[centre]))
+            out[start : start + _CHUNK_SIZE] = np.sqrt(squares)
         return out
+
+    def _points(self, q: Array) -> Array:
+        """Return the points (cos q, sin q) of revolute and q of prismatic joints, divided by the spreads."""
+        turning, sliding = ~self.is_prismatic, self.is_prismatic
+        spread = np.maximum(self.spread, MIN_SPREAD)
+        return np.hstack(
+            [f(q[:, turning]) / spread[turning] for f in (np.cos, np.sin)] + [q[:, sliding] / spread[sliding]]
+        )
+
+    def _squared_distances(self, q: Array, others: Array) -> Array:
+        """Compute the squared distance of each configuration from another one."""
+        difference = q - others
+        turns = np.rint(difference / (2 * np.pi))
+        difference -= np.where(self.is_prismatic, 0.0, turns * (2 * np.pi))
+        return np.sum(np.square(difference / np.maximum(self.spread, MIN_SPREAD)), 1)
 
     def contains(self, q: Array) -> Array:
         """Check which configurations are in the region."""
