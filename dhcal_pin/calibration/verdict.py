@@ -663,6 +663,8 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
 
 def _fitted_holdout(fit: Evidence) -> list[Finding]:
     """Advise caution if hold-out samples are fitted ones."""
+    if not fit.holdout:
+        return []
     digests, count = fitted_row_digests(fit.data), sum(len(item.rows) for item in fit.holdout)
     n_fitted = sum(count_fitted_rows(item, digests) for item in fit.holdout)
     if n_fitted <= MAX_FITTED_SHARE * count:

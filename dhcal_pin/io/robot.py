@@ -362,7 +362,9 @@ def urdf_files(
     is_replaced = existing_sidecar(path) is not None
     # The sidecar of an MJCF belongs to its translation.
     hashed = urdf.data if isinstance(urdf, Mjcf) else data
-    sidecar = sidecar_text(chain, tool, hashed, findings, additions, required=is_replaced)
+    if isinstance(urdf, Mjcf) or hashed != urdf.data:
+        urdf = parse_urdf(hashed, "")
+    sidecar = sidecar_text(chain, tool, urdf, findings, additions, required=is_replaced)
     if sidecar is not None:
         contents[sidecar_path(path)] = sidecar
     return contents

@@ -124,7 +124,7 @@ from ..robot.transmission import (
     n_coefficients,
     split_coefficients,
 )
-from ..robot.urdf import Urdf, parse_urdf, suggest_names
+from ..robot.urdf import Urdf, suggest_names
 from ..saving import complete_interrupted_save
 from . import toml_table as toml
 from .rig_file import rig_content
@@ -415,10 +415,10 @@ def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str
         )
 
 
-def _manifest_content(data: bytes, tip: str, fitted: Fitted) -> dict[str, Any]:
+def _manifest_content(urdf: Urdf, tip: str, fitted: Fitted) -> dict[str, Any]:
     """Return the table [manifest] for a URDF that is written with the sidecar."""
-    urdf = parse_urdf(data, "")
-    content = {"urdf_sha256": hashlib.sha256(data).hexdigest(), "joints_sha256": _joints_digest(urdf, tip)}
+    digest = hashlib.sha256(urdf.data).hexdigest()
+    content = {"urdf_sha256": digest, "joints_sha256": _joints_digest(urdf, tip)}
     content |= {"fitted_sha256": list(fitted.files)} if fitted.files else {}
     return content | ({"fitted_rows": _encode(fitted.rows)} if fitted.rows else {})
 
@@ -693,7 +693,7 @@ def _as_rows(data: bytes, n_rows: int, number: str, where: str) -> Array:
 def sidecar_text(
     chain: Chain,
     tool: Array,
-    urdf: bytes,
+    urdf: Urdf,
     findings: Findings,
     additions: Mapping[str, Array],
     *,
@@ -787,7 +787,7 @@ def _uncertainty_content(uncertainty: Uncertainty | None) -> dict[str, Any]:
     """Return the table [uncertainty]; empty if the noise, and with it the covariance, is unknown."""
     if uncertainty is None or not np.isfinite(uncertainty.sqrt_covariance).all():
         return {}
-    indices = _coefficient_indices(uncertainty.chain)
+    indices = _coefficient_indices(uncertainty.chain) if len(uncertainty.entries) else {}
     names = {index: name for name, index in indices.items()}
     found = compact(uncertainty)
     if found is None:

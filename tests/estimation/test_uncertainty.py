@@ -109,8 +109,7 @@ def test_errors_that_the_model_lacks_are_added_and_kept_in_the_sidecar(ur10, tmp
     added = with_model.predict(q).covariance - plain.predict(q).covariance
     expected = np.diag([4e-8, 4e-8, 4e-8, 9e-8, 9e-8, 9e-8])
     np.testing.assert_allclose(added, np.tile(expected, (20, 1, 1)), atol=1e-15)
-    urdf = robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes()
-    text = sidecar_text(plain.chain, np.eye(4), urdf, Findings(uncertainty=with_model), {})
+    text = sidecar_text(plain.chain, np.eye(4), plain.chain.urdf, Findings(uncertainty=with_model), {})
     assert text is not None
     (tmp_path / "arm.calibration.toml").write_text(text)
     known = read_uncertainty(tmp_path / "arm.calibration.toml", plain.chain)

@@ -27,6 +27,7 @@ from dhcal_pin.measurements import MeasuredRegion
 from dhcal_pin.robot import Transmission
 from dhcal_pin.robot.error_families import JOINT_TERMS
 from dhcal_pin.robot.transmission import coefficient_indices
+from dhcal_pin.robot.urdf import parse_urdf
 
 
 def test_base_and_tool_are_read_back_from_the_sidecar(tmp_path, scara):
@@ -66,7 +67,7 @@ def test_elasticity_of_a_joint_that_gravity_does_not_load_is_read_back(tmp_path)
     root = np.random.default_rng(0).normal(size=(6 * 7 + 6, 3))
     known = Uncertainty(arm, terms, root, root[:, :0])
     path = write(
-        tmp_path, "a.toml", sidecar_text(arm, np.eye(4), arm.urdf.data, Findings(uncertainty=known), {}) or ""
+        tmp_path, "a.toml", sidecar_text(arm, np.eye(4), arm.urdf, Findings(uncertainty=known), {}) or ""
     )
     read = read_uncertainty(path, arm)
     assert read is not None
@@ -88,7 +89,8 @@ def test_an_invalid_sidecar_is_an_error(tmp_path, text, words, scara):
 
 def test_sidecar_text_is_toml(scara):
     urdf = b'<robot name="r"><link name="a &quot;b&quot;"/></robot>'
-    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), urdf, Findings(), {}, required=True)
+    robot = parse_urdf(urdf, "")
+    text = sidecar_text(replace(scara, tip='a "b"'), np.eye(4), robot, Findings(), {}, required=True)
     assert text is not None
     content = tomllib.loads(text)
     assert set(content) == {"tip", "base", "tool", "manifest"}

@@ -150,10 +150,15 @@ def _reader_below_titles(
     """Return the function that reads a table below lines of titles, None without such lines."""
     first = content[:_N_SEPARATOR_ROWS]
     separators = [layout.separator] if layout.separator else SEPARATORS
-    found = [find_header([_split_stripped(line, name) for _, line in first]) for name in separators]
-    header = min((i for i in found if i is not None), default=0)
-    if not header:
+    found = []
+    for name in separators:
+        header = find_header([_split_stripped(line, name) for _, line in first])
+        if header == 0:
+            return None
+        found += [] if header is None else [header]
+    if not found:
         return None
+    header = min(found)
     return partial(parse_lines, source, content, replace(layout, skip=content[header][0] - 1))
 
 
