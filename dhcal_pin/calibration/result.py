@@ -57,7 +57,8 @@ class Result(Evidence, ResultPlots):
 
     @cached_property
     def _probe(self) -> ObservabilityProbe:
-        return ObservabilityProbe(self.problem, self.x)
+        known_r = self._system_at_x.r if self.rank < len(self.x) else None
+        return ObservabilityProbe(self.problem, self.x, known_r)
 
     @cached_property
     def verdict(self) -> Verdict:

@@ -28,7 +28,7 @@ from .._typing import Array
 from ..estimation import qr
 from ..estimation.error_model import ErrorParameter
 from ..estimation.parameters import fold_harmonics
-from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.problem import Problem
 from ..estimation.qr import TriangularSystem
 from ..formatting import format_count, join_names
 from ..measurements.pose import Pose
@@ -455,9 +455,7 @@ def _explain_curves(probe: ObservabilityProbe, system: TriangularSystem, curve_j
 def _explain_null_space(probe: ObservabilityProbe) -> list[str]:
     """Explain all unobservable directions of a problem."""
     problem, x = probe.problem, probe.x
-    # Even a small last step rotates the null space by more than the tolerance, so take the Jacobian at x.
-    r = linearize_and_factor(problem, x, small_angle=False).r
-    layers = probe.null_space_layers(r)
+    layers = probe.null_space_layers(probe.r)
     plain_errors = PlainErrors.from_model(problem.errors, x[: len(problem.errors.parameters)])
     names = [p.name for p in problem.parameters]
     explainer = Explainer(probe, dict(layers), names, plain_errors)

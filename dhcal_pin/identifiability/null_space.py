@@ -91,6 +91,14 @@ class ObservabilityProbe:
 
     problem: Problem  # Unknowns and measurements
     x: Array  # Values of the unknowns for all Jacobians, shape (p,) [m or rad]
+    known_r: Array | None = None  # R factor of the measurements at x, if it is known
+
+    @cached_property
+    def r(self) -> Array:
+        """R factor of the measurements at x, (p, p). Even a small last step rotates its null space."""
+        if self.known_r is not None:
+            return self.known_r
+        return linearize_and_factor(self.problem, self.x, small_angle=False).r
 
     @property
     def chain(self) -> Chain:
@@ -181,9 +189,7 @@ class ObservabilityProbe:
             return False
         n_robot = len(problem.errors.parameters)
         growth = gauge.rates(*problem.errors.derivative(self.x[:n_robot]))[:, 0]
-        # Even a small last step rotates the null space, so take the Jacobian at x.
-        r = linearize_and_factor(problem, self.x, small_angle=False).r
-        return bool(np.abs(growth @ qr.null_space(r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
+        return bool(np.abs(growth @ qr.null_space(self.r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
 
     def null_space_layers(self, r: Array) -> list[tuple[Cause, Array]]:
         """Split the null space by cause."""
