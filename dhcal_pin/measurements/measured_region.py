@@ -93,11 +93,13 @@ class MeasuredRegion:
         for start in range(0, len(q), _CHUNK_SIZE):
             part = q[start : start + _CHUNK_SIZE]
             points = self._points(part)
-            own_sizes = np.sum(points**2, 1)[:, None]
-            bounds = points @ (-2 * of_centres.T) + sizes + own_sizes
+            own_sizes = np.sum(points**2, 1)
+            # Squared distances of the points, less the own size of each.
+            bounds = points @ (-2 * of_centres.T)
+            bounds += sizes
             squares = self._squared_distances(part, centres[bounds.argmin(1)])
-            limits = squares[:, None] + _ROUNDING * (1 + own_sizes + sizes.max())
-            row, centre = np.divmod(np.flatnonzero(bounds <= limits), len(centres))
+            limits = squares - own_sizes + _ROUNDING * (1 + own_sizes + sizes.max())
+            row, centre = np.divmod(np.flatnonzero(bounds <= limits[:, None]), len(centres))
             np.minimum.at(squares, row, self._squared_distances(part[row], centres[centre]))
             out[start : start + _CHUNK_SIZE] = np.sqrt(squares)
         return out

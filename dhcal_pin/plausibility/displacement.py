@@ -17,6 +17,7 @@ import numpy as np
 
 from .. import se3
 from .._frozen import frozen
+from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..robot.chain import Chain
@@ -49,12 +50,16 @@ def measure_correction(errors: ErrorModel, calibrated: Chain) -> CorrectionSize:
     rng = np.random.default_rng(0)
     nominal = errors.chain.with_base_and_tool(np.eye(4), calibrated.tool)
     q = rng.uniform(*joint_range(nominal), (_N_CONFIGURATIONS, nominal.n_joints))
-    moved = _displacements(nominal, calibrated.with_base_and_tool(nominal.base, nominal.tool), q)
+    state = nominal.joint_state(q)
+    frames = nominal.forward_kinematics(state)
+
+    def displacements(chain: Chain) -> Array:
+        return _displacements(frames, chain.forward_kinematics(state), nominal.prismatic)
+
+    moved = displacements(calibrated.with_base_and_tool(nominal.base, nominal.tool))
     std = np.where(errors.is_of_arm, errors.priors, 0.0)
     model = replace(errors, chain=nominal)
-    draws = [
-        _displacements(nominal, model.at(std * rng.standard_normal(len(std))), q) for _ in range(_N_ROBOTS)
-    ]
+    draws = [displacements(model.at(std * rng.standard_normal(len(std)))) for _ in range(_N_ROBOTS)]
     expected = np.sqrt(np.mean(np.square(draws), 0))
     expected = np.fmax(expected, _MIN_RELATIVE * expected.max(1, keepdims=True))
     ratio = np.divide(moved, expected, out=np.zeros_like(moved), where=expected > 0)
@@ -65,9 +70,8 @@ def measure_correction(errors: ErrorModel, calibrated: Chain) -> CorrectionSize:
     )
 
 
-def _displacements(a: Chain, b: Chain, q: Array) -> Array:
+def _displacements(frames_a: FrameBatch, frames_b: FrameBatch, prismatic: Array) -> Array:
     """Return RMS distance [m] and angle [rad] between each axis, then the tool, of two robots, (2, k+1)."""
-    frames_a, frames_b = a.forward_kinematics(q), b.forward_kinematics(q)
     # Directions and points of the axes, (k, 3, m).
     (axis_a, point_a), (axis_b, point_b) = (
         (frames.bodies[1:, 2], frames.bodies[1:, 3]) for frames in (frames_a, frames_b)
@@ -76,7 +80,7 @@ def _displacements(a: Chain, b: Chain, q: Array) -> Array:
     offset = point_a - point_b
     distance = np.linalg.norm(offset - axis_b * np.sum(offset * axis_b, 1, keepdims=True), axis=1)
     # The place of a prismatic axis has no effect; only its direction has.
-    distance[np.asarray(a.prismatic)] = 0.0
+    distance[np.asarray(prismatic)] = 0.0
     tool = np.linalg.norm(frames_a.tool[3] - frames_b.tool[3], axis=0)
     squares = [
         np.concatenate([distance**2, tool[None] ** 2]),

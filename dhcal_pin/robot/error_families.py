@@ -163,7 +163,7 @@ class ErrorFamily:
                 Coefficient(entry, j, term.coefficient, term.unit, term.formula)
                 for j, entry in enumerate(row)
             ]
-        numbers = indices.harmonics.tolist()
+        numbers = indices.harmonics[: self.orders.stop - 1].tolist()
         return [
             Coefficient(numbers[k - 1][part][i], i, f"{function}{k}", "rad", f"{function}({k} * q[{i}])")
             for i in joints

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -49,14 +50,18 @@ class Timeline:
         """Times of all fitted samples, in the order of the measurements."""
         return np.concatenate(self.times[: self.n_fitted])
 
+    @cached_property
+    def _counted(self) -> Array:
+        """Fitted samples in the order of measurement; of consecutive ones at one configuration the first."""
+        # They share the error of the model.
+        order = np.argsort(self.fitted_numbers, kind="stable")
+        q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
+        return order[np.diff(group_by_configuration(q), prepend=-1) != 0]
+
     def thinned(self, count: int) -> Timeline:
         """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""
-        # Of consecutive samples at one configuration, the first counts: they share the error of the model.
-        numbers = self.fitted_numbers
-        order = np.argsort(numbers, kind="stable")
-        q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
-        order = order[np.diff(group_by_configuration(q), prepend=-1) != 0]
-        kept = np.zeros(len(numbers), bool)
+        order = self._counted
+        kept = np.zeros(len(self.fitted_numbers), bool)
         kept[order[:: max(1, -(-len(order) // count))]] = True
         ends = np.cumsum([len(each) for each in self.numbers[: self.n_fitted]])[:-1]
         masks = np.split(kept, ends)
