@@ -441,6 +441,12 @@ def first_equal_rows(columns: Sequence[Array]) -> Array:
     if not columns or not len(columns[0]):
         return np.empty(0, int)
     # Ranks, as columns of texts and of numbers cannot be stacked.
-    keys = np.stack([np.unique(column, return_inverse=True)[1] for column in columns], -1)
+    ranks, m = [], len(columns[0])
+    for column in columns:
+        values, rank = np.unique(column, return_inverse=True)
+        if len(values) == m:
+            return np.arange(m)
+        ranks.append(rank)
+    keys = np.stack(ranks, -1)
     first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)[1:]
     return first[inverse.reshape(-1)]

@@ -67,11 +67,12 @@ class MeasuredRegion:
 
     def with_reach(self, q: Array, is_left_out: Array) -> MeasuredRegion:
         """Determine the reach from parts of the region that were left out in turn."""
-        distances = [
-            replace(self, configurations=q[~mask][_is_drawn(int(np.sum(~mask)))]).distances(_thinned(q[mask]))
-            for mask in is_left_out
-            if not mask.all()
-        ]
+        points, distances = self._points(q), []
+        for mask in is_left_out:
+            if not mask.all():
+                tested, others = _thinned(np.flatnonzero(mask)), np.flatnonzero(~mask)
+                centres = others[_is_drawn(len(others))]
+                distances.append(self._nearest(q[tested], points[tested], q[centres], points[centres]))
         reach = float(np.quantile(np.concatenate(distances), RADIUS_QUANTILE)) if distances else 0.0
         return replace(self, reach=max(self.radius, reach))
 
@@ -86,16 +87,18 @@ class MeasuredRegion:
 
     def distances(self, q: Array) -> Array:
         """Compute the distances of configurations from the nearest one that represents the region."""
+        centres = self.configurations
+        return self._nearest(q, self._points(q), centres, self._points(centres))
+
+    def _nearest(self, q: Array, points: Array, centres: Array, of_centres: Array) -> Array:
+        """Compute the distances of configurations from the nearest centre, from the points of both."""
         # Points are no farther apart than their configurations: only the nearest points are compared.
-        centres, out = self.configurations, np.empty(len(q))
-        of_centres = self._points(centres)
-        sizes = np.sum(of_centres**2, 1)
+        out, sizes = np.empty(len(q)), np.sum(of_centres**2, 1)
         for start in range(0, len(q), _CHUNK_SIZE):
-            part = q[start : start + _CHUNK_SIZE]
-            points = self._points(part)
-            own_sizes = np.sum(points**2, 1)
+            part, own = q[start : start + _CHUNK_SIZE], points[start : start + _CHUNK_SIZE]
+            own_sizes = np.sum(own**2, 1)
             # Squared distances of the points, less the own size of each.
-            bounds = points @ (-2 * of_centres.T)
+            bounds = own @ (-2 * of_centres.T)
             bounds += sizes
             squares = self._squared_distances(part, centres[bounds.argmin(1)])
             limits = squares - own_sizes + _ROUNDING * (1 + own_sizes + sizes.max())

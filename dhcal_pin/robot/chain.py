@@ -383,7 +383,8 @@ class Chain:
     def conditions(self, q: ArrayLike | Conditions) -> Conditions:
         """Return the conditions of m samples from joint positions, which are checked, or conditions."""
         if isinstance(q, Conditions):
-            return replace(q, q=self.validated_q(q.q))
+            positions = self.validated_q(q.q)
+            return q if positions is q.q else replace(q, q=positions)
         return Conditions(self.validated_q(q))
 
     def actual_positions(self, conditions: Conditions) -> tuple[Array, Array | None]:

@@ -79,10 +79,10 @@ def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
     # One of the lines is the header.
     require_few_rows(source, text.count("\n") - 1)
     lines = text.splitlines()
-    longest = max(range(len(lines)), key=lambda i: len(lines[i]), default=None)
-    if longest is not None and len(lines[longest]) > MAX_LINE_LENGTH:
+    lengths = list(map(len, lines))
+    if (longest := max(lengths, default=0)) > MAX_LINE_LENGTH:
         raise FileFormatError(
-            f"{source}:{longest + 1}: a line of {len(lines[longest])} characters, more than "
+            f"{source}:{lengths.index(longest) + 1}: a line of {longest} characters, more than "
             f"{MAX_LINE_LENGTH}; check that the file is a table"
         )
     return parse_lines(source, enumerate(lines, 1), layout)
@@ -187,6 +187,11 @@ def _divide_rows(
     rows: Sequence[tuple[int, str]], separator: str, width: int
 ) -> tuple[list[tuple[int, str]], dict[int, str]]:
     """Return the rows that have a cell for each column, and the reasons why the others do not, by line."""
+    character = SEPARATORS[separator]
+    if character is not None and all(text.count(character) == width - 1 for _, text in rows):
+        limit = csv.field_size_limit()
+        if not any('"' in text or len(text) > limit for _, text in rows):
+            return list(rows), {}
     split, name = _splitter(separator), _SEPARATOR_NAMES[separator]
     counts: dict[int, int] = {}
     bad: dict[int, str] = {}
