@@ -38,7 +38,7 @@ from .._frozen import frozen
 from .._typing import Array
 from . import qr
 from .normal_equations import NormalEquations
-from .problem import Problem, linearize_and_factor, normal_equations_by_part, uses_normal_equations
+from .problem import Problem, factor, normal_equations_by_part, uses_normal_equations
 from .qr import TriangularSystem, merge_r_factors
 
 # Mask of the held-out samples (m,) of each measurement.
@@ -147,7 +147,8 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Itera
         if np.any(np.concatenate(masks))
     ]
     held_out = parts[: len(folds)]
-    factors = [linearize_and_factor(part, x, small_angle=False).rows for part in parts]
+    linearization = problem.linearize(x)
+    factors = [factor(part, linearization, len(x)).rows for part in parts]
     for part, one in zip(held_out, factors, strict=False):
         others = merge_r_factors([other for other in factors if other is not one])
         yield FoldSystems(TriangularSystem(others), TriangularSystem(one), count_rows(part))

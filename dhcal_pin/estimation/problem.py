@@ -445,9 +445,15 @@ def merge_instrument_parameters(data: Sequence[Measurement]) -> tuple[Instrument
 
 def linearize_and_factor(problem: Problem, x: Array, small_angle: bool) -> TriangularSystem:
     """Compute the triangular system of all data, without priors."""
-    return combine_r_factors(
-        problem.map_chunks(partial(_chunk_r_factor, problem.linearize(x), small_angle)), len(x)
-    )
+    return factor(problem, problem.linearize(x), len(x), small_angle)
+
+
+def factor(
+    problem: Problem, linearization: Linearization, n_unknowns: int, small_angle: bool = False
+) -> TriangularSystem:
+    """Compute the triangular system of all data, without priors, of a model that is linearized already."""
+    factors = problem.map_chunks(partial(_chunk_r_factor, linearization, small_angle))
+    return combine_r_factors(factors, n_unknowns)
 
 
 class UnfactoredSystem(NormalEquations):
