@@ -556,7 +556,7 @@ def _extension_families(
         return ()
     is_possible = method == "lm" and priors != "none"
     if extend is None or extend == "auto":
-        frames = errors.only_frames()
+        frames = errors.only_frames
         is_frames_only = frames is not None and len(frames.parameters) == len(errors.parameters)
         return EXTENSIONS if is_possible and not is_frames_only else ()
     if not is_possible:

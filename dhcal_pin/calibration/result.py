@@ -92,7 +92,7 @@ class Result(Evidence, ResultPlots):
         It is that along the worst direction; 0 if all of these positions are known, or if they are not
         distinguishable from an unknown base or tool.
         """
-        if self.errors.only_frames():
+        if self.errors.only_frames:
             return 0.0
         return cameras.largest_position_std([p.name for p in self.parameters], self.covariance)
 

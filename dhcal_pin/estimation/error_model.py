@@ -191,8 +191,9 @@ class ErrorModel:
         frames = (BASE_FRAME, self.chain.tool_frame_index)
         return np.array([p.error_frame not in frames for p in self.parameters], bool)
 
+    @cached_property
     def only_frames(self) -> ErrorModel | None:
-        """Return the model with the unknowns of base and tool alone."""
+        """Model with the unknowns of base and tool alone; None without any."""
         frame_parameters = tuple(self.parameters[i] for i in np.flatnonzero(~self.is_of_arm))
         return replace(self, parameters=frame_parameters) if frame_parameters else None
 

@@ -256,7 +256,7 @@ def initialize_frames(
     errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> ErrorModel:
     """Initialize unknown base and tool frames from a subsample of the measurements."""
-    frames = errors.only_frames()
+    frames = errors.only_frames
     if frames is None:
         return errors
     unknown_frames = {p.error_frame for p in frames.parameters}
@@ -291,8 +291,10 @@ def _best_frames(
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:
     """Fit the unknown base and tool frames of the nominal chain to all measurements."""
-    frames = errors.only_frames()
+    frames = errors.only_frames
     if frames is None:
         return errors.chain.with_current_loads()
-    start = replace(frames, chain=errors.chain.with_current_loads())
+    chain = errors.chain.with_current_loads()
+    # What does not depend on the data is then computed once for several fits.
+    start = frames if chain is errors.chain else replace(frames, chain=chain)
     return _fit_frames(start, data, known, _MAX_ITERATIONS)[1]

@@ -322,7 +322,7 @@ def without_arm(fit: Fit, max_iterations: int, held: Collection[str] = ()) -> Fi
 
 def nominal_arm(errors: ErrorModel) -> ErrorModel:
     """Return the model of the nominal arm, with the unknowns of base and tool alone."""
-    return errors.only_frames() or ErrorModel(errors.chain, ())
+    return errors.only_frames or ErrorModel(errors.chain, ())
 
 
 def judge_stages(

@@ -50,7 +50,7 @@ def find_initial_outliers(
 ) -> list[Array]:
     """Find samples that are so far from the nominal robot that a fit must begin without them."""
     all_good = [np.zeros(len(item.rows), bool) for item in data]
-    frames = errors.only_frames() or ErrorModel(errors.chain, ())
+    frames = errors.only_frames or ErrorModel(errors.chain, ())
     starts = [_initialize_instruments(frames.chain, item, _draw_groups(item)) for item in data]
     parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
     weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
