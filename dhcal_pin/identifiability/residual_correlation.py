@@ -162,8 +162,7 @@ def _points(q: Array, is_prismatic: Array) -> Array:
 
 def _squared_distances(points: Array, others: Array, out: Array | None = None) -> Array:
     """Return the squared distances (b, m) of points (b, d) from others (m, d)."""
-    out = np.empty((len(points), len(others))) if out is None else out
-    np.matmul(points, -2 * others.T, out)
-    out += np.sum(others**2, 1)
-    out += np.sum(points**2, 1)[:, None]
-    return out
+    squares: Array = np.matmul(points, -2 * others.T, out)
+    squares += np.sum(others**2, 1)
+    squares += np.sum(points**2, 1)[:, None]
+    return squares
