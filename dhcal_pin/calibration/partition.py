@@ -30,7 +30,12 @@ from ..estimation.problem import Problem, merge_instrument_parameters
 from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
-from ..measurements.configurations import connect_nodes, group_by_configuration, label_by_appearance
+from ..measurements.configurations import (
+    connect_nodes,
+    group_by_configuration,
+    label_samples,
+    order_of_rows,
+)
 
 # Fraction of the samples that a blocked fold holds out at either end of a principal direction.
 BLOCK_FRACTION = 0.25
@@ -51,63 +56,8 @@ def _merge_groups(labels: Array, others: Array) -> Array:
 
 def configuration_groups(data: Sequence[Measurement]) -> Array:
     """Label the samples of measurements, those of the same configuration by the same label."""
-    if len(data) != 1:
-        return _find_groups(data)
-    # Labels of one measurement are kept with it: many parts of a calibration need them.
-    known = vars(data[0])
-    if "configuration_groups" not in known:
-        known["configuration_groups"] = _find_groups(data)
-        known["configuration_groups"].flags.writeable = False
-    return known["configuration_groups"]
-
-
-def _find_groups(data: Sequence[Measurement]) -> Array:
-    """Label the samples of measurements by their configuration."""
-    # Labels are numbered in the order of the joint values. A sample with several configurations, such as a
-    # relative pose, is compared by all of its joint values. A sample without a configuration, such as a known
-    # distance between points, has a label of its own; these are the last, in the order of their names.
-    counts = [len(item.rows) for item in data]
-    starts = np.cumsum([0, *counts])
-    labels = np.arange(starts[-1])
-    for width in {item.configurations_per_row for item in data} - {0}:
-        chosen = [i for i, item in enumerate(data) if item.configurations_per_row == width and counts[i]]
-        if not chosen:
-            continue
-        # One row of joint values per sample: configurations() lists all first ones, then all second ones.
-        rows = [np.concatenate(np.split(np.asarray(data[i].configurations()), width), axis=1) for i in chosen]
-        samples = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in chosen])
-        # The label of a group is the number of its first sample.
-        groups = group_by_configuration(np.concatenate(rows))
-        is_first = np.diff(np.maximum.accumulate(groups), prepend=-1) > 0
-        labels[samples] = samples[np.flatnonzero(is_first)[groups]]
-    if len(labels):
-        order = _order_of_joint_values(data)
-        labels[order] = label_by_appearance(labels[order])
-    return labels
-
-
-def _order_of_joint_values(data: Sequence[Measurement]) -> Array:
-    """Return the samples (m,) of measurements in the order of their joint values, or else of their names."""
-    keys = []
-    for item in data:
-        if item.configurations_per_row:
-            names = np.zeros((len(item.rows), 0))
-            q = np.concatenate(np.split(item.configurations(), item.configurations_per_row), axis=1)
-        else:
-            texts = item.text_values().values()
-            names = np.stack([np.unique(text, return_inverse=True)[1] for text in texts], axis=1)
-            q = np.full(item.q.shape, np.inf)
-        keys.append(np.concatenate([q, names], axis=1))
-    width = max(key.shape[1] for key in keys)
-    padded = [np.pad(key, ((0, 0), (0, width - key.shape[1]))) for key in keys]
-    return _order_of_rows(np.concatenate(padded))
-
-
-def _order_of_rows(rows: Array) -> Array:
-    """Return the order of rows (m, n) by their first values, equal ones by the second values, and so on."""
-    order = np.argsort(rows[:, 0], kind="stable")
-    first = rows[order, 0]
-    return order if np.all(first[1:] > first[:-1]) else np.lexsort(rows.T[::-1])
+    # Many parts of a calibration need the labels of one measurement.
+    return data[0].configuration_groups if len(data) == 1 else label_samples(data)
 
 
 def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]:
@@ -121,7 +71,7 @@ def different_configurations(data: Sequence[Measurement]) -> tuple[Array, Array]
     if len(q) == 1:
         return q[0], samples[0]
     rows, of_rows = np.concatenate(q[1:]), np.concatenate(samples)
-    order = _order_of_rows(rows)
+    order = order_of_rows(rows)
     rows, of_rows = rows[order], of_rows[order]
     first = np.unique(group_by_configuration(rows), return_index=True)[1]
     return rows[first], of_rows[first]

@@ -40,6 +40,7 @@ from ..formatting import format_count
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS, Conditions, concatenate_conditions, directions_in_order
 from .columns import Column, common_text, file_columns, stack_columns, stack_sigmas
+from .configurations import label_samples
 from .groups import ErrorGroup, Group, declare
 from .mounting import MountedRig
 
@@ -152,6 +153,13 @@ class Measurement(ABC):
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
         return []
+
+    @cached_property
+    def configuration_groups(self) -> Array:
+        """Labels of the samples, (m,), equal for samples of the same configuration; read-only."""
+        labels = label_samples([self])
+        labels.flags.writeable = False
+        return labels
 
     # ------------------------------------------------------------------------------------------- copies
     def with_conditions(self, **conditions: ArrayLike) -> Self:
