@@ -6,54 +6,68 @@ that uses rich.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-
-from rich.console import Console
-from rich.markup import escape
-from rich.text import Text
+from typing import TYPE_CHECKING
 
 from ..._typing import Progress
 from ...messages import escape_control_characters
 from .screen import Line, Screen, Verbosity
 
-
-def _console() -> Console:
-    """Create a console on stderr."""
-    return Console(stderr=True, highlight=False)
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
-def _print(console: Console, lines: Iterable[Line]) -> None:
+def _terminal() -> Console | None:
+    """Return the terminal of stderr, None if it is a file or a pipe."""
+    if not (sys.stderr and sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
+        return None
+    from rich.console import Console  # lazy import, as the following: only on a terminal
+
+    console = Console(stderr=True, highlight=False)
+    return console if console.is_terminal else None
+
+
+def _print(terminal: Console | None, lines: Sequence[Line]) -> None:
     """Print lines as they are."""
+    if terminal is None:
+        if sys.stderr:  # it may be closed
+            sys.stderr.write("".join(f"{line.text}\n" for line in lines))
+            sys.stderr.flush()
+        return
+    from rich.text import Text
+
     for line in lines:
-        console.print(Text(line.text, style=line.style), soft_wrap=True)
+        terminal.print(Text(line.text, style=line.style), soft_wrap=True)
 
 
 def show(screen: Screen, verbosity: Verbosity) -> None:
     """Print the result of a command, as wide as the terminal, and not folded in files and pipes."""
-    console = _console()
-    width = console.width if console.is_terminal else None
-    _print(console, screen.lines(verbosity, width))
+    terminal = _terminal()
+    _print(terminal, screen.lines(verbosity, terminal and terminal.width))
 
 
 def print_lines(*texts: str, style: str = "") -> None:
     """Print sentences."""
-    _print(_console(), [Line(escape_control_characters(text), style) for text in texts])
+    _print(_terminal(), [Line(escape_control_characters(text), style) for text in texts])
 
 
 @contextmanager
 def show_progress(title: str) -> Iterator[Progress | None]:
     """Show the phase of the work in a status line."""
-    console = _console()
-    if not console.is_terminal:
+    terminal = _terminal()
+    if terminal is None:
         yield None
         return
+    from rich.text import Text
 
     def update(phase: str, step: int, total: int) -> None:
         status.update(Text(escape_control_characters(f"{phase} {step}/{total}")))
 
-    with console.status(Text(escape_control_characters(title))) as status:
+    with terminal.status(Text(escape_control_characters(title))) as status:
         yield update
 
 
@@ -65,14 +79,15 @@ def print_progress(phase: str, step: int, total: int) -> None:
 @contextmanager
 def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[int], None]]:
     """Show a progress bar; nothing is shown if stderr is not a terminal."""
-    console = _console()
-    if not console.is_terminal:
+    terminal = _terminal()
+    if terminal is None:
         # A disabled bar of older versions of rich prints an empty line.
         yield lambda count: None
         return
-    from rich.progress import Progress as ProgressBar  # lazy import: only on a terminal
+    from rich.markup import escape
+    from rich.progress import Progress as ProgressBar
 
-    with ProgressBar(console=console) as bar:
+    with ProgressBar(console=terminal) as bar:
         # The bar reads markup such as [bold] in its description.
         task = bar.add_task(escape(escape_control_characters(title)), total=total, completed=n_done)
         yield lambda count: bar.update(task, completed=count)
