@@ -31,10 +31,16 @@ def frozen(cls: Any = None, /, *, eq: bool = True) -> Any:
     return _frozen(cls, eq)
 
 
+def bare(cls: Any) -> Any:
+    """Make a class a dataclass that can be changed, without comparison and text."""
+    made = dataclass(init=False, repr=False, eq=False)(cls)
+    made.__init__ = _constructor(made)
+    return made
+
+
 def _frozen(cls: Any, eq: bool) -> Any:
     """Make a class a frozen dataclass."""
-    made: Any = dataclass(init=False, repr=False, eq=False)(cls)
-    made.__init__ = _constructor(made)
+    made = bare(cls)
     made.__setattr__, made.__delattr__ = _refuse_change, _refuse_change
     if made.__repr__ is object.__repr__:
         made.__repr__ = _repr

@@ -19,7 +19,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
@@ -360,9 +360,9 @@ def _announce_start(pipe: int) -> None:
     """Write a byte to a pipe as soon as a command has begun and can be interrupted."""
     build_parser = main_of_cli.build_parser
 
-    def announce() -> argparse.ArgumentParser:
+    def announce(words: Sequence[str]) -> argparse.ArgumentParser:
         os.write(pipe, b".")
-        return build_parser()
+        return build_parser(words)
 
     main_of_cli.build_parser = announce
 

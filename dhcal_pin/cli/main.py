@@ -84,8 +84,8 @@ class _VersionAction(argparse.Action):
         sys.exit(0)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands."""
+def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Build the parser of all commands, or of the one that the words begin with."""
     parser = CommandParser(
         prog="dhcal",
         description="Robot kinematic calibration: estimate the errors of a robot and correct its URDF.",
@@ -96,8 +96,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", dest="command", metavar="COMMAND", required=True, parser_class=_LazyCommandParser
     )
-    for name, text in COMMANDS.items():
-        commands.add_parser(name, help=text, **_parser_options(name))
+    for name in words[:1] if words and words[0] in COMMANDS else COMMANDS:
+        commands.add_parser(name, help=COMMANDS[name], **_parser_options(name))
     return parser
 
 
@@ -160,7 +160,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         with interrupt:
             if (outputs := _outputs_module()) is not None:
                 outputs.forget_written_files()
-            args = build_parser().parse_args(argv)
+            words = sys.argv[1:] if argv is None else argv
+            args = build_parser(words).parse_args(words)
             # The matrices are small: more BLAS threads only wait. BLAS reads these when NumPy is loaded.
             for name in BLAS_VARIABLES:
                 os.environ.setdefault(name, "1")

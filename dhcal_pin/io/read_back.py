@@ -8,6 +8,7 @@ normalized, for example, are read differently.
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import io
 import os
 import warnings
@@ -23,6 +24,7 @@ import numpy as np
 import pinocchio as pin
 
 from .. import se3
+from .._frozen import bare
 from .._typing import Array, PathLike
 from ..exceptions import DhcalError
 from ..native_output import discard_native_messages
@@ -96,8 +98,9 @@ def _pose_in_base(robot: Any, by_child: Mapping[str, Any], link: str) -> Array:
 
 @cache
 def _yourdfpy_reader() -> dict[str, Any]:
-    """Return the names of yourdfpy's module that reads URDF, with a replacement of trimesh."""
-    # The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it.
+    """Return the names of yourdfpy's module that reads URDF, without slow imports."""
+    # The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it. It does not
+    # compare objects.
     trimesh: Any = ModuleType("trimesh")
     trimesh.Trimesh = trimesh.Scene = object  # in annotations
     trimesh.transformations = SimpleNamespace(
@@ -108,8 +111,12 @@ def _yourdfpy_reader() -> dict[str, Any]:
         ),
     )
 
+    simple: Any = SimpleNamespace(**vars(dataclasses))
+    simple.dataclass = lambda cls=None, **_: bare if cls is None else bare(cls)
+    replacements = {"trimesh": trimesh, "dataclasses": simple}
+
     def import_module(name: str, *args: Any) -> Any:
-        return trimesh if name.split(".")[0] == "trimesh" else builtins.__import__(name, *args)
+        return replacements.get(name.split(".")[0]) or builtins.__import__(name, *args)
 
     package = find_spec("yourdfpy")
     assert package is not None

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 def _terminal() -> Console | None:
     """Return the terminal of stderr, None if it is a file or a pipe."""
-    if not (sys.stderr and sys.stderr.isatty() or os.environ.get("FORCE_COLOR")):
+    if not ((sys.stderr and sys.stderr.isatty()) or os.environ.get("FORCE_COLOR")):
         return None
     from rich.console import Console  # lazy import, as the following: only on a terminal
 
