@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
-from ..session.check import Recheck, recheck
 from ..session.linear_model import measures_positions
 from ..session.search import can_have_session
 from . import cameras
@@ -48,7 +47,11 @@ from .partition import configuration_groups
 from .reweighting import Fit
 from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
 
+if TYPE_CHECKING:
+    from ..session.check import Recheck
+
 Status = Literal["ok", "caution", "refused"]
+
 # Statuses, the most severe one last.
 STATUSES: tuple[Status, ...] = ("ok", "caution", "refused")
 
@@ -711,6 +714,8 @@ def _change_before_holdout(fit: Evidence) -> Recheck | None:
     if is_drawn or not can_have_session(holdout) or not measures_positions(holdout):
         return None
     data = [_with_noise(fit, item.take(np.arange(0, len(item.rows), step))) for item in holdout]
+    from ..session.check import recheck  # lazy import: only for hold-out samples
+
     return recheck(fit.chain, data, fit.uncertainty, known=fit.instruments)
 
 

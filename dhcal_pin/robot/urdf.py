@@ -12,7 +12,6 @@ its parent link, T = Trans(xyz) · Rz(yaw) · Ry(pitch) · Rx(roll), as in the U
 from __future__ import annotations
 
 import difflib
-import html
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field
@@ -245,7 +244,9 @@ def suggest_names(name: str, known: Iterable[str]) -> str:
 
 def xml_attribute(text: str) -> str:
     """Write an XML attribute with quotes, as `xml.sax.saxutils.quoteattr`, which imports an HTTP client."""
-    return f'"{html.escape(text)}"'
+    from html import escape  # lazy import: its table of names is large
+
+    return f'"{escape(text)}"'
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Array:
