@@ -99,9 +99,11 @@ def find_good_samples(
     taken = [drawn[(drawn >= a) & (drawn < b)] - a for a, b in pairwise(starts)]
     part = problem.with_data([item.take(index) for item, index in zip(data, taken, strict=True)])
     system = linearize_and_factor(part, solution.x, small_angle=False)
-    root, n_determined = system.sqrt_covariance(problem.weights)[0], system.rank
-    n_rows = sum(item.residual_dim * len(item.rows) for item in part.data)
-    if not (0 < 2 * n_determined <= n_rows and root.shape[1] <= MAX_COORDINATES):
+    root = system.sqrt_covariance(problem.weights)[0]
+    if root.shape[1] > MAX_COORDINATES:
+        return all_good
+    n_determined, n_rows = system.rank, sum(item.residual_dim * len(item.rows) for item in part.data)
+    if not 0 < 2 * n_determined <= n_rows:
         return all_good
     rows = linearize_rows(part, solution.x, root)
     redundancy = n_rows / independent_rows([item[:-1] for item in rows.items], groups[drawn])
