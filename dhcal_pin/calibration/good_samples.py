@@ -92,7 +92,9 @@ def find_good_samples(
     # from the other samples, "reject_regional" if these lie together in joint space, else "reject_far".
     counts = [len(item.rows) for item in data]
     all_good = [np.ones(count) for count in counts], robust.FAR_REJECTED
-    if _looks_like_noise(problem.with_data(data), solution.x, groups):
+    # Data and priors determine at least the coordinates that have priors.
+    is_large = np.count_nonzero(problem.weights) > MAX_COORDINATES
+    if is_large or _looks_like_noise(problem.with_data(data), solution.x, groups):
         return all_good
     drawn = _draw_samples(sum(counts))
     starts = np.cumsum([0, *counts])
