@@ -13,6 +13,16 @@ from typing import Any, TypeVar, dataclass_transform, overload
 _T = TypeVar("_T")
 
 
+class _Factory:
+    """Default of an argument whose value is made for each object."""
+
+    def __repr__(self) -> str:
+        return "<factory>"
+
+
+_FACTORY = _Factory()
+
+
 @overload
 def frozen(cls: type[_T], /) -> type[_T]: ...
 @overload
@@ -51,7 +61,7 @@ def _frozen(cls: Any, eq: bool) -> Any:
 
 def _constructor(cls: Any) -> Callable[..., None]:
     """Compile the constructor of a dataclass."""
-    names: dict[str, Any] = {"set_": object.__setattr__, "missing_": MISSING}
+    names: dict[str, Any] = {"set_": object.__setattr__, "factory_": _FACTORY}
     arguments, entries = ["self"], []
     for item in fields(cls):
         name = value = argument = item.name
@@ -60,7 +70,7 @@ def _constructor(cls: Any) -> Callable[..., None]:
             argument = f"{name}={name}_"
         elif item.default_factory is not MISSING:
             names[f"{name}_"] = item.default_factory
-            argument, value = f"{name}=missing_", f"{name}_() if {name} is missing_ else {name}"
+            argument, value = f"{name}=factory_", f"{name}_() if {name} is factory_ else {name}"
         arguments.append(argument)
         entries.append(f"'{name}': {value}")
     # A line per field takes twice as long to compile.

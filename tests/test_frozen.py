@@ -37,7 +37,7 @@ def declared(decorator: Any) -> tuple[type, type]:
 def test_behaviour_is_that_of_the_standard_library():
     """Constructors, comparison, hash, text, copies and errors are the same."""
     for ours, theirs in zip(declared(frozen), declared(dataclass(frozen=True)), strict=True):
-        assert inspect.signature(ours).parameters.keys() == inspect.signature(theirs).parameters.keys()
+        assert str(inspect.signature(ours)) == str(inspect.signature(theirs))
         assert [f.name for f in dataclasses.fields(ours)] == [f.name for f in dataclasses.fields(theirs)]
         for arguments, others in (((1,), (1, ["x"])), ((1, [], 2.0), (1,)), ((1, [], 2.0), (1, [], 2.0))):
             (x, y), (u, v) = ((made(*arguments), made(*others)) for made in (ours, theirs))
