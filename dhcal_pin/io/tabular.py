@@ -66,13 +66,19 @@ def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT
 def decode_text(path: PathLike, data: bytes, encoding: str = "utf-8", first_line: int = 1) -> str:
     """Decode a text file, or a part of it from a line on."""
     try:
-        return data.decode(encoding).removeprefix("\ufeff")
+        text = data.decode(encoding).removeprefix("\ufeff")
     except UnicodeError as error:
         name, start = encoding.upper(), getattr(error, "start", 0)
         line = first_line + data.count(b"\n", 0, start)
         is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         found = "the file is UTF-16," if is_utf16 else f"byte 0x{data[start : start + 1].hex()} is"
         raise FileFormatError(f"{path}:{line}: {found} not {name}; save the file as {name}") from error
+    if "\0" in text:
+        line = first_line + text.count("\n", 0, text.index("\0"))
+        raise FileFormatError(
+            f"{path}:{line}: a zero byte, as in UTF-16; save the file as {encoding.upper()}"
+        )
+    return text
 
 
 def size_text(size: int) -> str:

@@ -27,6 +27,14 @@ DATA = {
         b"\xff\xfe" + positions_csv(4).encode("utf-16-le"),
         ["data.csv:1: the file is UTF-16, not UTF-8; save the file as UTF-8"],
     ),
+    "UTF-16 without a mark": (
+        positions_csv(4).encode("utf-16-le"),
+        ["data.csv:1: a zero byte, as in UTF-16; save the file as UTF-8"],
+    ),
+    "zero byte": (
+        positions_csv(4).encode() + b"\0\n",
+        ["data.csv:6: a zero byte, as in UTF-16; save the file as UTF-8"],
+    ),
     "Latin-1": (
         positions_csv(4).encode() + b"# 20 \xb0C\n",
         ["data.csv:6: byte 0xb0 is not UTF-8; save the file as UTF-8"],
