@@ -92,6 +92,8 @@ MAX_CONTINUED = 500
 # A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
 # standard errors, and by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
+# Residuals this many times as large as the stated standard deviations may be the cause of a large correction.
+MIN_SIGMA_RATIO = 10.0
 # Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
 # probability and one degree of freedom. That with more is closer to 0.
 MAX_CHANCE, MIN_T = 0.025, -12.71
@@ -435,7 +437,27 @@ def _implausible_correction(fit: Evidence) -> list[Finding]:
     if size.ratio <= MAX_USUAL_DISPLACEMENT:
         return []
     status: Status = "refused" if size.ratio > MAX_DISPLACEMENT else "caution"
-    return [Finding(status, f"The correction {_describe(size)}. {_plausible_cause(fit)}")]
+    cause = _too_small_sigmas(fit) or _plausible_cause(fit)
+    return [Finding(status, f"The correction {_describe(size)}. {cause}")]
+
+
+def _too_small_sigmas(fit: Evidence) -> str:
+    """Name stated standard deviations as a cause if the correction is plausible with larger ones."""
+    ratios = [ratio or 1.0 for ratio in fit.sigma_ratios]
+    if max(ratios) < MIN_SIGMA_RATIO:
+        return ""
+    data = [
+        item.with_scaled_sigma(dict.fromkeys(item.residual_groups, ratio))
+        for item, ratio in zip(fit.problem.data, ratios, strict=True)
+    ]
+    x = minimize(fit.problem.with_data(data)).x
+    size = measure_correction(fit.errors, fit.errors.at(x[: len(fit.errors.parameters)]))
+    if size.ratio > MAX_USUAL_DISPLACEMENT:
+        return ""
+    return (
+        f"The residuals are {max(ratios):.2g} times as large as the stated standard deviations. With larger "
+        "ones the correction is plausible: leave the sigma columns out, or correct them."
+    )
 
 
 def _implausible_errors(fit: Evidence) -> list[Finding]:

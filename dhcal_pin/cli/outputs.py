@@ -107,6 +107,8 @@ def write_with_json(
 
 def print_to_stdout(text: str) -> None:
     """Print a JSON text and nothing else on standard output."""
+    if sys.stdout is None:
+        raise FileFormatError("standard output is closed; no file is written; name a file with --json")
     try:
         try:
             sys.stdout.write(text)

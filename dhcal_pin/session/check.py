@@ -766,7 +766,7 @@ def _sentence(group: list[Hypothesis]) -> str:
     """Say what changed."""
     best, *others = group
     if best.kind == "robot":
-        return "More than one part of the robot changed: calibrate again."
+        return "More than one part of the robot changed, or the origin of a joint: calibrate again."
     size = format_quantity(abs(best.size), best.unit, best.std, small=best.unit == "m")
     verb = "turned" if best.unit == "rad" else "moved"
     part = "base or the instrument" if best.kind == "base" else best.kind

@@ -94,3 +94,41 @@ def test_nothing_but_the_command_prints(robot_folder):
         assert done.returncode in (0, 3), done.stderr
         assert "Warning" not in done.stderr
         assert "Error:" not in done.stderr
+
+
+def program(*words, **options):
+    """Run the command as a process of its own; return its status and standard output."""
+    command = [sys.executable, "-m", "dhcal_pin.cli", *words]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=False, **options)
+    return done.returncode, done.stdout
+
+
+def test_json_is_not_changed_by_the_status_line(robot_folder):
+    """On a terminal, a status line is shown while the JSON is written to another file."""
+    Path("data.csv").write_text(positions_csv(20))
+    words = ("calibrate", "arm.dh.toml", "data.csv", "-o", "o.urdf", "--json", "-")
+    environment = os.environ | {"FORCE_COLOR": "1", "COLUMNS": "40"}
+    status, out = program(*words, stderr=subprocess.PIPE, env=environment)
+    assert status == 0
+    assert json.loads(out)["verdict"]["status"] == "ok"
+
+
+def test_exit_status_does_not_depend_on_the_reader(robot_folder):
+    """If nobody reads stderr, the files are written and the exit status is that of the result."""
+    Path("data.csv").write_text(positions_csv(20))
+    reader, writer = os.pipe()
+    os.close(reader)
+    assert program("calibrate", "arm.dh.toml", "data.csv", "-o", "o.urdf", stderr=writer) == (0, b"")
+    os.close(writer)
+    assert Path("o.urdf").is_file()
+
+
+def test_closed_standard_output(robot_folder):
+    """A JSON document for a closed standard output is an error in one line, and nothing is written."""
+    Path("data.csv").write_text(positions_csv(20))
+    words = "calibrate arm.dh.toml data.csv -o o.urdf --json -"
+    command = f"{sys.executable} -m dhcal_pin.cli {words} >&-"
+    done = subprocess.run(command, shell=True, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == ("dhcal: standard output is closed; no file is written; name a file with --json\n")
+    assert not Path("o.urdf").exists()

@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
 import dhcal_pin as dh
+from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import RefusedCalibrationError
+from dhcal_pin.measurements import Noise, Position
 
 OUTPUTS = ("--json", "r.json", "--report", "r.html", "--report", "r.md", "--map", "m.csv")
 # One iteration does not solve the problem.
@@ -375,3 +377,18 @@ def test_a_named_mistake_is_undone_in_the_files_that_have_it(run, robot_folder):
     assert (status, "does not apply to measurements of kind point_distance" in err) == (2, True)
     status, _, err = run(*command, "--mend", f"{key}@points.csv")
     assert (status, "unknown file; choose from point.csv, point_distance.csv" in err) == (2, True)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_too_small_sigmas_are_named_as_the_cause_of_a_large_correction(seed):
+    """Noise of 0.3 mm with stated 0.01 mm; without stated standard deviations the result is ok."""
+    chain = dh.Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    rng, errors = np.random.default_rng(seed), select_parameters(chain, "placement")
+    sizes = np.array([1e-3 if p.unit == "m" else 5e-3 for p in errors.parameters])
+    truth = errors.at(rng.normal(size=len(sizes)) * sizes)
+    q = rng.uniform(chain.lower, chain.upper, (80, 6))
+    measured = Position.simulate(truth, q, Noise(3e-4), rng).positions()
+    reasons = dh.calibrate(chain, Position(q, measured, sigma=1e-5)).verdict.reasons
+    assert "times as large as the stated standard deviations" in reasons[0]
+    assert "leave the sigma columns out" in reasons[0]
+    assert dh.calibrate(chain, Position(q, measured)).verdict.status == "ok"

@@ -35,8 +35,12 @@ def _print(terminal: Console | None, lines: Sequence[Line]) -> None:
     """Print lines as they are."""
     if terminal is None:
         if sys.stderr:  # it may be closed
-            sys.stderr.write("".join(f"{line.text}\n" for line in lines))
-            sys.stderr.flush()
+            try:
+                sys.stderr.write("".join(f"{line.text}\n" for line in lines))
+                sys.stderr.flush()
+            except OSError:
+                # The reader has gone or the disk is full. The result, and the exit status, are the same.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
         return
     from rich.text import Text
 
@@ -62,13 +66,22 @@ def show_progress(title: str) -> Iterator[Progress | None]:
     if terminal is None:
         yield None
         return
+    from rich.live import Live
+    from rich.spinner import Spinner
     from rich.text import Text
 
-    def update(phase: str, step: int, total: int) -> None:
-        status.update(Text(escape_control_characters(f"{phase} {step}/{total}")))
+    spinner = Spinner("dots", Text(escape_control_characters(title)), style="status.spinner")
 
-    with terminal.status(Text(escape_control_characters(title))) as status:
+    def update(phase: str, step: int, total: int) -> None:
+        spinner.update(text=Text(escape_control_characters(f"{phase} {step}/{total}")))
+
+    with Live(spinner, console=terminal, transient=True, redirect_stdout=_is_on_terminal()):
         yield update
+
+
+def _is_on_terminal() -> bool:
+    """Return whether standard output is a terminal; else nothing may change what is written to it."""
+    return sys.stdout is not None and sys.stdout.isatty()
 
 
 def print_progress(phase: str, step: int, total: int) -> None:
@@ -87,7 +100,7 @@ def progress_bar(title: str, total: int, n_done: int = 0) -> Iterator[Callable[[
     from rich.markup import escape
     from rich.progress import Progress as ProgressBar
 
-    with ProgressBar(console=terminal) as bar:
+    with ProgressBar(console=terminal, redirect_stdout=_is_on_terminal()) as bar:
         # The bar reads markup such as [bold] in its description.
         task = bar.add_task(escape(escape_control_characters(title)), total=total, completed=n_done)
         yield lambda count: bar.update(task, completed=count)
