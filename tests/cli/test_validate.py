@@ -8,7 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import CALIBRATE, HEADER, KEYS, json_of, parse_json, stdout_of, tool_positions, unfolded
+from command_line import (
+    CALIBRATE,
+    HEADER,
+    KEYS,
+    json_of,
+    parse_json,
+    positions_csv,
+    stdout_of,
+    tool_positions,
+    unfolded,
+)
 from robots import URDF, robot_file
 
 
@@ -289,3 +299,12 @@ def test_frames_of_few_samples_are_compared(run, robot_folder, count, is_said):
         np.savetxt("few.csv", moved, "%.9f", ",", header=HEADER, comments="")
         warnings = json_of(run("validate", "arm.urdf", "few.csv", "--json", "-"))["warnings"]
         assert any("--fit-frames" in text for text in warnings) == (is_said and shift > 0)
+
+
+def test_tip_of_a_urdf_does_not_concern_a_nominal_dh_table(run, robot_folder):
+    """The nominal robot may be a DH table, which has no option --tip."""
+    Path("data.csv").write_text(positions_csv(20))
+    words = ("validate", "arm.urdf", "data.csv", "--tip", "tool0", "--nominal", "arm.dh.toml")
+    status, _, err = run(*words)
+    assert status == 0, err
+    assert run("diff", "arm.urdf", "arm.dh.toml", "--tip", "tool0")[0] == 0

@@ -6,7 +6,7 @@ from argparse import Namespace
 
 from ... import diagnostics, io, report
 from .. import screens
-from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
+from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_robot_or_table
 from ..output_table import Output
 
 EXAMPLE = "dhcal diff ur10_may.urdf ur10_june.urdf --tip tool0 --report difference.html"
@@ -45,7 +45,7 @@ def run(args: Namespace) -> int:
 
 def _read(path: str, args: Namespace) -> diagnostics.Calibrated:
     """Read a robot and what its sidecar says of its calibration."""
-    chain, sidecar = read_one_robot(path, args), io.existing_sidecar(path)
+    chain, sidecar = read_robot_or_table(path, args), io.existing_sidecar(path)
     if sidecar is None:
         return diagnostics.Calibrated(chain, source=path)
     return diagnostics.Calibrated(

@@ -298,7 +298,7 @@ def _nominal_accuracy(
     """Compute the accuracy of the nominal robot; fit its base and tool if the calibrated robot has others."""
     import numpy as np  # lazy import: slow to load
 
-    nominal = options.read_one_robot(args.nominal, args)
+    nominal = options.read_robot_or_table(args.nominal, args)
     if nominal.joint_names != chain.joint_names:
         raise InvalidArgumentError(
             f"{args.nominal}: joints {', '.join(nominal.joint_names)}; expected the joints of {args.robot}: "
