@@ -444,7 +444,8 @@ def _implausible_correction(fit: Evidence) -> list[Finding]:
 def _too_small_sigmas(fit: Evidence) -> str:
     """Name stated standard deviations as a cause if the correction is plausible with larger ones."""
     ratios = [ratio or 1.0 for ratio in fit.sigma_ratios]
-    if max(ratios) < MIN_SIGMA_RATIO:
+    # Few wrong samples may be the cause as well.
+    if max(ratios) < MIN_SIGMA_RATIO or _hidden_outliers(fit):
         return ""
     data = [
         item.with_scaled_sigma(dict.fromkeys(item.residual_groups, ratio))
