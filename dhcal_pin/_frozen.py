@@ -61,20 +61,20 @@ def _frozen(cls: Any, eq: bool) -> Any:
 
 def _constructor(cls: Any) -> Callable[..., None]:
     """Compile the constructor of a dataclass."""
-    names: dict[str, Any] = {"set_": object.__setattr__, "factory_": _FACTORY}
+    names: dict[str, Any] = {"__set__": object.__setattr__, "__factory__": _FACTORY}
     arguments, entries = ["self"], []
     for item in fields(cls):
         name = value = argument = item.name
         if item.default is not MISSING:
-            names[f"{name}_"] = item.default
-            argument = f"{name}={name}_"
+            names[f"__{name}"] = item.default
+            argument = f"{name}=__{name}"
         elif item.default_factory is not MISSING:
-            names[f"{name}_"] = item.default_factory
-            argument, value = f"{name}=factory_", f"{name}_() if {name} is factory_ else {name}"
+            names[f"__{name}"] = item.default_factory
+            argument, value = f"{name}=__factory__", f"__{name}() if {name} is __factory__ else {name}"
         arguments.append(argument)
         entries.append(f"'{name}': {value}")
     # A line per field takes twice as long to compile.
-    lines = [f"set_(self, '__dict__', {{{', '.join(entries)}}})"]
+    lines = [f"__set__(self, '__dict__', {{{', '.join(entries)}}})"]
     if hasattr(cls, "__post_init__"):
         lines.append("self.__post_init__()")
     exec(f"def __init__({', '.join(arguments)}): {'; '.join(lines)}", names)

@@ -22,6 +22,8 @@ def declared(decorator: Any) -> tuple[type, type]:
         a: int
         b: list[str] = field(default_factory=list, compare=False)
         c: float = field(default=0.5, repr=False)
+        set: int = 0
+        factory: int = 1
 
     base = decorator(Base)
 

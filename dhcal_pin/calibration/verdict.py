@@ -95,7 +95,7 @@ MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # Residuals this many times as large as the stated standard deviations may be the cause of a large correction.
 MIN_SIGMA_RATIO = 10.0
 # Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
-# probability and one degree of freedom. That with more is closer to 0.
+# probability and one degree of freedom. Those with more degrees of freedom are closer to 0.
 MAX_CHANCE, MIN_T = 0.025, -12.71
 # Outliers spoil a fit if the error without them is smaller by this factor.
 MAX_SPOILED_RATIO = 1.5

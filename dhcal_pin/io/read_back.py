@@ -99,8 +99,8 @@ def _pose_in_base(robot: Any, by_child: Mapping[str, Any], link: str) -> Array:
 @cache
 def _yourdfpy_reader() -> dict[str, Any]:
     """Return the names of yourdfpy's module that reads URDF, without slow imports."""
-    # The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it. It does not
-    # compare objects.
+    # The import of trimesh takes 0.7 s of processor time. Reading needs three functions of it,
+    # and no comparison of objects.
     trimesh: Any = ModuleType("trimesh")
     trimesh.Trimesh = trimesh.Scene = object  # in annotations
     trimesh.transformations = SimpleNamespace(
