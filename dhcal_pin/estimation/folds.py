@@ -127,13 +127,15 @@ def count_rows(problem: Problem) -> int:
     return sum(item.residual_dim * len(item.rows) for item in problem.data)
 
 
-def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
+def factor_partition(
+    problem: Problem, x: Array, folds: Sequence[Fold], whole: NormalEquations | None = None
+) -> Iterator[FoldSystems]:
     """Compute the triangular systems of disjoint folds; the rows of each sample are factored once."""
     if uses_normal_equations(problem):
-        # The last label is that of samples in no fold.
+        # The last label is that of samples in no fold, which count only in the equations of all samples.
         labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
-        equations = normal_equations_by_part(problem, x, labels)
-        whole = NormalEquations(reduce(np.add, (one.products for one in equations)))
+        equations = normal_equations_by_part(problem, x, labels, len(folds) + (0 if whole else 1))
+        whole = whole or NormalEquations(reduce(np.add, (one.products for one in equations)))
         for fold, one in zip(folds, equations, strict=False):
             n_rows = sum(
                 item.residual_dim * int(mask.sum()) for item, mask in zip(problem.data, fold, strict=True)
@@ -156,14 +158,17 @@ def factor_partition(problem: Problem, x: Array, folds: Sequence[Fold]) -> Itera
 
 def factor_folds(problem: Problem, x: Array, folds: Sequence[Fold]) -> Iterator[FoldSystems]:
     """Compute the triangular systems of folds; consecutive disjoint folds are factored once."""
-    group: list[Fold] = []
+    groups: list[list[Fold]] = []
     for fold in folds:
-        if any(np.any(a & b) for other in group for a, b in zip(fold, other, strict=True)):
-            yield from factor_partition(problem, x, group)
-            group = []
-        group.append(fold)
-    if group:
-        yield from factor_partition(problem, x, group)
+        last = groups[-1] if groups else []
+        if not last or any(np.any(a & b) for other in last for a, b in zip(fold, other, strict=True)):
+            groups.append([])
+        groups[-1].append(fold)
+    whole: NormalEquations | None = None
+    for group in groups:
+        for systems in factor_partition(problem, x, group, whole):
+            whole = systems.whole
+            yield systems
 
 
 def solve_fold(

@@ -510,12 +510,13 @@ def _chunk_products(linearization: Linearization, chunk: Chunk) -> Array:
     return linearization.structured_rows(chunk).products()
 
 
-def normal_equations_by_part(problem: Problem, x: Array, labels: Sequence[Array]) -> list[NormalEquations]:
-    """Compute the normal equations of the samples of each label 0, 1, …, given for each measurement, (m,)."""
+def normal_equations_by_part(
+    problem: Problem, x: Array, labels: Sequence[Array], count: int
+) -> list[NormalEquations]:
+    """Compute the normal equations of the samples of each label below a count; labels (m,) by measurement."""
     of_chunks = [
         label[start : start + CHUNK_SIZE] for label in labels for start in range(0, len(label), CHUNK_SIZE)
     ]
-    count = max(int(label.max(initial=-1)) for label in labels) + 1
     function = partial(_chunk_products_by_part, problem.linearize(x), count)
     products = problem.executor.map(function, zip(problem.chunks, of_chunks, strict=True))
     return [NormalEquations(reduce(np.add, parts)) for parts in zip(*products, strict=True)]

@@ -40,8 +40,29 @@ from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
 
-# Terms that each thread evaluated last, with what they depend on.
-_last_terms = threading.local()
+# Number of arrays of terms that each thread keeps: those of all samples, of the parts of a cross-validation, and
+# of random configurations are needed in turn.
+_MAX_CACHED_TERMS = 6
+
+
+@frozen(eq=False)
+class _EvaluatedTerms:
+    """Terms, with what they depend on."""
+
+    loads: GravityLoads
+    order: int
+    conditions: Conditions
+    terms: Array
+
+
+class _LastTerms(threading.local):
+    """Terms that a thread used last, the latest one first."""
+
+    def __init__(self) -> None:
+        self.evaluated: list[_EvaluatedTerms] = []
+
+
+_last_terms = _LastTerms()
 
 
 @frozen
@@ -193,17 +214,16 @@ class Transmission:
 
     def terms(self, conditions: Conditions) -> Array:
         """Evaluate the terms q, sin q, cos q, sin 2q, cos 2q, …, the joint terms and the link terms."""
-        # They do not depend on the coefficients. Each thread keeps those that it evaluated last.
-        last = vars(_last_terms)
-        is_same = last and last["loads"] is self.loads and last["order"] == self.order
-        if not is_same or not last["conditions"].equals(conditions.of_joints):
-            last.update(
-                loads=self.loads,
-                order=self.order,
-                conditions=conditions.of_joints.copy(),
-                terms=self._terms(conditions),
-            )
-        return last["terms"]
+        # They do not depend on the coefficients. Each thread keeps those that it used last.
+        last, of_joints = _last_terms.evaluated, conditions.of_joints
+        for i, one in enumerate(last):
+            if one.loads is self.loads and one.order == self.order and one.conditions.equals(of_joints):
+                found = last.pop(i)
+                break
+        else:
+            found = _EvaluatedTerms(self.loads, self.order, of_joints.copy(), self._terms(conditions))
+        last[:] = [found, *last[: _MAX_CACHED_TERMS - 1]]
+        return found.terms
 
     def _terms(self, conditions: Conditions) -> Array:
         """Evaluate the terms."""
