@@ -80,7 +80,9 @@ class _VersionAction(argparse.Action):
     def __call__(self, *_: object) -> NoReturn:
         from importlib.metadata import version  # lazy import: reads the installed metadata
 
-        print(f"dhcal {version('dhcal-pin')}")
+        from .screens.streams import print_result
+
+        print_result(f"dhcal {version('dhcal-pin')}\n", "version")
         sys.exit(0)
 
 
@@ -167,16 +169,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 os.environ.setdefault(name, "1")
             return args.run(args)
     except (Exception, KeyboardInterrupt) as error:
+        from .screens.streams import print_message  # lazy import: only for errors
+
         if isinstance(error, KeyboardInterrupt) or interrupt.is_received:
             outputs = _outputs_module()
             written = ", ".join(outputs.written_files()) if outputs is not None else ""
             what = f"these files are written: {written}" if written else "nothing written"
-            print(f"dhcal: interrupted; {message_line(what)}", file=sys.stderr)
+            print_message(f"dhcal: interrupted; {message_line(what)}")
             return 130
         if isinstance(error, DhcalError | MemoryError):
             is_known = isinstance(error, DhcalError)
             text = message_line(error) if is_known else "not enough memory; use fewer samples"
-            print(f"dhcal: {text}", file=sys.stderr)
+            print_message(f"dhcal: {text}")
             return 2
         raise
 

@@ -62,9 +62,17 @@ class CommandParser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"invalid choice: {value!r}{text}")
         super()._check_value(action, value)
 
+    def print_help(self, file: Any = None) -> None:
+        """Print the help on standard output."""
+        from .screens.streams import print_result  # lazy import: a command that runs does not need it
+
+        print_result(self.format_help(), "help")
+
     def error(self, message: str) -> NoReturn:
         """Print one line to stderr and exit with status 2."""
-        print(f"{self.prog}: {message_line(message)}; see {self.prog} --help", file=sys.stderr)
+        from .screens.streams import print_message  # lazy import: only for errors
+
+        print_message(f"{self.prog}: {message_line(message)}; see {self.prog} --help")
         sys.exit(2)
 
 
@@ -120,11 +128,12 @@ def find_robot(text: str) -> str:
     """Return the path of a robot file, also for `example:NAME` and for a robot that ships, and say which."""
     from ..io.shipped_files import resolve_robot_file  # lazy import, as the following: only for robots
     from ..ros_packages import EXAMPLE_PREFIX
+    from .screens.streams import print_message
 
     path = resolve_robot_file(text)
     if path != text and not text.startswith(EXAMPLE_PREFIX):
         line = f"{text} is not in this folder; the file that ships with dhcal is used: {path}"
-        print(message_line(line), file=sys.stderr)
+        print_message(message_line(line))
     return path
 
 

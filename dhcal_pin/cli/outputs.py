@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 
 from .._typing import PathLike
-from ..exceptions import FileFormatError, InvalidArgumentError
+from ..exceptions import InvalidArgumentError
 from ..io.sidecar import existing_sidecar
 from ..io.tables import WORKBOOK_ENDINGS
 from ..report.json_document import json_text
@@ -18,6 +16,7 @@ from ..report.provenance import file_digests, versions
 from ..saving import defer_signals, is_stream, require_writable, write_files
 from .options import STDOUT
 from .output_table import Output, OutputFile, chosen_files, require_endings
+from .screens.streams import print_result
 
 
 def is_same_file(a: str, b: str) -> bool:
@@ -86,7 +85,7 @@ def write_outputs(
         contents = {**contents, json_target: json_text(document)}
     # An interrupt waits until the files are noted as written.
     with defer_signals():
-        write_files(contents, (lambda: print_to_stdout(json_text(document))) if is_printed else None)
+        write_files(contents, (lambda: print_json(json_text(document))) if is_printed else None)
         _written.extend(os.fspath(path) for path, content in contents.items() if content is not None)
 
 
@@ -105,22 +104,11 @@ def write_with_json(
     write_outputs(contents, json_target, document)
 
 
-def print_to_stdout(text: str) -> None:
-    """Print a JSON text and nothing else on standard output."""
-    if sys.stdout is None:
-        raise FileFormatError("standard output is closed; no file is written; name a file with --json")
+def print_json(text: str) -> None:
+    """Print a JSON text on standard output."""
+    remedy = "no file is written; name a file with --json"
     try:
-        try:
-            sys.stdout.write(text)
-        except UnicodeEncodeError:
-            # Standard output has another encoding; JSON can escape all characters.
-            sys.stdout.write(json.dumps(json.loads(text), indent=2) + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        # Python would try to write the rest when it ends, and print a traceback.
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise FileFormatError(
-            f"standard output: cannot write the JSON: {error.strerror}; no file is written; name a file with "
-            "--json"
-        ) from error
+        print_result(text, "JSON", remedy)
+    except UnicodeEncodeError:
+        # Standard output has another encoding; JSON can escape all characters.
+        print_result(json.dumps(json.loads(text), indent=2) + "\n", "JSON", remedy)

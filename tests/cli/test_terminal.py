@@ -132,3 +132,34 @@ def test_closed_standard_output(robot_folder):
     assert done.returncode == 2
     assert done.stderr == ("dhcal: standard output is closed; no file is written; name a file with --json\n")
     assert not Path("o.urdf").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "noun"),
+    [
+        ("--version", "version"),
+        ("--help", "help"),
+        ("calibrate --help", "help"),
+        ("completion bash", "script"),
+    ],
+)
+def test_standard_output_without_a_reader(words, noun):
+    """It is an error in one line, as for a JSON document."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "dhcal_pin.cli", *words.split()]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"dhcal: standard output: cannot write the {noun}: Broken pipe; expected an open file or pipe\n"
+    )
+
+
+@pytest.mark.parametrize("words", ["calibrat", "calibrate --xyz", "validate no.urdf no.csv", "validate"])
+def test_error_without_a_reader(words):
+    """The exit status is that of the error."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    assert program(*words.split(), stderr=writer) == (2, b"")
+    os.close(writer)

@@ -6,6 +6,7 @@ from argparse import Namespace, _SubParsersAction
 
 from ...exceptions import InvalidArgumentError
 from ..options import IntegerType, Options, expand_placeholders
+from ..screens.streams import print_result
 
 EXAMPLE = "dhcal completion bash"
 SHELLS = ("bash", "zsh", "fish")
@@ -35,5 +36,5 @@ def run(args: Namespace) -> int:
             if action.nargs != 0 and not action.choices and not isinstance(action.type, IntegerType):
                 is_folder = action.metavar == "DIR"
                 action.complete = shtab.DIRECTORY if is_folder else shtab.FILE  # pyright: ignore
-    print(shtab.complete(parser, args.shell))
+    print_result(f"{shtab.complete(parser, args.shell)}\n", "script")
     return 0

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from argparse import Namespace
 from dataclasses import asdict
 
 from ...messages import message_line
 from ..options import JSON, Options
+from ..screens.streams import print_message
 
 EXAMPLE = "dhcal doctor"
 _STYLES = {"ok": "", "note": "yellow", "failed": "bold red"}
@@ -24,7 +24,7 @@ def run(args: Namespace) -> int:
         from ..outputs import require_writable_outputs, write_outputs
         from ..screens import console
     except ImportError as error:
-        print(f"failed  imports: {message_line(error)}; install dhcal-pin again", file=sys.stderr)
+        print_message(f"failed  imports: {message_line(error)}; install dhcal-pin again")
         return 1
 
     require_writable_outputs([args.json], [])

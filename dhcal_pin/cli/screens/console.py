@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from ..._typing import Progress
 from ...messages import escape_control_characters
 from .screen import Line, Screen, Verbosity
+from .streams import print_message
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,13 +35,8 @@ def _terminal() -> Console | None:
 def _print(terminal: Console | None, lines: Sequence[Line]) -> None:
     """Print lines as they are."""
     if terminal is None:
-        if sys.stderr:  # it may be closed
-            try:
-                sys.stderr.write("".join(f"{line.text}\n" for line in lines))
-                sys.stderr.flush()
-            except OSError:
-                # The reader has gone or the disk is full. The result, and the exit status, are the same.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+        if lines:
+            print_message("\n".join(line.text for line in lines))
         return
     from rich.text import Text
 
