@@ -46,10 +46,14 @@ def chosen_files(options: Mapping[str, Any], table: Mapping[str, Output]) -> lis
 
 
 def require_endings(files: Iterable[OutputFile]) -> None:
-    """Require that the names of files have the endings of their rows."""
+    """Require that the names of files have the endings of their rows; a device may hold the only format."""
+    from ..saving import is_stream  # lazy import: loads NumPy
+
     for file in files:
         endings = file.output.endings
-        if endings and not file.path.lower().endswith((*endings, *file.output.other_endings)):
+        has_format = len(endings) == 1 and is_stream(file.path)
+        has_format = has_format or file.path.lower().endswith((*endings, *file.output.other_endings))
+        if endings and not has_format:
             raise InvalidArgumentError(
                 f"{file.path}: unknown ending; write {file.output.noun} as {' or '.join(endings)}"
             )

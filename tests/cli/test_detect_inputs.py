@@ -262,3 +262,10 @@ def test_images_that_do_not_exist_are_named(assert_refused, folder, joints):
     Path("rig.toml").write_text(rig_text([CAMERA], BOARDS))
     words = ["nothere: no such file or folder"]
     assert_refused(words, "detect", "nothere", "--rig", "rig.toml", *joints, "-o", "corners.csv")
+
+
+def test_corners_are_written_as_csv(assert_refused, folder):
+    render(("one.png", [1]))
+    Path("rig.toml").write_text(rig_text([CAMERA], BOARDS))
+    words = ["corners.parquet: unknown ending; write image coordinates as .csv"]
+    assert_refused(words, "detect", "images", "--rig", "rig.toml", "-o", "corners.parquet")

@@ -141,6 +141,18 @@ ARGUMENTS = {
         ["'1ft'", "0.1mm"],
     ),
     "noise below zero": (["simulate", "arm.urdf", "-m", "5", "--noise=-1mm", "-o", "s.csv"], ["'-1mm'", "0"]),
+    "simulate to a workbook": (
+        ["simulate", "arm.urdf", "-m", "5", "-o", "s.xlsx"],
+        ["s.xlsx: unknown ending; write measurements as .csv"],
+    ),
+    "compensate to JSON": (
+        ["compensate", "arm.urdf", "arm.urdf", "targets.csv", "-o", "c.json"],
+        ["c.json: unknown ending; write corrected targets as .csv"],
+    ),
+    "study to a workbook": (
+        ["study", "figure3", "-o", "results.xlsx"],
+        ["results.xlsx: unknown ending; write a table of results as .csv"],
+    ),
     "simulate over the robot": (
         ["simulate", "arm.urdf", "-m", "5", "-o", "arm.urdf"],
         ["arm.urdf: is an input"],

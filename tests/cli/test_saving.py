@@ -43,6 +43,12 @@ def test_json_into_a_device(run, robot_folder):
     assert run(*CALIBRATE, "--json", "/dev/null")[0] == 0
 
 
+def test_a_device_needs_no_ending(run, robot_folder):
+    """It has the only format of an output."""
+    assert run("simulate", "arm.urdf", "-n", "5", "-o", "/dev/null")[0] == 0
+    assert run(*CALIBRATE, "--map", "/dev/null")[0] == 2
+
+
 def test_json_into_a_pipe(run, robot_folder):
     os.mkfifo("pipe")
     received = []

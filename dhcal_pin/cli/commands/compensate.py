@@ -59,7 +59,11 @@ def run(args: Namespace) -> int:
     robots = [args.nominal, args.calibrated]
     tcp_file = [args.tcp] if args.tcp and os.path.exists(args.tcp) else []
     inputs = [*robots, *existing_sidecars(robots), args.targets, *tcp_file]
-    table = {"output": Output(), "export": Output("a program", tuple(FORMATS)), "json": Output()}
+    table = {
+        "output": Output("corrected targets", (".csv",)),
+        "export": Output("a program", tuple(FORMATS)),
+        "json": Output(),
+    }
     checked_files(args, table, inputs)
     nominal, calibrated = read_robots(args)
     targets = io.read_targets(args.targets, calibrated)

@@ -78,7 +78,8 @@ def _with_stills(args: Namespace, folder: str) -> tuple[list[str], list[str]]:
 def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Sequence[str]) -> int:
     """Find the corners in images and write them."""
     from ...io.measurement_files.columns import IN_ORDER  # lazy import, as the following: they load Pinocchio
-    from ..outputs import require_writable_outputs, write_with_json
+    from ..output_table import Output
+    from ..outputs import checked_files, require_writable_outputs, write_with_json
 
     # A recording of ROS 2 is a folder.
     files = [args.joints] if args.joints and os.path.isfile(args.joints) else []
@@ -86,7 +87,7 @@ def _run(args: Namespace, folder: str, images: Sequence[str], video_notes: Seque
     stills = [path for path in paths if os.path.dirname(path) == folder]
     videos = [path for path in args.images if os.path.isfile(path) and path not in paths]
     inputs = [args.rig, *files, *(path for path in paths if path not in stills), *videos]
-    require_writable_outputs([args.output, args.json], inputs)
+    checked_files(args, {"output": Output("image coordinates", (".csv",)), "json": Output()}, inputs)
     rig = io.read_rig(args.rig)
     camera = io.only_entry(rig.cameras, args.camera, "camera", args.rig)
     read = _joints(args, paths)

@@ -60,11 +60,12 @@ def run(args: Namespace) -> int:
 
     from ...measurements import KINDS, Noise
     from ...units import parse_noise
-    from ..outputs import existing_sidecars, require_writable_outputs, write_with_json
+    from ..output_table import Output
+    from ..outputs import checked_files, existing_sidecars, require_writable_outputs, write_with_json
 
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
-    require_writable_outputs([args.output, args.json], inputs)
+    checked_files(args, {"output": Output("measurements", (".csv",)), "json": Output()}, inputs)
     sigma = _length_of_pixels(args.noise) if args.kind == "camera" else args.noise
     noise = Noise(*parse_noise(sigma, "--sigma"))
     if args.truth and args.errors:
