@@ -10,6 +10,7 @@ from dhcal_pin.messages import (
     escape_control_characters,
     message_line,
     quote,
+    similar_words,
 )
 
 # Escape sequence, bell, C1 control, bidirectional marks, line and paragraph separator, surrogate, zero width.
@@ -53,3 +54,54 @@ def test_deep_values_are_quoted():
 def test_short_values_are_quoted_in_full():
     assert quote("it's") == '"it\'s"'
     assert quote([1, 2.5, "a", True]) == "[1, 2.5, 'a', True]"
+
+
+OPTIONS = [
+    *("--arm", "--bounds", "--bundle", "--columns", "--curves", "--extend", "--fix", "--free", "--holdout"),
+    *(
+        "--json",
+        "--loss",
+        "--max-iterations",
+        "--mend",
+        "--output",
+        "--package-dir",
+        "--parameters",
+        "--quiet",
+    ),
+    *("--report", "--root", "--scene", "--seed", "--session", "--skip-bad-rows", "--tip", "--tool-frame"),
+]
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("--sed", "--seed"),
+        ("--joson", "--json"),
+        ("--tpi", "--tip"),
+        ("--outptu", "--output"),
+        ("--coloumns", "--columns"),
+        ("--paramters", "--parameters"),
+        ("--hold-out", "--holdout"),
+        ("--boundle", "--bundle"),
+        ("--extends", "--extend"),
+        ("--quit", "--quiet"),
+        ("--max_iter", "--max-iterations"),
+        ("--iterations", "--max-iterations"),
+        ("--bad-rows", "--skip-bad-rows"),
+        ("--tool", "--tool-frame"),
+        ("--ROOT", "--root"),
+    ],
+)
+def test_misspelt_and_abbreviated_words_are_recognized(word, expected):
+    assert similar_words(word, OPTIONS) == [expected]
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "--",
+        *"speed fit-frames tolerance plot robot data scale time version count cores model units x".split(),
+    ],
+)
+def test_other_words_are_not_taken_for_misspelt_ones(word):
+    assert similar_words(word, OPTIONS) == []

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
+from itertools import takewhile
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -52,7 +53,7 @@ class _LazyCommandParser(CommandParser):
     def parse_known_args(self, *args: Any, **options: Any) -> Any:
         """Declare the arguments of the command, then parse. Options may stand between the names of files."""
         self.declare_arguments()
-        self.refuse_unknown_options(args[0])
+        self._refuse_unknown_options(args[0])
         found, others = super().parse_known_args(*args, **options)
         last = [action for action in self._actions if not action.option_strings][-1:]
         if others and last and last[0].nargs in ("*", "+") and not any(w.startswith("-") for w in others):
@@ -63,6 +64,14 @@ class _LazyCommandParser(CommandParser):
             self.error(f"unrecognized arguments: {' '.join(others)}")
         return found, others
 
+    def _refuse_unknown_options(self, words: Sequence[str]) -> None:
+        """Report the first unknown option with two hyphens, before options that are missing."""
+        for word in takewhile(lambda word: word != "--", words):
+            name = word.partition("=")[0]
+            if name.startswith("--") and " " not in word and not self.has_option(name):
+                hint = self.suggestion(name) or _owners_hint(name)
+                self.error(f"unrecognized arguments: {name}{hint}")
+
     def declare_arguments(self) -> None:
         """Declare the arguments of the command, once."""
         if self._has_arguments:
@@ -72,6 +81,21 @@ class _LazyCommandParser(CommandParser):
         self.epilog = f"example:\n  {module.EXAMPLE}"
         add_options(self, {**module.ARGUMENTS, **VERBOSITY_OPTIONS})
         self.set_defaults(run=module.run)
+
+
+class _MainParser(CommandParser):
+    """Parser of the words before the name of a command."""
+
+    def parse_known_args(self, *args: Any, **options: Any) -> Any:
+        """Refuse an unknown option before the command, whose value would be taken for the command."""
+        words = args[0]
+        name = words[0].partition("=")[0] if words else ""
+        if name.startswith("-") and name != "--" and not self.has_option(name):
+            if _owners(name):
+                command = next((word for word in words if word in COMMANDS), "COMMAND")
+                self.error(f"{name} stands before the command; expected dhcal {command} ... {name}")
+            self.error(f"unrecognized arguments: {name}{self.suggestion(name)}")
+        return super().parse_known_args(*args, **options)
 
 
 class _VersionAction(argparse.Action):
@@ -88,7 +112,7 @@ class _VersionAction(argparse.Action):
 
 def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     """Build the parser of all commands, or of the one that the words begin with."""
-    parser = CommandParser(
+    parser = _MainParser(
         prog="dhcal",
         description="Robot kinematic calibration: estimate the errors of a robot and correct its URDF.",
         epilog="ROBOT is a URDF or a DH file. `dhcal COMMAND --help` shows the options and an example.",
@@ -103,13 +127,24 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     return parser
 
 
-def command_parsers() -> dict[str, argparse.ArgumentParser]:
+def command_parsers() -> dict[str, CommandParser]:
     """Build the complete parsers of all commands, for their documentation."""
     out = {}
     for name in COMMANDS:
         parser = out[name] = _LazyCommandParser(prog=f"dhcal {name}", **_parser_options(name))
         parser.declare_arguments()
     return out
+
+
+def _owners(option: str) -> list[str]:
+    """Return the commands that have an option."""
+    return [name for name, parser in command_parsers().items() if parser.has_option(option)]
+
+
+def _owners_hint(option: str) -> str:
+    """Name the commands that have an option."""
+    owners = _owners(option)
+    return f" (an option of {', '.join(owners)})" if owners else ""
 
 
 def _parser_options(name: str) -> dict[str, Any]:

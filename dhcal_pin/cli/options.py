@@ -15,12 +15,11 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
-from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from ..messages import message_line
+from ..messages import message_line, similar_words
 
 if TYPE_CHECKING:
     from ..io.measurement_files import MeasurementFile
@@ -48,12 +47,13 @@ class CommandParser(argparse.ArgumentParser):
         # argparse takes a word with a minus sign for a value only if this pattern matches it.
         self._negative_number_matcher = re.compile(r"-\.?\d")
 
-    def refuse_unknown_options(self, words: Sequence[str]) -> None:
-        """Report the first unknown option with two hyphens, before options that are missing."""
-        for word in takewhile(lambda word: word != "--", words):
-            name = word.partition("=")[0]
-            if name.startswith("--") and " " not in word and name not in self._option_string_actions:
-                self.error(f"unrecognized arguments: {name}{_suggestion(name, self._option_string_actions)}")
+    def has_option(self, name: str) -> bool:
+        """Return whether an option is declared."""
+        return name in self._option_string_actions
+
+    def suggestion(self, name: str) -> str:
+        """Name the options that an unknown one may be."""
+        return _suggestion(name, (known for known in self._option_string_actions if known.startswith("--")))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Suggest a choice in place of a misspelt one."""
@@ -77,13 +77,9 @@ class CommandParser(argparse.ArgumentParser):
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
-    """Name the words that begin with an unknown one, or the most similar ones."""
-    from difflib import get_close_matches  # lazy import: only for errors
-
-    # Hyphens would count as similarity.
-    word, names = word.lstrip("-")[:100], {name.lstrip("-"): name for name in known}
-    near = [name for name in names if name.startswith(word)] or get_close_matches(word, names, 1)
-    return f" (did you mean {' or '.join(names[name] for name in near[:3])}?)" if near else ""
+    """Name the words that an unknown one may be."""
+    near = similar_words(word, known)
+    return f" (did you mean {' or '.join(near[:3])}?)" if near else ""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

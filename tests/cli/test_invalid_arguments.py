@@ -21,6 +21,25 @@ ARGUMENTS = {
         [*CALIBRATE[:-2], "--ouput", "out.urdf"],
         ["--ouput (did you mean --output?)"],
     ),
+    "option of another command": (
+        [*CALIBRATE, "--fit-frames"],
+        ["unrecognized arguments: --fit-frames (an option of validate, view); see"],
+    ),
+    "unlike any option": ([*CALIBRATE, "--speed", "1"], ["unrecognized arguments: --speed; see"]),
+    "misspelt option without a command": (["--verison"], ["--verison (did you mean --version?)"]),
+    "unknown option without a command": (["-x"], ["unrecognized arguments: -x; see dhcal --help"]),
+    "option before the command": (
+        ["--tip", "tool0", *CALIBRATE],
+        ["--tip stands before the command; expected dhcal calibrate ... --tip; see dhcal --help"],
+    ),
+    "option with its value before the command": (
+        ["--tip=tool0", *CALIBRATE],
+        ["--tip stands before the command; expected dhcal calibrate ... --tip; see dhcal --help"],
+    ),
+    "option without a command": (
+        ["-o", "out.urdf"],
+        ["-o stands before the command; expected dhcal COMMAND"],
+    ),
     "misspelt choice": ([*CALIBRATE, "--arm", "lowcost"], ["'lowcost' (did you mean low-cost?)"]),
     "no output": (["calibrate", "arm.dh.toml", "data.csv"], ["-o", "required", "dhcal calibrate --help"]),
     "no data": (["calibrate", "arm.dh.toml", "-o", "out.urdf"], ["DATA", "required"]),
