@@ -18,7 +18,7 @@ from typing import Any
 from .._typing import Progress
 from ..exceptions import FileFormatError, InvalidArgumentError
 from ..io.bundle import Bundle, read_bundle
-from ..io.robot import find_format, read_robot
+from ..io.robot import has_robot_ending, read_robot
 from ..io.sidecar import sidecar_path
 from ..io.tabular import read_bytes
 from ..parallel import SERIAL, TaskExecutor
@@ -75,8 +75,7 @@ def _continued(args: Namespace, bundle: Bundle, folder: str) -> Job:
     """Return the job of a bundle with the options, the robot and the data of a command line."""
     given = given_options(args)
     words = [given.pop("robot", None), *given.pop("data", ())]
-    robot_format = find_format(words[0]) if words[0] else None
-    if robot_format and str(words[0]).lower().endswith(robot_format.endings):
+    if words[0] and has_robot_ending(words[0]):
         given["robot"] = words.pop(0)
     known = {option.name for option in fields(Job)}
     if unknown := sorted(set(bundle.options) - known):

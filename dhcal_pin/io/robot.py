@@ -139,6 +139,12 @@ def find_format(path: PathLike) -> RobotFormat | None:
     return by_ending[max(by_ending, key=len)] if by_ending else None
 
 
+def has_robot_ending(path: PathLike) -> bool:
+    """Return whether a path has a recommended ending of a robot file; measurements end in .csv, too."""
+    robot_format = find_format(path)
+    return robot_format is not None and os.fspath(path).lower().endswith(robot_format.endings)
+
+
 def has_dh_table(path: PathLike) -> bool:
     """Return whether a path names a robot file that holds a DH table."""
     robot_format = find_format(path)

@@ -43,6 +43,11 @@ ARGUMENTS = {
     "misspelt choice": ([*CALIBRATE, "--arm", "lowcost"], ["'lowcost' (did you mean low-cost?)"]),
     "no output": (["calibrate", "arm.dh.toml", "data.csv"], ["-o", "required", "dhcal calibrate --help"]),
     "no data": (["calibrate", "arm.dh.toml", "-o", "out.urdf"], ["DATA", "required"]),
+    "no robot": (
+        ["calibrate", "data.csv", "-o", "out.urdf"],
+        ["data.csv: ROBOT is required; name the file of the robot before that of the measurements"],
+    ),
+    "no data for a table": (["calibrate", "arm.dh.csv", "-o", "out.urdf"], ["arm.dh.csv: DATA is required"]),
     "no such robot": (["calibrate", "no.urdf", "data.csv", "-o", "out.urdf"], ["no.urdf", "No such file"]),
     "no such table": (
         ["calibrate", "no.dh.toml", "data.csv", "-o", "out.urdf"],

@@ -50,9 +50,19 @@ def run(args: Namespace) -> int:
 
         return run_manifest(args)
     if robot and not args.data:
-        raise InvalidArgumentError(f"{robot}: DATA is required; name at least one measurement file")
+        raise InvalidArgumentError(_missing_input(robot))
     Job.from_args(args)  # names an option that is missing, before heavy modules are loaded
     return _calibrate_robot(args)
+
+
+def _missing_input(path: str) -> str:
+    """Say which input is missing beside the only one."""
+    from ...io.robot import has_robot_ending  # lazy import, as the following: they load Pinocchio
+    from ...io.tables.sources import has_table_ending
+
+    if has_table_ending(path) and not has_robot_ending(path):
+        return f"{path}: ROBOT is required; name the file of the robot before that of the measurements"
+    return f"{path}: DATA is required; name at least one measurement file"
 
 
 @contextmanager

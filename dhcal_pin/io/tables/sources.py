@@ -31,6 +31,8 @@ FORMATS = (
     TableFormat((".parquet", ".pq"), read_parquet),
     TableFormat((), read_text_table),
 )
+# Usual endings of tables in text; files with other endings are read as text, too.
+_TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat")
 # Endings of files that cannot be read, and what to do with them.
 _UNREADABLE = {
     ".xls": "save it as .xlsx",
@@ -40,6 +42,12 @@ _UNREADABLE = {
     ".mcap": "convert it with `dhcal convert`",
     **dict.fromkeys((".urdf", ".xacro", ".xml"), "expected a table of measurements"),
 }
+
+
+def has_table_ending(path: PathLike) -> bool:
+    """Return whether a path has the ending of a table."""
+    endings = (*_TEXT_ENDINGS, *(ending for form in FORMATS for ending in form.endings))
+    return os.fspath(path).lower().endswith(endings)
 
 
 def read_table(source: PathLike | Any, layout: TextLayout = DETECTED) -> DataTable:
