@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 
@@ -61,6 +62,15 @@ def parse_json(text):
         raise AssertionError(f"{name} in JSON")
 
     return json.loads(text, parse_constant=refuse)
+
+
+def assert_shows(text, lines):
+    """Assert that a page shows lines of a program; numbers may differ, and … stands for any text."""
+    number = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+    shown = [re.escape(number.sub("#", line)).replace("…", ".*") for line in text.splitlines()]
+    assert len(shown) == len(lines)
+    for pattern, line in zip(shown, lines, strict=True):
+        assert re.fullmatch(pattern, number.sub("#", line))
 
 
 def stdout_of(result):

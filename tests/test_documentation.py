@@ -7,7 +7,8 @@ Blocks of a page run in the order of the page, in a folder of their own with the
 - ```toml, ```text and ```c that start with `# file: NAME` or `// file: NAME`: written to this file.
 
 Other blocks of text are not executed. A block of text behind a line `<!-- output: last N -->` shows the last
-N lines of the command before it; numbers may differ.
+N lines of the command before it, and one behind `<!-- start of: FILE -->` the first lines of a file. Numbers
+may differ, and … stands for any text.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import pytest
 import schema_files
 import tomli_w
 from camera_setups import visible_corners, wrong_arm
+from command_line import assert_shows
 from robots import ROOT
 from sessions import nominal_arm
 
@@ -57,7 +59,7 @@ SCHEMAS = {
 }
 _FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```$", re.DOTALL | re.MULTILINE)
 _OUTPUT = re.compile(r"<!-- output: last (\d+) -->\s*$")
-_NUMBER = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+_START = re.compile(r"<!-- start of: (\S+) -->\s*$")
 # Fewer photographs are enough for the same commands.
 SMALLER = {"howto/paper_arm.md": ("[:25]", "[:12]")}
 # Pages that take long; `docs/evidence/tour.py` draws the figures of the tour whenever the pages are built.
@@ -196,8 +198,9 @@ def test_blocks_of_a_page_run_in_order(page, examples, tmp_path, monkeypatch, ca
         elif language == "toml":
             tomllib.loads(text)
         if shown := _OUTPUT.search(before):
-            masked = [_NUMBER.sub("#", line) for line in output[-int(shown[1]) :]]
-            assert [_NUMBER.sub("#", line) for line in text.splitlines()] == masked
+            assert_shows(text, output[-int(shown[1]) :])
+        if shown := _START.search(before):
+            assert_shows(text, Path(shown[1]).read_text(encoding="utf-8").splitlines()[: text.count("\n")])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

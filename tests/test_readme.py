@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+from command_line import assert_shows
 from robots import ROOT
 
 from dhcal_pin.cli import main
@@ -18,11 +19,6 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 
 
-def without_numbers(text: str) -> list[str]:
-    """Return the lines of a text with a sign in place of each number."""
-    return [re.sub(r"\d+(\.\d+)?", "#", line) for line in text.splitlines() if line.strip()]
-
-
 def test_commands_of_the_readme_run_one_after_another(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     commands = [line for block in blocks("sh") for line in block.splitlines()]
@@ -31,9 +27,9 @@ def test_commands_of_the_readme_run_one_after_another(tmp_path, monkeypatch, cap
     for words in run:
         capsys.readouterr()
         assert main.main(words) == 0, capsys.readouterr().err
-    result = without_numbers(capsys.readouterr().err)
-    shown = without_numbers(blocks("text")[-1])
-    assert result[-len(shown) :] == shown
+    *_, measurements, result = blocks("text")
+    assert_shows(measurements, Path("laser.csv").read_text().splitlines()[:3])
+    assert_shows(result, capsys.readouterr().err.splitlines()[-2:])
     assert Path("report.html").stat().st_size > 1e5
     for block in blocks("python"):
         exec(compile(block, "README.md", "exec"), {})
