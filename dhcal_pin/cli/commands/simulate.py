@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
@@ -13,8 +12,12 @@ from .. import options, screens
 
 if TYPE_CHECKING:
     from ..._typing import Array, PathLike
+    from ...measurements import Measurement, Noise
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
+
+# Quantity of the standard deviations of residuals, and an example, by the unit of the residuals.
+_EXAMPLES = {"m": ("length", "0.1mm"), "rad": ("angle", "0.01deg"), "px": ("pixel", "0.2px")}
 
 ARGUMENTS: options.Options = {
     "robot ROBOT": {"type": options.ROBOT["type"], "help": f"nominal {options.ROBOT['help']}"},
@@ -26,9 +29,8 @@ ARGUMENTS: options.Options = {
     },
     "--sigma --noise LENGTH[,ANGLE]": {
         "dest": "noise",
-        "default": "0mm",
-        "help": "standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind "
-        "camera in pixels, such as 0.2px",
+        "help": "standard deviation per axis in the units of the kind: 0.1mm; 0.1mm,0.01deg for pose and "
+        "relative; 0.01deg for inclination; 0.2px for camera (default: 0)",
     },
     "-o --output data.csv": {"required": True, "help": "measurement CSV file to write"},
     "--truth T.urdf": {
@@ -58,7 +60,7 @@ def run(args: Namespace) -> int:
     """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ...measurements import KINDS, Noise
+    from ...measurements import KINDS
     from ...units import parse_noise
     from ..output_table import Output
     from ..outputs import checked_files, existing_sidecars, require_writable_outputs, write_with_json
@@ -66,12 +68,13 @@ def run(args: Namespace) -> int:
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
     checked_files(args, {"output": Output("measurements", (".csv",)), "json": Output()}, inputs)
-    sigma = _length_of_pixels(args.noise) if args.kind == "camera" else args.noise
-    noise = Noise(*parse_noise(sigma, "--sigma"))
     if args.truth and args.errors:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
+    kind = KINDS[args.kind]
+    sigma = args.noise or f"0{next(iter(kind.residual_groups.values())).unit}"
+    noise = _parse_noise(sigma, kind)
     nominal = truth = io.read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
         truth = options.read_robot_or_table(args.truth, args)
@@ -84,17 +87,15 @@ def run(args: Namespace) -> int:
         truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
     q = rng.uniform(*robot.joint_range(nominal), (args.samples, nominal.n_joints))
-    data = KINDS[args.kind].simulate(truth, _conditions(truth, q, args.seed), noise, rng)
+    data = kind.simulate(truth, _conditions(truth, q, args.seed), noise, rng)
     errors = f" with random errors {args.errors}" if args.errors else ""
-    comment = (
-        f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
-    )
+    comment = f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {sigma}, seed {args.seed}"
     contents: dict[PathLike, str | bytes] = {args.output: io.measurement_text(data, nominal, [comment])}
     if data.rig is not None:
         rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
         require_writable_outputs([rig_path], [*robots, args.output])
         contents[rig_path] = io.rig_text(data.rig.cameras, data.rig.boards)
-    facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
+    facts = {"samples": len(data.rows), "kind": args.kind, "noise": sigma, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
     screens.show(screens.files_screen(contents), args.verbosity)
@@ -115,9 +116,16 @@ def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
     return robot.Conditions(q, **drawn)
 
 
-def _length_of_pixels(noise: str) -> str:
-    """Return noise in pixels as that in millimetres, which are as large in the simulated images."""
-    return re.sub(r"^([0-9.eE+-]+)\s*px$", r"\1mm", noise.strip())
+def _parse_noise(text: str, kind: type[Measurement]) -> Noise:
+    """Parse standard deviations in the units of a measurement kind."""
+    from ...measurements import Noise  # lazy import, as the following: they are slow to load
+    from ...units import LENGTHS, parse_deviations
+
+    examples = dict(_EXAMPLES[group.unit] for group in kind.residual_groups.values())
+    found = parse_deviations(text, "--sigma", examples, f" for kind {kind.kind}")
+    # A millimetre is as large as a pixel in the simulated images.
+    pixels = found.get("pixel", 0.0) / LENGTHS["mm"]
+    return Noise(found.get("length", pixels), found.get("angle", 0.0))
 
 
 def _with_random_errors(nominal: robot.Chain, length: float, angle: float, seed: int) -> robot.Chain:
