@@ -21,6 +21,7 @@ covariance is I + A·Aᵀ, and residuals and Jacobians are multiplied by its inv
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -62,6 +63,8 @@ _TERMS = (np.repeat([0, 1], 6), np.tile(np.arange(6), 2))
 # Set-up of simulations: distance of the cameras from the robot as a multiple of its reach, image scale [px/m]
 # at the robot, and half the diagonals of the board [m].
 _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
+# Half the usual width of their images [px], and the factor by which larger images exceed what they show.
+_HALF_IMAGE, _IMAGE_MARGIN = 2048, 1.05
 
 
 @frozen(eq=False)
@@ -656,23 +659,31 @@ class CameraCorners(Measurement):
 
 
 def simulated_rig(chain: Chain, q: Array) -> Rig:
-    """Return two fixed cameras that look at the tool from two sides, and six points on the tool."""
-    tools = chain.poses(q)[:, :3, 3] if len(q) else np.zeros((1, 3))
-    centre = tools.mean(0)
-    distance = _DISTANCE * max(1.0, float(np.abs(tools - centre).max()))
-    values = np.array([_SCALE * distance, _SCALE * distance, 2047.5, 2047.5, 0, 0, 0, 0, 0])
+    """Return two fixed cameras that look at the tool from two sides in turn, and six points on the tool.
+
+    All points are in the images, which are larger than usual if the robot is.
+    """
+    poses = chain.poses(q) if len(q) else np.eye(4)[None]
+    centre = poses[:, :3, 3].mean(0)
+    distance = _DISTANCE * max(1.0, float(np.abs(poses[:, :3, 3] - centre).max()))
+    points = _BOARD_SIZE * np.array(
+        [[1, 0.1, 0], [-1, 0, 0.2], [0.1, 1, -0.1], [0, -1, 0.1], [0.2, 0.1, 1], [0, 0.2, -1]]
+    )
+    tips = (poses @ se3.inverse(chain.tool))[:, None]
+    corners = (tips[..., :3, :3] @ points[..., None])[..., 0] + tips[..., :3, 3]
     cameras = {}
-    for name, direction in (("left", [1.0, 0.2, 0.1]), ("right", [-0.1, 1.0, 0.3])):
+    for i, (name, direction) in enumerate((("left", [1.0, 0.2, 0.1]), ("right", [-0.1, 1.0, 0.3]))):
         forward = np.array(direction) / np.linalg.norm(direction)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         pose = se3.transform(
             np.column_stack([right, np.cross(forward, right), forward]), centre - distance * forward
         )
-        cameras[name] = Camera(name, WORLD, 4096, 4096, values, intrinsics="fixed", pose=pose)
-    points = _BOARD_SIZE * np.array(
-        [[1, 0.1, 0], [-1, 0, 0.2], [0.1, 1, -0.1], [0, -1, 0.1], [0.2, 0.1, 1], [0, 0.2, -1]]
-    )
+        right, down, depth = np.moveaxis((corners[i::2] - pose[:3, 3]) @ pose[:3, :3], -1, 0)
+        offset = _SCALE * distance * np.maximum(np.abs(right), np.abs(down)) / depth
+        half = math.ceil(max(_HALF_IMAGE, _IMAGE_MARGIN * offset.max(initial=0.0)))
+        values = np.array([_SCALE * distance] * 2 + [half - 0.5] * 2 + [0.0] * 5)
+        cameras[name] = Camera(name, WORLD, 2 * half, 2 * half, values, intrinsics="fixed", pose=pose)
     board = Board("target", "tip", "points", listed_points=points, pose=np.eye(4))
     return Rig(cameras, {"target": board})
 

@@ -10,6 +10,7 @@ from command_line import stdout_of, tool_positions
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.io import read_measurement_file, read_robot
+from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.io.tables import read_table
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.robot import Chain
@@ -50,6 +51,18 @@ def test_noise_of_images_is_in_pixels(run, robot_folder):
         pixels[name] = np.stack([table.values(table.columns[column].index) for column in "uv"])
     np.testing.assert_allclose((pixels["a.csv"] - pixels["exact.csv"]).std(1), 0.2, rtol=0.05)
     assert Path("a.rig.toml").exists()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_all_corners_are_in_the_images(run, robot_folder, seed):
+    """The reach of a UR10 is larger than usual images."""
+    command = ("simulate", "example:ur10", "--tip", "tool0", "-n", "50", "--kind", "camera")
+    stdout_of(run(*command, "--sigma", "0.2px", "--seed", seed, "-o", "a.csv"))
+    table, cameras = read_table("a.csv"), read_rig("a.rig.toml").cameras
+    widths = np.array([cameras[name].width for name in table.text(table.columns["camera"])])
+    for name in "uv":
+        pixels = table.values(table.columns[name].index)
+        assert np.all((pixels > -0.5) & (pixels < widths - 0.5))
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -43,8 +43,8 @@ ARGUMENTS: options.Options = {
     "--kind KIND": {
         "default": "pose",
         "help": "kind of measurement (default: %(default)s): {kinds}; camera: six points on the tip in two "
-        "cameras of 4096 x 4096 px that stand still, in which 1 mm at the robot is 1 px; their rig file "
-        "NAME.rig.toml is written beside NAME.csv",
+        "cameras of 4096 x 4096 px, or more for large robots, that stand still, in which 1 mm at the robot "
+        "is 1 px; their rig file NAME.rig.toml is written beside NAME.csv",
     },
     **options.URDF_OPTIONS,
     "--seed N": {
