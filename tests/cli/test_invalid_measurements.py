@@ -22,6 +22,19 @@ SIGMA = "sigma_x[mm],sigma_y[mm],sigma_z[mm]"
 DATA = {
     "empty": ("", ["data.csv: is empty", "x[mm]"]),
     "only comments": ("# nothing\n\n", ["data.csv: is empty"]),
+    "a web page": (
+        "\n<!DOCTYPE html>\n<html></html>\n",
+        ["data.csv:2: is HTML, not a table; expected", "x[mm]"],
+    ),
+    "a robot": ("<?xml version='1.0'?>\n<robot/>\n", ["data.csv:1: is XML, not a table"]),
+    "a result": ('{\n  "verdict": {},\n  "samples": 9\n}\n', ["data.csv:1: is JSON, not a table"]),
+    "a list": ('[{"x": 1},\n {"x": 2}]\n', ["data.csv:1: is JSON, not a table"]),
+    "a sidecar": ("# base and tool\n[base]\nxyz_m = [0, 0, 0]\n", ["data.csv:2: is TOML, not a table"]),
+    "a DH file": ('convention = "standard"\n[units]\nlength = "mm"\n', ["data.csv:1: is TOML, not a table"]),
+    "titles in brackets": (
+        "[General]\nname = x\n" + positions_csv(4),
+        ["data.csv:1: no names of columns in this line; they seem to be in line 3"],
+    ),
     "header only": (HEADER + "\n", ["data.csv: no rows", "line 1"]),
     "UTF-16": (
         b"\xff\xfe" + positions_csv(4).encode("utf-16-le"),

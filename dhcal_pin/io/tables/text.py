@@ -52,6 +52,15 @@ _N_SEPARATOR_ROWS, _N_DECIMAL_ROWS = 50, 2000
 _INTEGER = re.compile(r"[+-]?\d+(?:[eE][+-]?\d+)?")
 _DECIMALS = {sign: re.compile(rf"[+-]?(?:\d+\{sign}\d*|\{sign}\d+)(?:[eE][+-]?\d+)?") for sign in ".,"}
 
+# Formats that are taken for tables by mistake, by how their first lines begin in lower case.
+_OTHER_FORMATS = {
+    "HTML": re.compile(r"<!doctype html|<html"),
+    # A joint may be called <b>.
+    "XML": re.compile(r"<[?!]|<[a-z][^<>]*(>\s*(<|$)|$)"),
+    "TOML": re.compile(r"\[\[?[\w.\"' -]+\]\]?\s*(#|$)|[\w.\"'-]+\s*="),
+    "JSON": re.compile(r"\{|\[\s*([\[{\"]|$)"),
+}
+
 
 @frozen
 class TextLayout:
@@ -104,6 +113,11 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
             f"{source}: is empty; the first line must be a header such as {layout.header_example}"
         )
     texts = [line for _, line in content]
+    if name := _other_format(texts):
+        raise FileFormatError(
+            f"{source}:{content[0][0]}: is {name}, not a table; expected a table with a header such as "
+            f"{layout.header_example}"
+        )
     separator = layout.separator or _detect_separator(texts[:_N_SEPARATOR_ROWS])
     split = _splitter(separator)
     header_line, header = content[0]
@@ -142,6 +156,22 @@ def parse_lines(source: str, numbered: Iterable[tuple[int, str]], layout: TextLa
         header_example=layout.header_example,
         read_below_titles=_reader_below_titles(source, content, layout) if layout.has_header else None,
     )
+
+
+def _other_format(lines: Sequence[str]) -> str:
+    """Return the format of lines that are no table; empty if they may be one."""
+    first = lines[0].lstrip().lower()
+    name = next((name for name, start in _OTHER_FORMATS.items() if start.match(first)), "")
+    if name != "TOML":
+        return name
+    import tomllib  # lazy import: slow to load
+
+    # Titles above a table may look like the first line of TOML.
+    try:
+        tomllib.loads("\n".join(lines))
+    except tomllib.TOMLDecodeError:
+        return ""
+    return name
 
 
 def _reader_below_titles(
