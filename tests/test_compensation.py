@@ -488,6 +488,21 @@ def test_targets_in_the_wrong_frame_are_hinted_at(place, capsys):
     assert "5 of 5 ok" in said
 
 
+@pytest.mark.parametrize(("stated", "unit"), [("m", "mm"), ("mm", "m")])
+def test_another_unit_is_suggested_if_the_targets_are_then_reached(place, capsys, stated, unit):
+    nominal, true = place
+    poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 30, np.random.default_rng(3)))
+    hint = f"hint: most targets are reached if they are in {unit}; check the units in the header"
+    for offset, is_hinted in ((0.0, True), (50.0, False)):
+        moved = poses + se3.translation([offset, 0, 0]) - np.eye(4)
+        moved[:, :3, 3] *= 1.0 if unit == "mm" else 1e-3
+        write_targets(moved)
+        text = Path("targets.csv").read_text()
+        Path("targets.csv").write_text(text.replace("[mm]", f"[{stated}]"))
+        assert main.main(BASE) == 0
+        assert (hint in capsys.readouterr().err) == is_hinted
+
+
 def link_in_tip(chain, name):
     """Pose of a link in the tip, by Pinocchio."""
     data = chain.model.createData()

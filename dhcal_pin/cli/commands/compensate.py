@@ -27,6 +27,9 @@ _COMPUTED_DIGITS = 15
 # Numbers that differ from a multiple of this angle by less than the tolerance are design values [rad].
 _DESIGN_ANGLE, _DESIGN_TOL = math.pi / 12, 1e-6
 
+# Share of the targets below which most are not reached, and number of those that are tried in another unit.
+_MIN_REACHED, _N_TRIED = 0.5, 20
+
 ARGUMENTS: Options = {
     "nominal NOMINAL.urdf": {"type": ROBOT["type"], "help": "robot model of the controller"},
     "calibrated CALIBRATED.urdf": {"type": ROBOT["type"], "help": "the same robot, calibrated"},
@@ -92,7 +95,7 @@ def run(args: Namespace) -> int:
         targets,
         notes,
         {args.nominal: [warning]} if warning else {},
-        _frame_hint(args, result),
+        _hint(args, nominal, calibrated, targets, result),
         contents,
     )
     screens.show(screen, args.verbosity)
@@ -145,11 +148,41 @@ def _tool_text(args: Namespace, chain: robot.Chain) -> str:
     return f"the tip {chain.tip}" if args.frame == BASE else "the measured point"
 
 
-def _frame_hint(args: Namespace, result: Compensation) -> str:
-    """Suggest --frame measuring if most targets are not reached, and the sidecar says where the base is."""
-    if args.frame != BASE or result.reached.mean() >= 0.5 or not io.existing_sidecar(args.calibrated):
+def _hint(
+    args: Namespace,
+    nominal: robot.Chain,
+    calibrated: robot.Chain,
+    targets: io.TargetPoses,
+    result: Compensation,
+) -> str:
+    """Suggest a remedy if most targets are not reached: another unit, or --frame measuring with a sidecar."""
+    if result.reached.mean() >= _MIN_REACHED:
+        return ""
+    if unit := _fitting_unit(nominal, calibrated, targets):
+        return f"most targets are reached if they are in {unit}; check the units in the header"
+    if args.frame != BASE or not io.existing_sidecar(args.calibrated):
         return ""
     return "are the targets in the measuring frame of the calibration? then add --frame measuring"
+
+
+def _fitting_unit(nominal: robot.Chain, calibrated: robot.Chain, targets: io.TargetPoses) -> str:
+    """Return the other unit of millimetres and metres if most targets are reached with it."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ...compensation import compensate
+    from ...units import LENGTHS
+
+    stated = {targets.units[name] for name in ("x", "y", "z")}
+    rows = np.unique(np.linspace(0, len(targets.values) - 1, _N_TRIED).astype(int))
+    for unit, other in (("m", "mm"), ("mm", "m")):
+        if stated == {unit}:
+            values = targets.values[rows]
+            positions = values if values.ndim == 2 else values[:, :3, 3]
+            positions *= LENGTHS[unit] / LENGTHS[other]
+            near = None if targets.near is None else targets.near[rows]
+            if compensate(nominal, calibrated, values, near).reached.mean() >= _MIN_REACHED:
+                return other
+    return ""
 
 
 def exchange_warning(
