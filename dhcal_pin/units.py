@@ -49,35 +49,28 @@ def column_header(name: str, unit: str) -> str:
 
 def parse_noise(text: str, label: str = "--noise") -> tuple[float, float]:
     """Parse standard deviations of position and orientation."""
-    found = parse_deviations(text, label, {"length": "0.1mm", "angle": "0.01deg"})
-    return found.get("length", 0.0), found.get("angle", 0.0)
-
-
-def parse_deviations(
-    text: str, label: str, examples: Mapping[str, str], purpose: str = ""
-) -> dict[str, float]:
-    """Parse standard deviations of some quantities, of which `examples` has one each, by quantity."""
-    expected = " or ".join(dict.fromkeys([next(iter(examples.values())), ",".join(examples.values())]))
-    quantities = {unit: quantity for quantity in examples for unit in UNITS[quantity]}
     out: dict[str, float] = {}
     for part in text.split(","):
         where = f"{label} {part.strip()!r}"
         match = re.fullmatch(r"\s*([0-9.eE+-]+)\s*([a-z\u00b5\u03bc]+)\s*", part)
-        if not match or match[2] not in quantities:
-            problem = f"unit {match[2]} does not fit" if match else "not a number with a unit"
-            raise InvalidArgumentError(f"{where}: {problem}; expected for example {expected}{purpose}")
-        quantity = quantities[match[2]]
+        quantity = "length" if match and match[2] in LENGTHS else "angle"
+        units = LENGTHS if quantity == "length" else ANGLES
+        if not match or match[2] not in units:
+            raise InvalidArgumentError(
+                f"{where}: not a number with a unit; expected for example 0.1mm or 0.1mm,0.01deg"
+            )
         if quantity in out:
-            raise InvalidArgumentError(f"{where}: second {quantity}; expected for example {expected}")
+            raise InvalidArgumentError(
+                f"{where}: second {quantity}; expected one length and one angle, for example 0.1mm,0.01deg"
+            )
         try:
-            out[quantity] = float(match[1]) / UNITS[quantity][match[2]]
+            out[quantity] = float(match[1]) / units[match[2]]
         except ValueError:
             raise InvalidArgumentError(
                 f"{where}: {match[1]!r} is not a number; expected for example 0.1"
             ) from None
         if not 0 <= out[quantity] <= MAX_SI_VALUE:
-            unit = next(iter(UNITS[quantity]))
             raise InvalidArgumentError(
-                f"{where}: standard deviation must lie in [0, {MAX_SI_VALUE:g}] {unit}"
+                f"{where}: standard deviation must lie in [0, {MAX_SI_VALUE:g}] m or rad"
             )
-    return out
+    return out.get("length", 0.0), out.get("angle", 0.0)

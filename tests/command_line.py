@@ -8,7 +8,6 @@ import re
 import numpy as np
 
 from dhcal_pin.io import read_robot
-from dhcal_pin.measurements import KINDS
 
 KEYS = {
     *("converged", "iterations", "samples", "samples_holdout", "rank", "parameters_total", "condition"),
@@ -25,12 +24,6 @@ CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
 # Height of the shoulder and lengths of the links [mm]: of the paper's robot as designed, and of the robot
 # with errors that is measured here.
 DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
-
-
-def simulated_noise(kind):
-    """Value of --sigma for a simulation of a kind."""
-    deviations = {"m": "0.1mm", "rad": "0.01deg", "px": "0.1px"}
-    return ",".join(deviations[group.unit] for group in KINDS[kind].residual_groups.values())
 
 
 def unfolded(screen):

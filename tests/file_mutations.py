@@ -24,7 +24,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from command_line import positions_csv, simulated_noise
+from command_line import positions_csv
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from mjcf_robots import BENCH, UR5E
@@ -190,7 +190,7 @@ def _simulated(kind: str) -> dict[str, bytes]:
             "--kind",
             kind,
             "--noise",
-            simulated_noise(kind),
+            "0.1mm,0.1deg",
             "--quiet",
         )
         main([*words, "--errors", "1mm,0.3deg", "-o", f"{kind}.csv"])

@@ -55,7 +55,7 @@ def test_planned_poses_have_the_board_in_view(run):
 def test_missing_poses_are_estimated_from_images(run):
     """Ten more poses for images of a rig without poses: of the simulated one, with two cameras."""
     arm, sizes = ("example:ur10", "--tip", "tool0"), ("-n", 6, "--candidates", 100)
-    run("simulate", *arm, "--kind", "camera", "-m", 12, "--noise", "0.3px", "-o", "images.csv")
+    run("simulate", *arm, "--kind", "camera", "-m", 12, "--noise", "0.3mm", "-o", "images.csv")
     plan = ("plan", *arm, "--rig", "images.rig.toml", *sizes, "--json", "-")
     status, out, err = run(*plan, "-o", "more.csv", "--data", "images.csv")
     assert status == 0, err

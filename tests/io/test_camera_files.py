@@ -126,7 +126,7 @@ def test_camera_in_urdf_and_sidecar(tmp_path, monkeypatch):
     nominal, actual = str(URDF / "sim_6dof.dh.toml"), str(URDF / "sim_6dof_actual.dh.toml")
     for name, seed in (("fit", 1), ("other", 1)):
         assert main(["simulate", nominal, "--truth", actual, "-m", "20", "--kind", "camera",
-                     "--noise", "0.1px", "--seed", str(seed), "-o", f"{name}.csv"]) == 0  # fmt: skip
+                     "--noise", "0.1mm", "--seed", str(seed), "-o", f"{name}.csv"]) == 0  # fmt: skip
     assert main(["calibrate", nominal, "fit.csv", "--rig", "fit.rig.toml", "-o", "o.urdf",
                  "--extend", "none", "--camera-frame", "eye", "--camera-files", "cam",
                  "--json", "o.json"]) == 0  # fmt: skip

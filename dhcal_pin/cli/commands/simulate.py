@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
 
-# Quantity of the standard deviations of residuals, and an example, by the unit of the residuals.
-_EXAMPLES = {"m": ("length", "0.1mm"), "rad": ("angle", "0.01deg"), "px": ("pixel", "0.2px")}
-
 ARGUMENTS: options.Options = {
     "robot ROBOT": {"type": options.ROBOT["type"], "help": f"nominal {options.ROBOT['help']}"},
     "-n --count -m --samples N": {
@@ -29,8 +27,9 @@ ARGUMENTS: options.Options = {
     },
     "--sigma --noise LENGTH[,ANGLE]": {
         "dest": "noise",
-        "help": "standard deviation per axis in the units of the kind: 0.1mm; 0.1mm,0.01deg for pose and "
-        "relative; 0.01deg for inclination; 0.2px for camera (default: 0)",
+        "default": "0mm",
+        "help": "standard deviation per axis, such as 0.1mm,0.01deg (default: %(default)s); for the kind "
+        "camera in pixels, such as 0.2px",
     },
     "-o --output data.csv": {"required": True, "help": "measurement CSV file to write"},
     "--truth T.urdf": {
@@ -60,7 +59,7 @@ def run(args: Namespace) -> int:
     """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
-    from ...measurements import KINDS
+    from ...measurements import KINDS, Noise
     from ...units import parse_noise
     from ..output_table import Output
     from ..outputs import checked_files, existing_sidecars, require_writable_outputs, write_with_json
@@ -68,13 +67,13 @@ def run(args: Namespace) -> int:
     robots = [args.robot, *([args.truth] if args.truth else [])]
     inputs = [*robots, *existing_sidecars(robots)]
     checked_files(args, {"output": Output("measurements", (".csv",)), "json": Output()}, inputs)
+    sigma = _length_of_pixels(args.noise) if args.kind == "camera" else args.noise
+    noise = Noise(*parse_noise(sigma, "--sigma"))
     if args.truth and args.errors:
         raise InvalidArgumentError("--errors: not allowed with --truth, which is the robot with errors")
     if args.kind not in KINDS:
         raise UnknownNameError(f"--kind: unknown kind {args.kind!r}; choose from {', '.join(KINDS)}")
-    kind = KINDS[args.kind]
-    sigma = args.noise or f"0{next(iter(kind.residual_groups.values())).unit}"
-    noise = _parse_noise(sigma, kind)
+    _require_noise_of(KINDS[args.kind], noise, args.noise)
     nominal = truth = io.read_robot(args.robot, args.tip, root=args.root)
     if args.truth:
         truth = options.read_robot_or_table(args.truth, args)
@@ -87,15 +86,17 @@ def run(args: Namespace) -> int:
         truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
     q = rng.uniform(*robot.joint_range(nominal), (args.samples, nominal.n_joints))
-    data = kind.simulate(truth, _conditions(truth, q, args.seed), noise, rng)
+    data = KINDS[args.kind].simulate(truth, _conditions(truth, q, args.seed), noise, rng)
     errors = f" with random errors {args.errors}" if args.errors else ""
-    comment = f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {sigma}, seed {args.seed}"
+    comment = (
+        f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
+    )
     contents: dict[PathLike, str | bytes] = {args.output: io.measurement_text(data, nominal, [comment])}
     if data.rig is not None:
         rig_path = os.path.splitext(args.output)[0] + ".rig.toml"
         require_writable_outputs([rig_path], [*robots, args.output])
         contents[rig_path] = io.rig_text(data.rig.cameras, data.rig.boards)
-    facts = {"samples": len(data.rows), "kind": args.kind, "noise": sigma, "seed": args.seed}
+    facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
     write_with_json(contents, args.json, files, inputs, **facts)
     screens.show(screens.files_screen(contents), args.verbosity)
@@ -116,16 +117,21 @@ def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
     return robot.Conditions(q, **drawn)
 
 
-def _parse_noise(text: str, kind: type[Measurement]) -> Noise:
-    """Parse standard deviations in the units of a measurement kind."""
-    from ...measurements import Noise  # lazy import, as the following: they are slow to load
-    from ...units import LENGTHS, parse_deviations
+def _require_noise_of(kind: type[Measurement], noise: Noise, text: str) -> None:
+    """Require that noise which is not zero applies to a kind."""
+    units = {group.unit for group in kind.residual_groups.values()}
+    applies = {"m": noise.position, "px": noise.position, "rad": noise.rotation}
+    if (noise.position or noise.rotation) and not any(applies[unit] for unit in units):
+        examples = {"m": "0.1mm", "rad": "0.01deg", "px": "0.2px"}
+        expected = ",".join(examples[unit] for unit in units)
+        raise InvalidArgumentError(
+            f"--sigma {text}: does not apply to the kind {kind.kind}; expected for example {expected}"
+        )
 
-    examples = dict(_EXAMPLES[group.unit] for group in kind.residual_groups.values())
-    found = parse_deviations(text, "--sigma", examples, f" for kind {kind.kind}")
-    # A millimetre is as large as a pixel in the simulated images.
-    pixels = found.get("pixel", 0.0) / LENGTHS["mm"]
-    return Noise(found.get("length", pixels), found.get("angle", 0.0))
+
+def _length_of_pixels(noise: str) -> str:
+    """Return noise in pixels as that in millimetres, which are as large in the simulated images."""
+    return re.sub(r"^([0-9.eE+-]+)\s*px$", r"\1mm", noise.strip())
 
 
 def _with_random_errors(nominal: robot.Chain, length: float, angle: float, seed: int) -> robot.Chain:
