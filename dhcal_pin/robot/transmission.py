@@ -40,8 +40,8 @@ from .error_families import COMPLIANCE, JOINT_TERMS, LINK_TERMS, MAX_CURVE_ORDER
 # Maximum number of cached torque arrays, one per array of joint positions. A full cache is emptied.
 MAX_CACHED_TORQUES = 256
 
-# Number of arrays of terms that each thread keeps: those of all samples, of the parts of a cross-validation, and
-# of random configurations are needed in turn.
+# Number of arrays of terms that each thread keeps: those of all samples, of parts of them and of random
+# configurations are needed in turn.
 _MAX_CACHED_TERMS = 6
 
 
