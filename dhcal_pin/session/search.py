@@ -72,6 +72,8 @@ MIN_PREDICTED_SHARE = 0.4
 N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 # Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
 MAX_OUTLIER_SHARE = 0.25
+# Smallest lag, relative to the time between samples.
+MIN_LAG = 0.01
 # Time constants of drifts, relative to the duration of the session.
 TIME_CONSTANTS = (np.inf, 1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12)
 # The same, of which the one that fits best is taken.
@@ -556,8 +558,16 @@ class _Search:
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
+        is_supported = is_supported and not self._is_negligible_lag(cause)
         evidence = self._log_evidence(cause, i, full, without) if is_supported else -np.inf
         return replace(cause, log_evidence=evidence, effect=effect)
+
+    def _is_negligible_lag(self, cause: Cause) -> bool:
+        """Return whether a cause is a lag that is too short to be one."""
+        # Backlash between configurations at random looks like it: both follow the direction of motion.
+        return cause.block.kind == "lag" and bool(
+            abs(cause.values[0]) < MIN_LAG * np.median(np.diff(self.times))
+        )
 
     def _outlier_share(self, fit: LinearFit, cause: Cause) -> float:
         """Return the share of outliers on the shorter side of a step, or among all samples."""

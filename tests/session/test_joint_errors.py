@@ -12,6 +12,7 @@ from slow_cases import some_slow
 from dhcal_pin import calibrate, se3
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.robot import Conditions
 
 SETS = "minimal,base,tool,harmonics,compliance"
 NOISE, ANGLE_NOISE = 5e-5, 1e-4
@@ -118,3 +119,19 @@ def test_two_values_per_joint_do_not_determine_joint_errors_and_random_configura
     # The advice of the first one was followed.
     assert errors[1] < 0.5 * errors[0]
     assert fits[1].verdict.status == "ok"
+
+
+@pytest.mark.parametrize("seed", some_slow(list(range(24)), {0}))
+def test_backlash_is_no_lag(seed):
+    """The directions of approach are not stated; those of the path from row to row are the true ones."""
+    rng = np.random.default_rng(seed)
+    chain = nominal_arm("ur5")
+    errors = select_parameters(chain, "minimal,base,tool,backlash")
+    sizes = [3e-3 if "backlash" in p.name else LENGTH if p.unit == "m" else ANGLE for p in errors.parameters]
+    truth = errors.at(np.abs(sizes) * rng.uniform(0.3, 1, len(sizes)))
+    q = rng.uniform(-1.9, 1.9, (150, 6))
+    directions = np.sign(np.diff(q, axis=0, prepend=q[:1] - 1))
+    poses = truth.poses(Conditions(q, approach=directions))
+    fit = calibrate(chain, measured(Position, q, poses, rng))
+    assert fit.session
+    assert fit.session.lag is None
