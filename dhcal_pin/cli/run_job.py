@@ -39,7 +39,7 @@ from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
 from ..io.settings import parse_payload, read_bounds, read_priors
-from ..io.sidecar import read_instrument
+from ..io.sidecar import read_instrument, robots_of_sidecar
 from ..measurements.base import Measurement
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
@@ -229,12 +229,23 @@ def checked_inputs(job: Job) -> list[str]:
     protected = [*measured, *settings] if job.in_place else inputs
     companions = companion_paths(job.output, servos is not None)
     require_writable_outputs([*job.output_paths, *companions], protected)
+    _require_own_sidecar([path for path in (job.output, *companions) if path])
     require_endings(job.outputs)
     if job.meta:
         if not job.certificate:
             raise InvalidArgumentError("--meta: needs --certificate, the file that shows it")
         report.parse_meta(job.meta)
     return inputs
+
+
+def _require_own_sidecar(paths: Sequence[str]) -> None:
+    """Require that no sidecar of another robot, such as one of another ending, is replaced."""
+    for path in paths:
+        for robot in robots_of_sidecar(path):
+            if not any(is_same_file(robot, other) for other in paths):
+                raise InvalidArgumentError(
+                    f"{path}: is the sidecar of {robot}; choose another name for the output"
+                )
 
 
 def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measurement:

@@ -86,12 +86,14 @@ from __future__ import annotations
 
 import base64
 import binascii
+import glob
 import hashlib
 import lzma
 import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -171,6 +173,7 @@ _MANIFEST_KEYS = {
     "fitted_sha256": replace(_NAMES, default=()),
     "fitted_rows": replace(_BASE64, default=""),
 }
+_ENDING = ".calibration.toml"
 # Keys of the families of joint errors.
 _GAIN, _HARMONICS, _COUPLING = (FAMILIES[name].sidecar_key for name in (GAIN, HARMONICS, COUPLING))
 _JOINT_TERM_KEYS = [FAMILIES[name].sidecar_key for name in JOINT_TERMS]
@@ -308,13 +311,28 @@ _TABLE_HEADERS = {
 
 def sidecar_path(path: PathLike) -> str:
     """Return the path of the sidecar of a robot."""
-    return f"{os.path.splitext(os.fspath(path))[0]}.calibration.toml"
+    return os.path.splitext(os.fspath(path))[0] + _ENDING
 
 
 def existing_sidecar(path: PathLike) -> str | None:
     """Return the path of the sidecar of a robot if the file exists."""
     complete_interrupted_save(path)
     return sidecar_path(path) if os.path.exists(sidecar_path(path)) else None
+
+
+def robots_of_sidecar(sidecar: PathLike) -> list[str]:
+    """Return the robot files beside a sidecar that it was written with."""
+    path = Path(sidecar)
+    if not os.access(path, os.R_OK):
+        return []
+    content, name = path.read_bytes(), glob.escape(path.name.removesuffix(_ENDING))
+    return [
+        str(other)
+        for other in sorted(path.parent.glob(f"{name}.*"))
+        if os.access(other, os.R_OK)
+        and other.is_file()
+        and f'urdf_sha256 = "{hashlib.sha256(other.read_bytes()).hexdigest()}"'.encode() in content
+    ]
 
 
 # --- reading ---------------------------------------------------------------------------------------

@@ -152,6 +152,17 @@ def test_sidecar_of_an_earlier_run_is_replaced(run, robot_folder):
     assert document["files"] == {"urdf": "out.urdf", "sidecar": "out.calibration.toml"}
 
 
+def test_the_sidecar_of_another_robot_is_not_replaced(run, assert_refused, robot_folder):
+    """Robots that differ in their ending only, such as out.urdf and out.xml, have one sidecar."""
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf"))
+    Path("out.urdf").rename("out.xml")
+    text = "out.calibration.toml: is the sidecar of out.xml; choose another name for the output"
+    assert_refused([text], "calibrate", "arm.urdf", "data.csv", "-o", "out.urdf")
+    # The sidecar of the robot that is replaced is replaced, too.
+    Path("out.xml").rename("out.urdf")
+    stdout_of(run("calibrate", "arm.urdf", "data.csv", "-o", "out.urdf"))
+
+
 def test_holdout_fraction_depends_on_the_seed(run, robot_folder):
     def calibrate(seed, fraction="0.3"):
         return json_of(run(*CALIBRATE, "--holdout", fraction, "--seed", seed, "--json", "-"))
