@@ -85,8 +85,10 @@ DETECTED = TextLayout()
 def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
     """Read a table from a text file."""
     source, text = os.fspath(path), read_text(path, layout.encoding, MAX_TABLE_BYTES)
-    # One of the lines is the header.
-    require_few_rows(source, text.count("\n") - 1)
+    # The other lines are the header and comments.
+    sign = layout.comment
+    n_comments = text.startswith(sign) + text.count(f"\n{sign}") if sign else 0
+    require_few_rows(source, text.count("\n") - n_comments - 1)
     lines = text.splitlines()
     lengths = list(map(len, lines))
     if (longest := max(lengths, default=0)) > MAX_LINE_LENGTH:

@@ -244,6 +244,7 @@ def test_a_list_of_many_lines_is_shortened():
     ("text", "words"),
     [
         ("a,b\n" + "1,2\n" * 201, r"a\.csv: 201 rows, more than 200; keep one in 2 of them"),
+        ("# a comment\na,b\n" + "1,2\n" * 201, r"a\.csv: 201 rows, more than 200"),
         ("a,b\n" + "1," * 10**6 + "\n", r"a\.csv:2: a line of 2000000 characters, more than 1048576"),
     ],
 )
@@ -251,6 +252,13 @@ def test_tables_that_are_too_large(tmp_path, monkeypatch, text, words):
     monkeypatch.setattr(tables, "MAX_ROWS", 200)
     with pytest.raises(DhcalError, match=words):
         read_table(write(tmp_path, "a.csv", text))
+
+
+def test_comments_are_no_rows(tmp_path, monkeypatch):
+    """A table of as many rows as are read at the most, as `simulate` writes it."""
+    monkeypatch.setattr(tables, "MAX_ROWS", 200)
+    table = read_table(write(tmp_path, "a.csv", "# simulated\na,b\n" + "1,2\n# a remark\n" * 200))
+    assert len(table.lines) == 200
 
 
 def test_a_parquet_file_that_is_too_large(tmp_path, monkeypatch):
