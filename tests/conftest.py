@@ -85,6 +85,16 @@ def unsuspected() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def uneventful(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the search for events while images were taken, unless a test is slow.
+
+    Mistakes in the joint values of the images are a part of it. `session/test_image_session.py` is about it.
+    """
+    if not request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(procedure, "can_have_session", lambda _: False)
+
+
 @pytest.fixture(scope="module")
 def own_loss() -> Iterator[None]:
     """Judge a calibration by its own loss alone; the verdict of another loss takes a second calibration."""

@@ -34,7 +34,7 @@ from dhcal_pin.cameras import Board, Camera
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Noise
 
-pytestmark = pytest.mark.usefixtures("own_loss")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from dhcal_pin.calibration.cameras.lens_priors import lens_prior_groups
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation.initialization import make_problem
 
-pytestmark = pytest.mark.usefixtures("own_loss")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
 
 SETS = "camera,board,intrinsics"
 
