@@ -76,13 +76,24 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots.SvgPanels, "draw", lambda self, plot, key, *_, **__: f'<svg id="{key}"></svg>')
 
 
+def leave_out_mistakes(patch: pytest.MonkeyPatch) -> None:
+    """Leave out the search for mistakes and events of a measurement, which takes seconds for some arms."""
+    patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
+    patch.setattr(procedure, "can_have_session", lambda _: False)
+
+
 @pytest.fixture(scope="module")
 def unsuspected() -> Iterator[None]:
-    """Leave out the search for mistakes and events of a measurement, which takes seconds for some arms."""
+    """Leave out the search for mistakes and events in all tests of a module."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
-        patch.setattr(procedure, "can_have_session", lambda _: False)
+        leave_out_mistakes(patch)
         yield
+
+
+@pytest.fixture
+def unsuspected_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the search for mistakes and events in one test."""
+    leave_out_mistakes(monkeypatch)
 
 
 @pytest.fixture

@@ -31,9 +31,9 @@ def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def calibrated(shot: PaperArm, extend: str = "auto") -> Result:
+def calibrated(shot: PaperArm, extend: str = "auto", session: str = "auto") -> Result:
     turned = ",".join(shot.arm.wrong) or "none"
-    return calibrate(shot.nominal, shot.images, turned=turned, extend=extend)
+    return calibrate(shot.nominal, shot.images, turned=turned, extend=extend, session=session)
 
 
 def tool_errors(shot: PaperArm, fit: Result) -> tuple[float, float]:
@@ -55,13 +55,13 @@ def shot() -> PaperArm:
 
 @pytest.fixture(scope="module")
 def fit(shot) -> Result:
-    return calibrated(shot)
+    return calibrated(shot, session="off")
 
 
 @pytest.fixture(scope="module")
 def plain(shot) -> Result:
     """Calibration without joint errors, which are displacements of the images."""
-    return calibrated(shot, "none")
+    return calibrated(shot, "none", "off")
 
 
 def with_jitter_times(problem: Problem, factor: float) -> Problem:
@@ -151,7 +151,7 @@ def test_play_and_sag_are_selected_and_corrected(shot, plain, fit):
 
 def test_arms_without_play_and_sag_keep_the_geometry():
     shot = photograph(7, 25, play=0.0, compliance=0.0).with_approach()
-    fit = calibrated(shot)
+    fit = calibrated(shot, session="off")
     assert not families(fit)
     assert fit.extension
     assert {trial.family for trial in fit.extension.trials} == {"backlash", "compliance"}
@@ -211,8 +211,7 @@ def photographs_of_an_elastic_arm(seed: int) -> tuple[Setup, CameraCorners]:
 def test_an_elastic_arm_is_estimated_where_its_geometry_alone_explains_too_little():
     """Without elasticity, left-out parts of joint space are predicted hardly better than nominally."""
     setup, images = photographs_of_an_elastic_arm(3)
-    geometry = calibrate(setup.nominal, images, extend="none")
-    fit = calibrate(setup.nominal, images)
+    geometry, fit = (calibrate(setup.nominal, images, extend=e, session="off") for e in ("none", "auto"))
     assert (geometry.verdict.status, fit.verdict.status) == ("caution", "ok")
     assert families(fit) == {"compliance"}
     assert [stage.is_kept for stage in (geometry.camera_stages[-1], fit.camera_stages[-1])] == [False, True]

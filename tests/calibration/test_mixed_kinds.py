@@ -107,12 +107,18 @@ def test_images_that_turn_about_one_axis_only_use_stated_poses(sim_6dof):
     assert result.comparisons[-1].after["residual_rms"] < 0.3
 
 
-@pytest.mark.parametrize("has_pose", [False, True])
-def test_cameras_and_boards_that_no_image_shows_change_nothing(has_pose):
-    rng = np.random.default_rng(7)
-    chain = ARMS["paper"]()
+@pytest.fixture(scope="module")
+def of_one_camera():
+    """An arm, images of one board by one camera, and the calibration with them."""
+    rng, chain = np.random.default_rng(7), ARMS["paper"]()
     images = simulate(chain, small_errors(chain, rng), rng, is_on_wrist=True, n_images=20, sigma=0.2).images
-    expected, rig = calibrate(chain, images), images.rig
+    return chain, images, calibrate(chain, images)
+
+
+@pytest.mark.parametrize("has_pose", [False, True])
+def test_cameras_and_boards_that_no_image_shows_change_nothing(has_pose, of_one_camera):
+    chain, images, expected = of_one_camera
+    rig = images.rig
     place = exp6(np.full(6, 0.3)) if has_pose else None
     spare = [replace(entry, name="spare", pose=place) for entry in (rig.cameras[0], rig.boards[0])]
     more = replace(

@@ -64,8 +64,9 @@ def test_other_processes_give_the_same_digits(laser, sim_6dof):
     alone = calibrate_stream(sim_6dof, parts, "dh")
     with open_executor(jobs=2) as where:
         np.testing.assert_array_equal(calibrate_stream(sim_6dof, parts, "dh", executor=where).x, alone.x)
+        few = data.take(np.s_[:200])
         np.testing.assert_array_equal(
-            calibrate(sim_6dof, data, "dh", executor=where).x, calibrate(sim_6dof, data, "dh").x
+            calibrate(sim_6dof, few, "dh", executor=where).x, calibrate(sim_6dof, few, "dh").x
         )
 
 

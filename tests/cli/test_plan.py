@@ -70,7 +70,7 @@ def test_plan_from_measured_poses(tmp_path, capsys):
     assert found["predicted_position_rms_m"] < 1e-4
 
 
-def test_plan_for_a_calibrated_robot(tmp_path, capsys, unsuspected):
+def test_plan_for_a_calibrated_robot(tmp_path, capsys, unsuspected_once):
     """The uncertainty in the sidecar is the prior unless data or priors are given."""
     data, robot, out = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "more.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)

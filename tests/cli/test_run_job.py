@@ -227,7 +227,7 @@ def test_figures_that_cannot_be_stated_are_null(run, robot_folder):
     assert err.count("cannot be said, too few samples") == 2
 
 
-def test_robot_without_errors_is_kept(run, robot_folder):
+def test_robot_without_errors_is_kept(run, robot_folder, unsuspected_once):
     """The calibration of an exact robot fits noise only, so nothing of it is applied."""
     for truth, is_kept in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
         arm = URDF / "sim_6dof.dh.toml"
@@ -355,7 +355,7 @@ def test_unreachable_rows_of_a_holdout_file_are_listed(run, robot_folder):
     assert (document["samples"], document["samples_holdout"], document["outliers"]) == (20, 8, [5])
 
 
-def test_poses_and_positions_are_fitted_together(run, robot_folder):
+def test_poses_and_positions_are_fitted_together(run, robot_folder, unsuspected_once):
     sim = URDF / "sim_6dof.dh.toml"
     for kind, seed in (("pose", 1), ("position", 2)):
         args = ("--truth", URDF / "sim_6dof_actual.dh.toml", "-m", "15", "--kind", kind, "--seed", seed)

@@ -64,7 +64,7 @@ def test_calibrations_of_several_robots(run, robot_folder, arm):
 
 
 @pytest.mark.parametrize("n_files", some_slow([1, 8, 40], {0, 1}))
-def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspected):
+def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspected_once):
     folder = Path(LONG_FOLDER)
     folder.mkdir(parents=True)
     names = [str(folder / f"{'position of the reflector ' * 4}{i}.csv") for i in range(n_files)]

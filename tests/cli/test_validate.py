@@ -83,7 +83,7 @@ def test_fit_frames_finds_the_measuring_frame(run, robot_folder):
     assert "base and tool as given" in err
 
 
-def test_unreachable_rows_are_reported_and_included(run, robot_folder, unsuspected):
+def test_unreachable_rows_are_reported_and_included(run, robot_folder, unsuspected_once):
     """Rows 7 and 8 of Table 5, as printed, raise the RMS error from 25.5 mm to 473 mm."""
     table = str(URDF / "experiment_table5.csv")
     status, out, err = run("validate", URDF / "experiment.dh.toml", table, "--json", "-")
