@@ -13,6 +13,8 @@ from camera_setups import ARMS, simulate
 from dhcal_pin import se3
 from dhcal_pin.io.rig_file import rig_text
 
+pytestmark = pytest.mark.usefixtures("uneventful")
+
 
 @pytest.fixture
 def flange_files(tmp_path, monkeypatch):

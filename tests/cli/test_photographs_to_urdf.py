@@ -16,6 +16,8 @@ from dhcal_pin.cameras import Rig
 from dhcal_pin.detection import ImageQuality, render_images
 from dhcal_pin.io.rig_file import rig_text
 
+pytestmark = pytest.mark.usefixtures("uneventful")
+
 cv2 = pytest.importorskip("cv2")
 
 N_IMAGES = 26

@@ -206,7 +206,7 @@ def test_a_shortened_list_counts_the_others():
 
 
 @pytest.mark.parametrize(("errors", "is_kept"), [("0mm,0deg", True), ("3mm,1deg", False)])
-def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, errors, is_kept):
+def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, uneventful, errors, is_kept):
     arm = URDF / "experiment.dh.toml"
     simulated = ("--kind", "camera", "--noise", "0.2mm", "-o", "k.csv")
     stdout_of(run("simulate", arm, "--errors", errors, "-m", 30, *simulated))
