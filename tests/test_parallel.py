@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from robots import paper
+from robots import paper, with_small_errors
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from dhcal_pin import Chain, calibrate
@@ -46,8 +46,8 @@ def test_a_calibration_uses_one_thread_of_blas_unless_the_user_set_a_number(vari
         monkeypatch.delenv(name, raising=False)
     if variable:
         monkeypatch.setenv(variable, "2")
-    nominal, actual = (Chain.from_dh(paper(name)) for name in ("sim_6dof", "sim_6dof_actual"))
-    q = np.random.default_rng(0).uniform(-1, 1, (20, 6))
+    nominal, rng = Chain.from_dh(paper("sim_6dof")), np.random.default_rng(0)
+    actual, q = with_small_errors(nominal, rng), rng.uniform(-1, 1, (20, 6))
     data, seen = Pose(q, actual.poses(q)), set()
     with threadpool_limits(2, user_api="blas"):
         calibrate(nominal, data, "dh", progress=lambda *_: seen.update(_blas_threads()))
