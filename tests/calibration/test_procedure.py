@@ -57,7 +57,7 @@ def test_wrong_priors_are_named(sim_6dof, kwargs, message):
         calibrate(sim_6dof, data, "dh", **kwargs)
 
 
-def test_bounded_solution_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual):
+def test_bounded_solution_is_the_minimum_that_scipy_finds(sim_6dof, sim_6dof_actual, unsuspected_once):
     """Two parameters at their bounds and one inside: the bounded solver of scipy finds no lower cost."""
     from scipy.optimize import least_squares
 

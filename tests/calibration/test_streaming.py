@@ -15,6 +15,8 @@ from dhcal_pin.io import iter_measurements, measurement_text
 from dhcal_pin.measurements import Noise, Pose, Position, Wires
 from dhcal_pin.parallel import open_executor
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 @pytest.fixture
 def laser(tmp_path, sim_6dof_actual):

@@ -45,11 +45,12 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("n_seeds", some_slow([3, 6], {0}))
 @pytest.mark.parametrize(("arm", "kind"), some_slow(CASES, {0, 1}))
-def test_errors_of_positions_that_residuals_do_not_show_are_stated(arm, kind):
+def test_errors_of_positions_that_residuals_do_not_show_are_stated(arm, kind, n_seeds):
     """The stated size is the RMS of the true errors of many arms."""
     stated, true = [], []
-    for seed in range(6):
+    for seed in range(n_seeds):
         nominal, truth, data = simulated(arm, kind, seed)
         fit = calibrate(nominal, data, extend="none", session="off")
         assert fit.verdict.status == "caution"

@@ -153,7 +153,7 @@ def test_clean_servo_arms_have_no_session(seed):
     assert not (fit.session and fit.session.sentences)
 
 
-@pytest.mark.parametrize("is_on_wrist", [True, False])
+@pytest.mark.parametrize("is_on_wrist", some_slow([True, False], {1}))
 def test_what_moved_is_named_from_poses_of_the_flange(is_on_wrist):
     nominal, _, images, first = photograph(1, is_on_wrist, True, MOTION)
     poses, flange = nominal.poses(images.q), read_robot("flange.urdf")

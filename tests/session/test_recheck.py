@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
+from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, select_parameters
 from dhcal_pin.cli.main import main
@@ -240,13 +241,14 @@ def test_a_new_base_does_not_hide_a_changed_zero(arm):
     )
 
 
+@pytest.mark.parametrize("n_seeds", some_slow([1, 4], {0}))
 @pytest.mark.parametrize("angle", [0.1, 0.3])
-def test_a_changed_zero_beside_a_new_base_is_found_without_stated_noise(angle):
+def test_a_changed_zero_beside_a_new_base_is_found_without_stated_noise(angle, n_seeds):
     """Eight poses: a fit of the base alone leaves residuals that are larger than those of the calibration."""
     sim, fit, _ = calibrated("ur10", 7, Position)
     new = pin.SE3(pin.exp3(np.array([0.4, -0.8, 0.5])), np.array([0.6, -0.7, 0.3]))
     zeros = np.deg2rad(angle) * np.eye(6)[2]
-    for seed in range(4):
+    for seed in range(n_seeds):
         q = np.random.default_rng(seed).uniform(-2.5, 2.5, (8, 6))
         data = measured(sim, q, Position, False, base=new, zeros=zeros)
         result = recheck(fit.chain, [data], fit.uncertainty)
@@ -257,11 +259,12 @@ def test_a_changed_zero_beside_a_new_base_is_found_without_stated_noise(angle):
         assert unchanged.reasons[1].startswith("The arm itself did not change")
 
 
-def test_what_remains_beside_a_named_change_is_no_single_second_change():
+@pytest.mark.parametrize("n_seeds", some_slow([2, 4], {0}))
+def test_what_remains_beside_a_named_change_is_no_single_second_change(n_seeds):
     sim, fit, _ = calibrated("ur10", 7, Position)
     new = pin.SE3(pin.exp3(np.array([0.4, -0.8, 0.5])), np.array([0.6, -0.7, 0.3]))
     zeros = np.deg2rad([0.0, 0.15, -0.2, 0.3, 0.2, 0.0])
-    for seed in range(4):
+    for seed in range(n_seeds):
         q = np.random.default_rng(seed).uniform(-2.5, 2.5, (7, 6))
         data = measured(sim, q, Position, False, base=new, zeros=zeros)
         result = recheck(fit.chain, [data], fit.uncertainty)
@@ -294,6 +297,7 @@ def conditional(family: str, size: float) -> tuple[Chain, np.random.Generator]:
     return errors.at(np.full(len(errors.parameters), size)), np.random.default_rng(3)
 
 
+@pytest.mark.parametrize("n_times", some_slow([2, 5], {0}))
 @pytest.mark.parametrize(
     ("family", "size", "condition", "values"),
     [
@@ -302,10 +306,10 @@ def conditional(family: str, size: float) -> tuple[Chain, np.random.Generator]:
         ("thermal", 2e-5, "temperature", (36.0, 40.0)),
     ],
 )
-def test_unknown_conditions_count_as_uncertainty(family, size, condition, values):
+def test_unknown_conditions_count_as_uncertainty(family, size, condition, values, n_times):
     """An arm that did not change, with a payload or temperature that is not stated."""
     chain, rng = conditional(family, size)
-    for _ in range(5):
+    for _ in range(n_times):
         q = rng.uniform(-2, 2, (12, 6))
         conditions = {condition: rng.choice(np.array(values, float), 12)}
         if condition == "temperature":

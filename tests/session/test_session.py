@@ -571,7 +571,8 @@ def test_no_joint_errors_or_steps_are_fitted_to_a_lag(lag, seed):
 
 
 @pytest.mark.parametrize(
-    ("scales", "seed"), [((1.0, 1.0, 1.003), 6), ((1.0, 1.0, 1.02), 7), ((1.015, 1.015, 1.015), 6)]
+    ("scales", "seed"),
+    some_slow([((1.0, 1.0, 1.003), 6), ((1.0, 1.0, 1.02), 7), ((1.015, 1.015, 1.015), 6)], {0, 2}),
 )
 def test_a_wrong_scale_is_found_and_mended(scales, seed):
     simulation = Simulation("ur10", 100, seed)
@@ -590,7 +591,7 @@ def test_a_wrong_scale_is_found_and_mended(scales, seed):
     assert simulation.true_error(mended.chain) < 0.3 * before
 
 
-@pytest.mark.parametrize("factor", [0.85, 0.95, 1.15])
+@pytest.mark.parametrize("factor", some_slow([0.85, 0.95, 1.15], {0}))
 def test_a_large_scale_of_all_lengths_is_exact(factor):
     simulation = Simulation("panda", 60, 5)
     data = simulation.measure(Position, Changes(scales=(factor, factor, factor)))
