@@ -182,7 +182,7 @@ def read_tags(path, side, chain):
         {2},
     ),
 )
-def test_talos_looks_at_its_hands(side, parameters, limit):
+def test_talos_looks_at_its_hands(side, parameters, limit, unsuspected_once):
     """Neither end of the path is the root; half of the poses are held out, 20 times. Limits in mm."""
     path = DATA / "talos_apriltag/measurements-pyrene-20200901-2.csv"
     if not path.exists():
