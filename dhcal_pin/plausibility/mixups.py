@@ -81,7 +81,7 @@ def diagnose_mixups(
         return found
     if len(items[0].rows) < _N_PARTS * _MIN_SAMPLES_PER_ITEM:
         return found
-    return trial.find_common([_find_alone(chain, part, sets, report) for part in _parts(items[0])])
+    return trial.find_common(_find_in_parts(chain, items[0], sets, report))
 
 
 def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MANUFACTURED) -> Diagnosis:
@@ -95,6 +95,18 @@ def diagnose_images(chain: Chain, images: Sequence[Measurement], sets: str = MAN
     first = next((one for one in found if one.hypotheses), Diagnosis(NO_EVIDENCE))
     is_common = all(one.hypotheses == first.hypotheses for one in found)
     return replace(first, source="") if is_common else first
+
+
+def _find_in_parts(chain: Chain, item: Measurement, sets: str, progress: Progress) -> list[Diagnosis]:
+    """Look for one mistake in each part of a measurement while a common one is still possible."""
+    from .trials import MIN_PARTS  # lazy import: few measurements are suspicious
+
+    found: list[Diagnosis] = []
+    for n_left, part in zip(reversed(range(_N_PARTS)), _parts(item), strict=True):
+        found.append(_find_alone(chain, part, sets, progress))
+        if sum(bool(each.hypotheses) for each in found) + n_left < MIN_PARTS:
+            break
+    return found
 
 
 def _parts(item: Measurement) -> list[Measurement]:

@@ -46,7 +46,7 @@ _TOLERANCE = 1e-6
 _MAX_MISFIT_RATIO, _MIN_MISFIT = 3.0, 0.01
 _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 # Number of parts of a file in which a mistake is found if it is in the whole file.
-_MIN_PARTS = 2
+MIN_PARTS = 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
 # Smallest angle by which the zero of a joint is called wrong [deg]. Smaller ones are errors of the robot,
@@ -109,7 +109,7 @@ class Trial(NamedTuple):
     def find_common(self, parts: Sequence[Diagnosis]) -> Diagnosis:
         """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
         counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
-        common = [each for each in self.candidates if counts[each.hypothesis.key] >= _MIN_PARTS]
+        common = [each for each in self.candidates if counts[each.hypothesis.key] >= MIN_PARTS]
         return _decide(self, _scores(self, common, SINGLES), is_partial=True)
 
     def _changes_of_pairs(self) -> Iterator[_Change]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from dhcal_pin.exceptions import UnknownNameError
 from dhcal_pin.io import read_robot
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
-from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, trials
+from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups, trials
 from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.robot import Chain, DHTable
 
@@ -394,7 +395,17 @@ def test_noise_of_a_joint_that_measures_a_contact_is_no_wrong_unit(seed):
     assert hypothesis.key == "joint:lift:mm-not-m"
 
 
-@pytest.mark.parametrize("seed", some_slow(list(range(6)), {0, 3, 5}))
+@pytest.mark.parametrize(
+    ("is_found", "n_parts"), [([False, False], 2), ([False, True], 3), ([True, False], 3)]
+)
+def test_the_last_part_is_left_out_where_it_decides_nothing(ur10, is_found, n_parts, monkeypatch):
+    """A mistake is common if two of three parts show it."""
+    found = iter([SimpleNamespace(hypotheses=["a mistake"] * each) for each in [*is_found, True]])
+    monkeypatch.setattr(mixups, "_find_alone", lambda *_: next(found))
+    assert len(mixups._find_in_parts(ur10, measured(Pose, 24), "minimal", lambda *_: None)) == n_parts
+
+
+@pytest.mark.parametrize("seed", some_slow(list(range(6)), {5}))
 def test_zeros_of_a_hobby_arm_are_no_wrong_unit_of_contacts(seed):
     """All joints in radians instead of degrees would move 57 times less, and so would the noise."""
     arm = read_robot("example:so101", tip="gripper_frame_link")

@@ -115,7 +115,7 @@ def test_every_kind_has_a_report_even_with_few_data(kind, count, sim_6dof, quick
         assert "All parameters are observable." not in text
 
 
-def test_the_same_command_writes_the_same_report(tmp_path, monkeypatch, quick):
+def test_the_same_command_writes_the_same_report(tmp_path, monkeypatch, quick, unsuspected_once):
     robot, data = URDF / "sim_6dof.dh.toml", tmp_path / "data.csv"
     truth = ("--truth", URDF / "sim_6dof_actual.dh.toml", "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
     assert main([str(a) for a in ("simulate", robot, *truth)]) == 0

@@ -55,7 +55,7 @@ def data(tmp_path, monkeypatch) -> str:
     return "data.csv"
 
 
-def test_page_of_a_validation(data, browser):
+def test_page_of_a_validation(data, browser, unsuspected_once):
     run("calibrate", ROBOT, data, "-o", "out.urdf")
     words = ("validate", "out.urdf", data, "--nominal", ROBOT)
     run(*words, "--report", "a.html", "--json", "a.json")
