@@ -9,6 +9,8 @@ from robots import paper
 import dhcal_pin as dh
 from dhcal_pin.calibration.presentation.budget import UncertaintyBudget
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 # Standard deviations per axis of the instrument, the arm at equal joint values and the configuration [m].
 INSTRUMENT, ARM, MODEL = 5e-5, 1e-4, 2e-4
 N_CONFIGURATIONS, N_REPEATS = 80, 3

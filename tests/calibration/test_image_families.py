@@ -18,6 +18,7 @@ from dhcal_pin.calibration.cameras.gate import _with_evidence, residual_jitter
 from dhcal_pin.calibration.cameras.joint_errors import factor_displacements
 from dhcal_pin.calibration.cameras.target_points import with_free_points
 from dhcal_pin.calibration.partition import k_fold
+from dhcal_pin.calibration.procedure import SessionOption
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.estimation.folds import NoisyRows
 from dhcal_pin.estimation.initialization import align
@@ -31,7 +32,7 @@ def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def calibrated(shot: PaperArm, extend: str = "auto", session: str = "auto") -> Result:
+def calibrated(shot: PaperArm, extend: str = "auto", session: SessionOption = "auto") -> Result:
     turned = ",".join(shot.arm.wrong) or "none"
     return calibrate(shot.nominal, shot.images, turned=turned, extend=extend, session=session)
 

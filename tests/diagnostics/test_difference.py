@@ -21,6 +21,8 @@ from dhcal_pin.io import write_urdf
 from dhcal_pin.measurements import Measurement, Pose, Position
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def calibration(sim: Simulation, data: Measurement) -> Calibrated:
     """Calibrate an arm without curves."""

@@ -18,6 +18,8 @@ from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.parallel import open_executor
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 NOISE = Noise(1e-4, 1e-4)
 
 

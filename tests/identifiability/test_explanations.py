@@ -20,6 +20,8 @@ from dhcal_pin.identifiability.propagation import PlainErrors
 from dhcal_pin.measurements import KINDS, Measurement, Noise, Pose, Position
 from dhcal_pin.robot import Chain, DHTable
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 def table(theta, d, a, alpha, prismatic=()):
     zero = np.zeros(len(theta))

@@ -16,6 +16,8 @@ from dhcal_pin.measurements import Position
 from dhcal_pin.paper import error_factors
 from dhcal_pin.robot import Chain
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 CHAIN = Chain.from_dh(paper("sim_6dof"))
 DATA = Position(np.random.default_rng(0).uniform(-3, 3, (40, 6)), np.zeros((40, 3)))
 

@@ -250,7 +250,10 @@ def test_simulated_file_calibrates(kind, tmp_path, monkeypatch, unsuspected_once
     assert main(["simulate", nominal, "--truth", actual, "-m", "40", "--kind", kind.kind, "-o", "d.csv",
                  "--noise", "0.1mm,0.01deg"]) == 0  # fmt: skip
     rig = ["--rig", "d.rig.toml"] if Path("d.rig.toml").exists() else []
-    assert main(["calibrate", nominal, "d.csv", *rig, "-o", "o.urdf", "--json", "r.json"]) == 0
+    assert (
+        main(["calibrate", nominal, "d.csv", *rig, "-o", "o.urdf", "--json", "r.json", "--extend", "none"])
+        == 0
+    )
     result = json.loads(Path("r.json").read_text())
     assert result["converged"]
     for key in ("position_rms_m", "residual_rms"):
@@ -258,7 +261,7 @@ def test_simulated_file_calibrates(kind, tmp_path, monkeypatch, unsuspected_once
             assert result["after"][key] < (1.0 if result["after"].get("unit") == "px" else 1e-3)
 
 
-def test_five_kinds_are_calibrated_together(sim_6dof, sim_6dof_actual):
+def test_five_kinds_are_calibrated_together(sim_6dof, sim_6dof_actual, unsuspected_once):
     rng = np.random.default_rng(0)
     kinds = [KINDS[name] for name in ("pose", "wires", "plane", "distance", "relative")]
     draw = lambda m: rng.uniform(-2.5, 2.5, (m, 6))  # noqa: E731

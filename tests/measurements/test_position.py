@@ -15,6 +15,8 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import MultiTargetPosition, Noise
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 
 @pytest.mark.parametrize("n_seeds", some_slow([1, 4], {0}))
 def test_targets_far_apart_and_an_instrument_far_away_converge(n_seeds, sim_6dof, sim_6dof_actual):

@@ -15,6 +15,8 @@ from dhcal_pin.measurements.trilateration import (
     trilaterate_three_wires,
 )
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 A, B, C = 0.3, 0.25, -0.1
 # Dimensions and anchors of an equilateral rig of 300 mm in the plane x = 0.
 EQUILATERAL = 0.3, 0.3 * np.sqrt(3) / 2, -0.15

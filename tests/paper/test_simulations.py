@@ -10,6 +10,8 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.paper import paper_arm, simulate
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 FIGURES = {
     2: [("2.1", "10", 35.1), ("1.70", "6.23", 17.1), ("1.65", "5.85", 17.5)],
     10: [

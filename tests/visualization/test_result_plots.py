@@ -16,6 +16,8 @@ from dhcal_pin.planning import plan
 from dhcal_pin.plots import COLORS
 from dhcal_pin.studies import plot_study, read_study, run
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 PLOTS = ("accuracy", "residuals", "parameters", "singular_values", "correlation", "workspace")
 
 

@@ -32,6 +32,8 @@ from dhcal_pin.robot.transmission import Transmission, n_coefficients, split_coe
 from dhcal_pin.robot.urdf import parse_urdf
 from dhcal_pin.visualization.scene import Preview, scene_html, show
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 FILES = {
     "ur10": ("ur_description/urdf/ur10_robot.urdf", None),
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),

@@ -24,6 +24,8 @@ from dhcal_pin.robot.chain import Chain
 from dhcal_pin.visualization.measured_samples import drawn_samples, measured_samples
 from dhcal_pin.visualization.scene import scene_html
 
+pytestmark = pytest.mark.usefixtures("unsuspected")
+
 N_FITTED, N_HELD_OUT, WRONG = 150, 40, (3, 70)
 # Instances of a mesh with a size, as (number, place).
 DRAWN = """name => {
