@@ -182,7 +182,7 @@ def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, capsys, opti
     assert not out.exists()
 
 
-def test_map_of_a_calibration(tmp_path, capsys):
+def test_map_of_a_calibration(tmp_path, capsys, unsuspected_once):
     data, robot, cells = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "map.csv"
     run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
     assert run(capsys, "calibrate", ROBOT, data, "-o", robot, "--map", cells)[0] == 0
