@@ -129,8 +129,11 @@ class GravityLoads:
         torques = self._torques(self.model, b"", q)
         if payload is None:
             return torques
-        per_kilogram = self._torques(self._with_one_kilogram, b"+1 kg", q) - torques
-        return torques + (payload - (self.payload.mass if self.payload else 0.0)) * per_kilogram
+        return torques + (payload - (self.payload.mass if self.payload else 0.0)) * self.torques_per_kilogram(q)
+
+    def torques_per_kilogram(self, q: Array) -> Array:
+        """Compute the gravity torques per kilogram of the payload, (n, m) [N·m/kg]."""
+        return self._torques(self._with_one_kilogram, b"+1 kg", q) - self._torques(self.model, b"", q)
 
     def _torques(self, model: pin.Model, prefix: bytes, q: Array) -> Array:
         """Compute the generalised gravity torques of a model, (n, m)."""

@@ -6,7 +6,8 @@ A cause is a block of columns of the linear model, such as the six of the base, 
 - a drift: f rises from -1 at the begin to 0 at the end, linearly or as 1 - exp(-t/τ);
 - a free drift: the first functions of the Karhunen-Loève expansion of a random walk that ends at 0,
   f = √2·sin(ω·(1 - s))/ω with ω = (i - ½)·π, for i = 1, 2, ... and the time s from 0 to 1;
-- a constant: f = 1, for a lag of the joint values and a scale of the instrument.
+- a constant: f = 1, for a lag of the joint values and a scale of the instrument; and for a payload that was
+  never stated, beside a step of the payload.
 
 Every f but the constant is 0 at the end, so that the robot of the fit is that at the end of the session.
 
@@ -30,7 +31,7 @@ HELD_SIZE = 1e-12
 # Number of functions of a free drift.
 N_FUNCTIONS = 8
 
-Kind = Literal["base", "tool", "joint", "links", "robot", "lag", "scale"]
+Kind = Literal["base", "tool", "joint", "links", "payload", "robot", "lag", "scale"]
 
 
 @frozen(eq=False)

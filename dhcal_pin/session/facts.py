@@ -33,7 +33,7 @@ _LIKE_BASE = " A motion of the base has the same effect."
 class Event:
     """Sudden change between two samples."""
 
-    kind: str  # "base", "tool", "joint" or "robot"
+    kind: str  # "base", "tool", "joint", "payload" or "robot"
     of: str  # Name of the joint or parameter, or of what moved if not base or tool; else empty
     before: Place  # Place of the last sample before it
     after: Place  # Place of the first sample after it
@@ -76,6 +76,8 @@ class Event:
             return f"Two robots were measured: from {where} on, {self.of} differs by {size}."
         if self.kind == "joint":
             return f"The zero of joint {self.of} changed by {size} {self.place}."
+        if self.kind == "payload":
+            return f"The load on the arm changed {self.place}, which moved the tool by {size}."
         verb = "turned" if self.unit == "rad" else "moved"
         return f"The {self.of or self.kind} {verb} by {size} {self.place}."
 
@@ -86,6 +88,11 @@ class Event:
             return "Calibrate each robot by itself."
         if self.kind == "joint":
             return "The result is the arm after the change." + _LIKE_BASE * self.is_like_base
+        if self.kind == "payload":
+            return (
+                "The result is the arm with the load after the change. State the mass at the tip in each row, in a "
+                "column payload[kg]."
+            )
         return f"Both parts were fitted with their own {self.of or self.kind} pose."
 
 
@@ -332,7 +339,7 @@ def cause_size(
 ) -> tuple[float, float, str]:
     """Return the size of a change, its standard deviation and its unit."""
     block, shape = cause.block, cause.shape
-    if isinstance(shape, Step) and block.kind != "joint":
+    if isinstance(shape, Step) and block.kind in ("base", "tool"):
         return _step_size(cause, shape, changes, chain)
     numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
     f = shape.values(numbers, times)
@@ -345,6 +352,8 @@ def cause_size(
         return abs(float(values[0])), float(np.sqrt(covariance[0, 0])), unit
     if block.kind == "links":
         return *_growth_size(values, covariance, chain, timeline), "m"
+    if block.kind == "payload":
+        return *_payload_size(values, covariance, chain, timeline), "m"
     origin = np.asarray(block.origin)
     return _motion_size(values[:3] + np.cross(values[3:], origin), values[3:], origin, block, covariance)
 
@@ -383,6 +392,19 @@ def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timel
         motions = motions.sum(0, keepdims=True)
     else:
         motions = motions[growing_links(chain.link_vectors)]
+    return _rms_motion(motions, values, covariance)
+
+
+def _payload_size(values: Array, covariance: Array, chain: Chain, timeline: Timeline) -> tuple[float, float]:
+    """Return the RMS motion of the tool by a change of the payload, and its standard deviation [m]."""
+    q = np.concatenate([item.q for item in timeline.data])
+    torques = chain.loads.torques_per_kilogram(q.T)
+    motions = chain.joint_jacobian(chain.forward_kinematics(q))[:, :3] * torques[:, None]
+    return _rms_motion(motions, values, covariance)
+
+
+def _rms_motion(motions: Array, values: Array, covariance: Array) -> tuple[float, float]:
+    """Return the RMS motion by values (c,) of motions (c, 3, m), and its standard deviation [m]."""
     moved = np.einsum("jcm,j->cm", motions, values)
     size = float(np.sqrt(np.mean(np.sum(moved**2, 0))))
     gradient = np.einsum("jcm,cm->j", motions, moved) / (moved.shape[1] * max(size, 1e-300))

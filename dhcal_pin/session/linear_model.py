@@ -1,7 +1,9 @@
 """Linear model of a session: whitened rows of the samples by all unknowns and by all possible causes.
 
 The columns are those of the parameters of the robot and of the instruments, then of base and tool, of the
-joint zeros, of the growth of each link, of a lag and of scales of the instrument, and last the residual r.
+joint zeros, of the growth of each link, of scales of the instrument, of a payload and of a lag, and last the
+residual r. A payload turns each joint by its compliance times the gravity torque of the payload. The column of
+a joint is its motion per kilogram and unit of compliance.
 
 Shapes: m samples of at most k residuals, c columns.
 """
@@ -19,7 +21,7 @@ from .._typing import Array
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, instrument_values
-from ..robot.error_families import growing_links
+from ..robot.error_families import COMPLIANCE, JOINT_TERMS, MIN_TORQUE, growing_links
 from .causes import HELD_SIZE, Block
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
@@ -50,6 +52,7 @@ class Layout:
     joints: Array  # Columns of the joint zeros, (n,)
     links: Array  # Columns of the growth of each link, (k+1,)
     scale: int  # Column of a scale of all axes
+    payload: Array  # Columns of the motions of the joints by a payload, (n,)
     lag: int  # Column of the lag
     n_columns: int  # Number of columns, the residual included
 
@@ -71,7 +74,8 @@ class Layout:
         links = joints[-1] + 1 + np.arange(n_links)
         all_links = int(links[-1]) + 1
         scales = all_links + 1 + np.arange(len(SCALE_AXES))
-        lag = int(scales[-1]) + 1
+        payload = int(scales[-1]) + 1 + np.arange(n)
+        lag = int(payload[-1]) + 1
         grows = growing_links(chain.link_vectors)
         # A robot without lengths only turns.
         size = float(np.linalg.norm(chain.link_vectors, axis=1).sum()) or 1.0
@@ -89,6 +93,11 @@ class Layout:
         if has_joints and grows.any():
             blocks.append(Block("links", "", np.array([all_links]), np.array([1 / size])))
             blocks.append(Block("links", "", links[grows], np.full(grows.sum(), 1 / size)))
+        # Robots without masses do not bend, and a payload that is stated has been taken into account.
+        torque = _largest_torques(problem)
+        if has_joints and torque.any():
+            unit = 1 / (size * torque.max())
+            blocks.append(Block("payload", "", payload, np.where(torque > MIN_TORQUE, unit, HELD_SIZE)))
         blocks += [
             Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_constant=True)
             for i, axis in enumerate(SCALE_AXES)
@@ -103,6 +112,7 @@ class Layout:
             joints,
             links,
             int(scales[0]),
+            payload,
             lag,
             lag + 2,
         )
@@ -113,7 +123,9 @@ class Layout:
         # only if the calibration also estimates a constant error of the same kind.
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
-        changing = np.unique(np.concatenate([b.columns for b in self.blocks if not b.is_constant]))
+        # The search itself adds a constant payload beside a step of it.
+        can_change = [b.columns for b in self.blocks if not (b.is_constant or b.kind == "payload")]
+        changing = np.unique(np.concatenate(can_change))
         products = np.tensordot(rows, rows, ((0, 1), (0, 1)))
         of_model = products[np.ix_(self.model, changing)]
         explained = inverse(products[np.ix_(self.model, self.model)]) @ of_model
@@ -128,6 +140,11 @@ class Layout:
         # The rotation of a tool of which only a point is measured would turn with the direction of its steps.
         weights = np.where(is_observed[self.model], self.weights, 1 / HELD_SIZE)
         return replace(self, blocks=tuple(blocks), weights=weights)
+
+    @property
+    def has_payload(self) -> bool:
+        """Whether a payload is a possible cause."""
+        return any(block.kind == "payload" for block in self.blocks)
 
     def errors_at(self, x: Array) -> Array:
         """Return the values of all parameters of `problem`, for unknowns x (p,) of the calibration."""
@@ -157,13 +174,18 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         block[-1] = residual
         jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)
         growth = chain.growth_motions(frames)
+        by_joint = chain.joint_jacobian(frames, observation.body)
+        torque = np.zeros((len(by_joint), len(item.rows)))
+        if layout.has_payload:
+            torque = errors.chain.loads.torques_per_kilogram(item.q.T)
         motions = np.concatenate(
             [
                 jacobian,
-                chain.joint_jacobian(frames, observation.body),
+                by_joint,
                 growth,
                 growth.sum(0, keepdims=True),
                 _scale_motions(frames.tool[3]),
+                by_joint * torque[:, None],
             ]
         )
         rows = np.empty((len(motions), *residual.shape))
@@ -176,6 +198,16 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
                 block[instrument_columns[parameter.name]] = part
     out[layout.lag] = np.einsum("nkm,mn->km", out[layout.joints], rates)
     return np.ascontiguousarray(out.transpose(2, 1, 0))
+
+
+def _largest_torques(problem: Problem) -> Array:
+    """Return the largest gravity torque of each joint per kilogram of an unstated payload, (n,) [N·m/kg]."""
+    chain = problem.errors.chain
+    is_stated = any(item.recorded is not None and item.recorded.payload is not None for item in problem.data)
+    if is_stated or not JOINT_TERMS[COMPLIANCE].has_effect(chain.loads).any():
+        return np.zeros(chain.n_joints)
+    torques = [np.abs(chain.loads.torques_per_kilogram(item.q.T)).max(1) for item in problem.data]
+    return np.where(chain.is_prismatic, 0.0, np.max(torques, 0))
 
 
 def _scale_motions(points: Array) -> Array:

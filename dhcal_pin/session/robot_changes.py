@@ -68,6 +68,9 @@ class RobotChanges:
     zeros: tuple[tuple[int, Change, Array], ...] = ()
     # Growth of the links: functions of time, and amplitudes of each link, (F, k+1).
     growth: tuple[tuple[Change, Array], ...] = ()
+    # Changes of the payload: functions of time, and change of the payload times the compliance of each joint,
+    # (n,) [kg·rad/Nm].
+    payload: tuple[tuple[Change, Array], ...] = ()
     lag: float = 0.0  # Time by which the joint values are too early, in the unit of the timeline
 
     @property
@@ -83,10 +86,12 @@ class RobotChanges:
     @property
     def is_empty(self) -> bool:
         """Whether nothing changed."""
-        return self.base.is_identity and self.tool.is_identity and not (self.zeros or self.growth or self.lag)
+        return self.base.is_identity and self.tool.is_identity and not (
+            self.zeros or self.growth or self.payload or self.lag
+        )
 
     def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:
-        """Return the changes with a step of base, tool or a joint at another sample."""
+        """Return the changes with a step of base, tool, payload or a joint at another sample."""
         if kind == "joint":
             moved = (i == joint and isinstance(f, Step) and f.number == old for i, f, _ in self.zeros)
             zeros = [
@@ -94,6 +99,9 @@ class RobotChanges:
                 for is_moved, (i, f, value) in zip(moved, self.zeros, strict=True)
             ]
             return replace(self, zeros=tuple(zeros))
+        if kind == "payload":
+            moved_steps = [(Step(new) if f == Step(old) else f, value) for f, value in self.payload]
+            return replace(self, payload=tuple(moved_steps))
         motion: Motion = getattr(self, kind)
         steps = tuple(new if step == old else step for step in motion.steps)
         return replace(self, **{kind: replace(motion, steps=steps)})
@@ -121,10 +129,13 @@ class RobotChanges:
         if not self.tool.is_identity:
             drift = se3.exp6(self.tool.twists(numbers, times))
             values["tool_motion"] = drift @ self.tool.poses[self.tool.segments(numbers)]
-        if self.zeros or later is not None:
+        if self.zeros or self.payload or later is not None:
             zeros = np.zeros(conditions.q.shape)
             for joint, shape, amplitudes in self.zeros:
                 zeros[:, joint] += shape.values(numbers, times) @ amplitudes
+            for shape, amplitudes in self.payload:
+                torque = chain.loads.torques_per_kilogram(conditions.q.T).T
+                zeros += shape.values(numbers, times) * amplitudes * torque
             if later is not None:
                 zeros += later - conditions.q
             values["zeros"] = zeros
@@ -178,6 +189,7 @@ def update(
     motions = {"base": changes.base, "tool": changes.tool}
     zeros: list[tuple[int, Change, Array]] = []
     growth: list[tuple[Change, Array]] = []
+    payload: list[tuple[Change, Array]] = []
     lag = changes.lag
     for kind, motion in motions.items():
         chosen = [(c.shape, d) for c, d in zip(causes, steps, strict=True) if c.block.kind == kind]
@@ -199,7 +211,7 @@ def update(
         ]
         motions[kind] = replace(motion, poses=poses, drifts=tuple(drifts))
     of_joints = {(joint, shape): values for joint, shape, values in changes.zeros}
-    of_links = dict(changes.growth)
+    of_links, of_payload = dict(changes.growth), dict(changes.payload)
     for cause, d in zip(causes, steps, strict=True):
         shape = cause.shape
         if not isinstance(shape, Constant) and cause.block.kind == "joint":
@@ -210,8 +222,10 @@ def update(
             is_own = np.isin(links, cause.block.columns) if len(cause.block.columns) > 1 else slice(None)
             amplitudes[:, is_own] += d.reshape(len(amplitudes), -1)
             growth.append((shape, amplitudes))
+        if not isinstance(shape, Constant) and cause.block.kind == "payload":
+            payload.append((shape, of_payload.get(shape, 0.0) + d))
         if cause.block.kind == "lag":
             lag += float(d[0])
     if not any(cause.block.kind == "lag" for cause in causes):
         lag = 0.0
-    return RobotChanges(motions["base"], motions["tool"], tuple(zeros), tuple(growth), lag)
+    return RobotChanges(motions["base"], motions["tool"], tuple(zeros), tuple(growth), tuple(payload), lag)

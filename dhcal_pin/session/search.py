@@ -190,7 +190,8 @@ class _Search:
             rates = self.paths.evaluate(numbers, times, self.changes.lag)[1]
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
         for cause in self.causes:
-            if cause.block.kind == "scale":
+            # A constant payload is part of the model, and changes nothing over time.
+            if isinstance(cause.shape, Constant) and cause.block.kind != "lag":
                 rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
         return rows
 
@@ -357,7 +358,7 @@ class _Search:
             steps = [Step(int(number)) for number in self.numbers[inner]]
         drifts: list[Shape] = []
         free: list[Shape] = []
-        if self.is_ordered:
+        if self.is_ordered and block.kind != "payload":
             begin, end = float(self.times[0]), float(self.times[-1])
             used = {
                 type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)
@@ -440,11 +441,16 @@ class _Search:
     def _remove(self, i: int) -> LinearFit:
         """Remove a cause, and fit without it."""
         del self.causes[i]
+        if not any(c.block.kind == "payload" and isinstance(c.shape, Step) for c in self.causes):
+            self.causes = [cause for cause in self.causes if not _is_part_of_model(cause)]
         self._drop_others()
         return self._settle()
 
     def _add(self, cause: Cause) -> None:
         """Add a cause, with coefficients of zero."""
+        # A step of the payload would imitate a part of one that is the same for all samples, such as wrong masses.
+        if cause.block.kind == "payload" and not any(_is_part_of_model(each) for each in self.causes):
+            self.causes.append(replace(cause, shape=Constant(), values=np.zeros_like(cause.values)))
         self.causes.append(replace(cause, values=np.zeros_like(cause.values)))
 
     def _settle(self) -> LinearFit:
@@ -537,8 +543,12 @@ class _Search:
         while self.causes:
             rows = self.linearize()
             full = self.solve(rows, self.causes)
-            judged = [self._judge(rows, full, i) for i in range(len(self.causes))]
-            worst = min(range(len(judged)), key=lambda i: judged[i].log_evidence)
+            judged = [
+                cause if _is_part_of_model(cause) else self._judge(rows, full, i)
+                for i, cause in enumerate(self.causes)
+            ]
+            judged_ones = [i for i, cause in enumerate(judged) if not _is_part_of_model(cause)]
+            worst = min(judged_ones, key=lambda i: judged[i].log_evidence)
             if judged[worst].log_evidence >= MIN_LOG_EVIDENCE:
                 self.causes = judged
                 break
@@ -688,6 +698,11 @@ class _Search:
         return Event("robot", name, before, after, size, float(std[worst]), unit)
 
 
+def _is_part_of_model(cause: Cause) -> bool:
+    """Return whether a cause is a payload of all samples, which is fitted beside a step of it."""
+    return cause.block.kind == "payload" and isinstance(cause.shape, Constant)
+
+
 def _information(columns: Array, root: Array) -> Array:
     """Return the inner products of columns (N, k, p) with square roots of weights (N, k) or (N, 1)."""
     flat = (columns * root[..., None]).reshape(-1, columns.shape[-1])
@@ -763,7 +778,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search = alone
     other_robot = search.other_robot()
     search.place_steps()
-    causes = tuple(search.causes)
+    causes = tuple(cause for cause in search.causes if not _is_part_of_model(cause))
     constants = [
         (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
         for cause in causes
