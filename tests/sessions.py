@@ -77,15 +77,32 @@ class Simulation:
         data, out = model.createData(), []
         frame = model.getFrameId(self.chain.tip, pin.FrameType.BODY)
         for row in q:
-            configuration = pin.neutral(model)
-            for i, value in zip(self.ids, row, strict=True):
-                joint = model.joints[i]
-                is_unbounded = joint.nq == 2
-                values = (np.cos(value), np.sin(value)) if is_unbounded else (value,)
-                configuration[joint.idx_q : joint.idx_q + joint.nq] = values
-            pin.framesForwardKinematics(model, data, configuration)
+            pin.framesForwardKinematics(model, data, self.configuration(row))
             out.append(data.oMf[frame].copy())
         return out
+
+    def configuration(self, row: np.ndarray) -> np.ndarray:
+        """Return the configuration of Pinocchio at joint positions (n,)."""
+        configuration = pin.neutral(self.model)
+        for i, value in zip(self.ids, row, strict=True):
+            joint = self.model.joints[i]
+            is_unbounded = joint.nq == 2
+            values = (np.cos(value), np.sin(value)) if is_unbounded else (value,)
+            configuration[joint.idx_q : joint.idx_q + joint.nq] = values
+        return configuration
+
+    def torques(self, q: np.ndarray, payload: np.ndarray) -> np.ndarray:
+        """Return the gravity torques on the joints (m, n) under a payload (m,) at the tip [N·m]."""
+        data = self.model.createData()
+        frame = self.model.getFrameId(self.chain.tip, pin.FrameType.BODY)
+        columns = [self.model.joints[i].idx_v for i in self.ids]
+        out = []
+        for row, mass in zip(q, payload, strict=True):
+            at = self.configuration(row)
+            own = pin.computeGeneralizedGravity(self.model, data, at)
+            jacobian = pin.computeFrameJacobian(self.model, data, at, frame, pin.LOCAL_WORLD_ALIGNED)
+            out.append((own + 9.81 * mass * jacobian[2])[columns])
+        return np.array(out)
 
     def add_eccentricities(self, size: float) -> None:
         """Add errors with random sines and cosines of q to each joint [rad], and half as large ones of 2q."""

@@ -129,7 +129,8 @@ class GravityLoads:
         torques = self._torques(self.model, b"", q)
         if payload is None:
             return torques
-        return torques + (payload - (self.payload.mass if self.payload else 0.0)) * self.torques_per_kilogram(q)
+        added = payload - (self.payload.mass if self.payload else 0.0)
+        return torques + added * self.torques_per_kilogram(q)
 
     def torques_per_kilogram(self, q: Array) -> Array:
         """Compute the gravity torques per kilogram of the payload, (n, m) [N·m/kg]."""

@@ -2,8 +2,8 @@
 
 The columns are those of the parameters of the robot and of the instruments, then of base and tool, of the
 joint zeros, of the growth of each link, of scales of the instrument, of a payload and of a lag, and last the
-residual r. A payload turns each joint by its compliance times the gravity torque of the payload. The column of
-a joint is its motion per kilogram and unit of compliance.
+residual r. A payload turns each joint by its compliance times the gravity torque of the payload. The column
+of a joint is its motion per kilogram and unit of compliance.
 
 Shapes: m samples of at most k residuals, c columns.
 """

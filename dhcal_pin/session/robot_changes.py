@@ -86,8 +86,10 @@ class RobotChanges:
     @property
     def is_empty(self) -> bool:
         """Whether nothing changed."""
-        return self.base.is_identity and self.tool.is_identity and not (
-            self.zeros or self.growth or self.payload or self.lag
+        return (
+            self.base.is_identity
+            and self.tool.is_identity
+            and not (self.zeros or self.growth or self.payload or self.lag)
         )
 
     def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:

@@ -448,7 +448,7 @@ class _Search:
 
     def _add(self, cause: Cause) -> None:
         """Add a cause, with coefficients of zero."""
-        # A step of the payload would imitate a part of one that is the same for all samples, such as wrong masses.
+        # A step of the payload would imitate a part of a constant one, such as that of wrong masses.
         if cause.block.kind == "payload" and not any(_is_part_of_model(each) for each in self.causes):
             self.causes.append(replace(cause, shape=Constant(), values=np.zeros_like(cause.values)))
         self.causes.append(replace(cause, values=np.zeros_like(cause.values)))

@@ -83,6 +83,8 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
     rows = whitened_rows(layout, np.zeros(len(errors.parameters)), (data,), rates)
     to_base, twists = se3.inverse(chain.base), np.eye(6)
     growth = np.eye(n + 1)
+    nominal = Simulation("ur5", 4, 0, errors=(0.0, 0.0))
+    torques = nominal.torques(q, np.ones(4)) - nominal.torques(q, np.zeros(4))
 
     def moved(**changes):
         changed = data.replace(recorded=Conditions(q, **changes))
@@ -96,6 +98,7 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
         "tool": [{"tool_motion": np.tile(se3.exp6(h), (4, 1, 1))} for h in step * twists],
         "lag": [{"zeros": step * rates}],
         "links": [{"growth": np.tile(step * h, (4, 1))} for h in growth],
+        "payload": [{"zeros": step * h * torques} for h in np.eye(n)],
     }
     for block in layout.blocks:
         if block.kind == "joint":
