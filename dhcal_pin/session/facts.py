@@ -90,8 +90,8 @@ class Event:
             return "The result is the arm after the change." + _LIKE_BASE * self.is_like_base
         if self.kind == "payload":
             return (
-                "The result is the arm with the load after the change. State the mass at the tip in each row, "
-                "in a column payload[kg]."
+                "The result is the arm with the load after the change. State the mass at the tip in each "
+                "row, in a column payload[kg]."
             )
         return f"Both parts were fitted with their own {self.of or self.kind} pose."
 
