@@ -94,9 +94,9 @@ MAX_CONTINUED = 500
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # Residuals this many times as large as the stated standard deviations may be the cause of a large correction.
 MIN_SIGMA_RATIO = 10.0
-# They are not if a fit with these residuals as standard deviations leaves a smaller share of them: the first
-# fit is then far from its minimum. The share was 1.00 to 1.04 in 29 simulated cases with too small standard
-# deviations, and 0.001 and 0.3 in two that did not converge.
+# Smallest residuals of a second fit, with the residuals of the first one as standard deviations. If they are
+# smaller, the first fit was far from its minimum. They were 1.00 to 1.04 in 29 simulated cases with too small
+# standard deviations, and 0.001 and 0.3 in two that did not converge.
 MIN_REFITTED_SHARE = 0.5
 # Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
 # probability and one degree of freedom. Those with more degrees of freedom are closer to 0.
