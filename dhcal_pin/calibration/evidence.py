@@ -43,7 +43,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, k_fold
+from .partition import configuration_groups, is_same_file, k_fold
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
@@ -296,7 +296,9 @@ class Evidence(FittedModel):
         """Mistake in hold-out samples whose errors are not explained; None without one."""
         if not self.is_holdout_unexplained:
             return None
-        found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self))
+        # A remedy changes the fitted samples of the same file, too.
+        others = [item for item in self.data if any(is_same_file(item, each) for each in self.holdout)]
+        found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self), holdout=others)
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
         return replace(found, source=source) if found.hypotheses else None
@@ -350,7 +352,10 @@ def positions_beside_images(data: Sequence[Measurement]) -> tuple[Measurement, .
 
 def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
     """Look for mistakes in the measurements of a calibration, if this was not done before."""
-    return fit.earlier_diagnosis or diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress)
+    if fit.earlier_diagnosis:
+        return fit.earlier_diagnosis
+    held_out = [item for item in fit.holdout if any(is_same_file(item, each) for each in fit.data)]
+    return diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
 
 
 def diagnose_joint_values(fit: Evidence) -> Diagnosis:

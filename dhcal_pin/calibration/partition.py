@@ -54,6 +54,11 @@ def _merge_groups(labels: Array, others: Array) -> Array:
     return values[first[merged]][groups]
 
 
+def is_same_file(item: Measurement, other: Measurement) -> bool:
+    """Return whether two measurements are parts of one file."""
+    return item.source == other.source and not np.intersect1d(item.rows, other.rows).size
+
+
 def configuration_groups(data: Sequence[Measurement]) -> Array:
     """Label the samples of measurements, those of the same configuration by the same label."""
     # Many parts of a calibration need the labels of one measurement.

@@ -36,6 +36,7 @@ from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
 from .model_selection import ExtendedFit, Extension, outlier_weights, with_joint_errors
+from .partition import is_same_file
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
 
@@ -105,7 +106,9 @@ def fit_session(
         found, refit, changed_holdout = without_changes(found), fit, holdout
     if found.changes.is_empty and not found.causes:
         return SessionFit(fit, holdout, found)
-    is_likely, diagnosis = _compare_with_mistakes(found, chain, data, changed, models.sets, progress)
+    is_likely, diagnosis = _compare_with_mistakes(
+        found, chain, (data, holdout), (changed, changed_holdout), models.sets, progress
+    )
     if not is_likely:
         return SessionFit(fit, holdout, Session(found.timeline, found.chain, found.is_ordered), diagnosis)
     return SessionFit(refit, changed_holdout, found, diagnosis)
@@ -131,27 +134,40 @@ def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
 def _compare_with_mistakes(
     session: Session,
     chain: Chain,
-    data: Sequence[Measurement],
-    with_changes: Sequence[Measurement],
+    as_measured: tuple[Sequence[Measurement], Sequence[Measurement]],
+    with_changes: tuple[Sequence[Measurement], Sequence[Measurement]],
     sets: str,
     progress: Progress | None,
 ) -> tuple[bool, Diagnosis | None]:
     """Return whether changes explain measurements better than mistakes do, and a diagnosis that was made."""
-    evidence = fit_drawn_samples(chain, with_changes, sets)
+    # Both are fitted and held-out measurements.
+    evidence = fit_drawn_samples(chain, with_changes[0], sets)
     grows = any(d.kind == "links" and d.size > MAX_GROWTH * workspace_radius(chain) for d in session.drifts)
     turns = _turns_far(session)
     if not (grows or turns or leaves_residuals(evidence) or evidence.width > MAX_WIDTH):
         return True, None if is_suspicious(evidence) else Diagnosis(evidence)
-    as_read = diagnose_mixups(chain, data, sets, progress)
+    as_read = _diagnose(chain, as_measured, sets, progress)
     if grows or (as_read.is_certain and _explains_better(as_read, Diagnosis(evidence))):
         return False, as_read
-    changed = diagnose_mixups(chain, with_changes, sets, progress)
+    changed = _diagnose(chain, with_changes, sets, progress)
     if _is_changed_zero(session, changed):
         changed = Diagnosis(changed.before)
     if as_read.hypotheses and _explains_better(as_read, changed):
         return False, as_read
     is_impossible = leaves_residuals(evidence) and (turns or _fits_no_robot(chain, evidence))
     return (False, as_read) if is_impossible and not changed.hypotheses else (True, changed)
+
+
+def _diagnose(
+    chain: Chain,
+    measured: tuple[Sequence[Measurement], Sequence[Measurement]],
+    sets: str,
+    progress: Progress | None,
+) -> Diagnosis:
+    """Look for a mistake in fitted measurements; held-out ones of the same files confirm it."""
+    data, holdout = measured
+    held_out = [item for item in holdout if any(is_same_file(item, each) for each in data)]
+    return diagnose_mixups(chain, data, sets, progress, held_out)
 
 
 def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:

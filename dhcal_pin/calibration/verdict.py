@@ -43,7 +43,7 @@ from . import cameras
 from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions, diagnose_joint_values
 from .model_selection import FULL_SET
-from .partition import configuration_groups
+from .partition import configuration_groups, is_same_file
 from .reweighting import Fit
 from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
 
@@ -767,7 +767,7 @@ def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
 
 def _alternate(item: Measurement, other: Measurement) -> bool:
     """Return whether samples of one file were measured between those of the other part of it."""
-    if item.source != other.source or np.intersect1d(item.rows, other.rows).size:
+    if not is_same_file(item, other):
         return False
     return bool(item.rows.min() < other.rows.max() and other.rows.min() < item.rows.max())
 

@@ -228,7 +228,8 @@ FIT_FRAMES: dict[str, Any] = {
 MEND: dict[str, Any] = {
     "metavar": "CHANGE",
     "help": "undo a mistake in the measurements, as a refused calibration names it, such as "
-    "sign:elbow_joint; CHANGE@FILE for one of several files; may be repeated",
+    "sign:elbow_joint; CHANGE@FILE for one of several files, CHANGE@FILE:52-101 for some of its lines; may "
+    "be repeated",
 }
 JSON: dict[str, Any] = {"metavar": "FILE", "help": "write the result as JSON; - for stdout"}
 PARAMETERS: dict[str, Any] = {

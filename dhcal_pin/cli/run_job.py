@@ -13,6 +13,7 @@ A job runs in these steps. Invalid input is found before anything is written.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
@@ -256,13 +257,22 @@ def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measur
 def _mended(chain: Chain, files: list[MeasurementFile], changes: Sequence[str]) -> list[MeasurementFile]:
     """Return measurement files after the changes of --mend."""
     data = [file.data for file in files]
-    for key, _, source in (change.partition("@") for change in changes):
-        # `KEY@FILE` changes one file only, other keys all files to which they apply.
+    known = dict.fromkeys(file.source for file in files)
+    for key, _, target in (change.partition("@") for change in changes):
+        # `KEY@FILE` changes one file only, `KEY@FILE:FIRST-LAST` some of its lines, other keys all files to
+        # which they apply.
+        source, lines = target, None
+        if target not in known and (found := re.fullmatch(r"(.+):(\d+)-(\d+)", target)):
+            source, lines = found[1], (int(found[2]), int(found[3]))
         chosen = [i for i, file in enumerate(files) if source in ("", file.source)]
         if not chosen:
-            known = ", ".join(dict.fromkeys(file.source for file in files))
-            raise InvalidArgumentError(f"--mend {key}@{source}: unknown file; choose from {known}")
-        mended = plausibility.mend_files(chain, [data[i] for i in chosen], key)
+            raise InvalidArgumentError(f"--mend {key}@{target}: unknown file; choose from {', '.join(known)}")
+        chosen_data = [data[i] for i in chosen]
+        mended = (
+            plausibility.mend_files(chain, chosen_data, key)
+            if lines is None
+            else plausibility.mend_lines(chain, chosen_data, key, lines)
+        )
         for i, item in zip(chosen, mended, strict=True):
             data[i] = item
     return [

@@ -10,6 +10,7 @@ from .hypotheses import Hypothesis as Hypothesis
 from .hypotheses import list_hypotheses as list_hypotheses
 from .hypotheses import mend as mend
 from .hypotheses import mend_files as mend_files
+from .hypotheses import mend_lines as mend_lines
 from .mixups import diagnose_mixups as diagnose_mixups
 from .signs import SignDecision as SignDecision
 from .signs import decide_signs as decide_signs

@@ -31,10 +31,14 @@ class Diagnosis:
     hypotheses: tuple[Hypothesis, ...] = ()
     after: Evidence | None = None  #: Evidence with the first hypothesis.
     source: str = ""  #: File that the hypotheses are about; empty for all measurements together.
+    #: First and last line of the mistake in this file; None if it is in all of them.
+    lines: tuple[int, int] | None = None
     #: Whether each of several measurements fits the robot, but not all of them together.
     fits_separately: bool = False
     #: Zero of a joint that explains the measurements, too; the calibration corrects its small angle.
     zero: Diagnosis | None = None
+    #: Evidence of a part of the samples with the first hypothesis, if all of them leave residuals with it.
+    part: Evidence | None = None
     gain: float = 0.0  #: Logarithm of the ratio of the evidence with the first hypothesis to that before.
 
     @property
@@ -62,7 +66,9 @@ class Diagnosis:
         """What was mixed up and what undoing it would change; only with a hypothesis."""
         first, *others = (hypothesis.description for hypothesis in self.hypotheses)
         assert self.after is not None
-        text = f"In {self.source}, {first}" if self.source else f"{first[0].upper()}{first[1:]}"
+        where = [f"lines {self.lines[0]} to {self.lines[1]}"] if self.lines else []
+        where += [self.source] if self.source else []
+        text = f"In {' of '.join(where)}, {first}" if where else f"{first[0].upper()}{first[1:]}"
         if others:
             text += f" (or {' or '.join(others)})"
         for before, after, unit in (
@@ -79,6 +85,10 @@ class Diagnosis:
     def remedy(self) -> str:
         """What to do about it; only with a hypothesis."""
         where = f"@{self.source}" if self.source else ""
+        if self.lines:
+            if not self.source:
+                return "Correct these lines."
+            where += f":{self.lines[0]}-{self.lines[1]}"
         keys = [f"--mend {hypothesis.key}{where}" for hypothesis in self.hypotheses]
         return f"Correct the measurements, or add {' or '.join(keys)}."
 

@@ -36,7 +36,7 @@ from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem
 from ..estimation.solver import minimize
-from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement
+from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, residual_of
 from ..measurements.pose import PoseMeasurement
 from ..measurements.position import PointMeasurement
 from ..robot.chain import Chain
@@ -77,6 +77,21 @@ class Evidence:
     chain: Chain | None = field(default=None, repr=False, compare=False)
     #: Errors of the robot, base and tool by name [m or rad].
     errors: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
+    #: Values of the instrument parameters by name [m or rad].
+    instruments: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
+
+    def misfits(self, item: Measurement) -> Array | None:
+        """Compute the residuals (m,) of samples relative to the noise; None for another instrument."""
+        if self.chain is None:
+            return None
+        equal = _with_equal_sigmas(item).matched_to(self.instruments).mounted(self.chain)
+        scales = {"m": self.length_scale / LENGTH_SIGMA, "rad": self.angle_scale / ANGLE_SIGMA}
+        is_known = all(p.name in self.instruments and not p.is_local for p in equal.instrument_parameters)
+        groups = equal.residual_groups.values()
+        if not is_known or any(not scales.get(group.unit, 0.0) > 0 for group in groups):
+            return None
+        r = residual_of(equal, self.chain, self.instruments)
+        return np.max([np.sqrt(np.mean(r[g.rows] ** 2, 0)) / scales[g.unit] for g in groups], 0)
 
 
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
@@ -112,6 +127,7 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Eviden
         factor * noise.angle_scale,
         problem.chain(solution.x),
         dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
+        problem.instruments(solution.x),
     )
 
 

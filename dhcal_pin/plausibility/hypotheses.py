@@ -23,7 +23,7 @@ from .. import se3
 from .._frozen import frozen
 from .._typing import Array
 from ..exceptions import InvalidArgumentError, UnknownNameError
-from ..measurements.base import Measurement, label_stops
+from ..measurements.base import Measurement, concatenate, label_stops
 from ..measurements.contact import PointContact
 from ..measurements.euler_angles import (
     EULER_NOTATIONS,
@@ -496,6 +496,26 @@ def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Meas
         kinds = " and ".join(dict.fromkeys(item.kind for item in data))
         raise UnknownNameError(f"--mend {key!r}: does not apply to measurements of kind {kinds}")
     return changed
+
+
+def mend_lines(
+    chain: Chain, data: Sequence[Measurement], key: str, lines: tuple[int, int]
+) -> list[Measurement]:
+    """Undo a mistake in the samples from the first to the last of two lines of a file."""
+    first, last = lines
+    inside = [(item.rows >= first) & (item.rows <= last) for item in data]
+    if not any(mask.any() for mask in inside):
+        raise InvalidArgumentError(f"--mend {key!r}: no samples in lines {first} to {last}")
+    parts = mend_files(chain, [item.take(mask) for item, mask in zip(data, inside, strict=True)], key)
+    mended = []
+    for item, part, mask in zip(data, parts, inside, strict=True):
+        if len(part.rows) != np.count_nonzero(mask):
+            raise InvalidArgumentError(
+                f"--mend {key!r}: needs the rows beside each sample; expected a whole file, without lines"
+            )
+        whole = concatenate([part, item.take(~mask)])
+        mended.append(whole.take(np.argsort(whole.rows, kind="stable")))
+    return mended
 
 
 def _change_of_size(key: str) -> Change | None:

@@ -23,6 +23,8 @@ If there is no such pair either, the base may have moved or something else may h
 measurement. One event leaves at least two of three parts of the file without a change. A single hypothesis
 that is found in two of them is therefore reported if it is decisive for the whole file, too, whatever
 residuals the event leaves.
+
+All samples confirm a hypothesis, or it is restricted to a part of them (`confirmation`).
 """
 
 from __future__ import annotations
@@ -59,12 +61,23 @@ def diagnose_mixups(
     data: Sequence[Measurement],
     sets: str = MANUFACTURED,
     progress: Progress | None = None,
+    holdout: Sequence[Measurement] = (),
 ) -> Diagnosis:
     """Look for a mistake in measurements that explains why they do not fit the robot."""
+    # Samples that are held out of the same files belong to the lines that contain a mistake.
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    report = progress or no_progress
+    found = _diagnose(chain, items, sets, progress or no_progress)
+    if not (found.hypotheses or found.zero):
+        return found
+    from .confirmation import confirm  # lazy import: few measurements have a mistake
+
+    return confirm(chain, found, [*items, *comparable_items(holdout)], sets)
+
+
+def _diagnose(chain: Chain, items: Sequence[Measurement], sets: str, report: Progress) -> Diagnosis:
+    """Look for one mistake or two in samples that are drawn from measurements."""
     diagnosis, trial = _find_single(chain, items, sets, report)
     if trial is None:
         return diagnosis

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from heapq import nsmallest
 from itertools import islice, permutations, product, starmap
 from typing import NamedTuple
@@ -110,7 +111,9 @@ class Trial(NamedTuple):
         """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
         counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
         common = [each for each in self.candidates if counts[each.hypothesis.key] >= MIN_PARTS]
-        return _decide(self, _scores(self, common, SINGLES), is_partial=True)
+        found = _decide(self, _scores(self, common, SINGLES), is_partial=True)
+        fits = [part.after for part in parts if part.after and found.hypotheses[:1] == part.hypotheses[:1]]
+        return replace(found, part=max(fits, key=lambda each: each.log, default=None))
 
     def _changes_of_pairs(self) -> Iterator[_Change]:
         """Yield pairs of mistakes with the samples after both changes."""

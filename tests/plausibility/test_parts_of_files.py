@@ -1,0 +1,99 @@
+"""A mistake that begins or ends within a file is stated for its lines only, with a remedy for these."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from sessions import Simulation
+from slow_cases import some_slow
+
+from dhcal_pin import Result, calibrate, split
+from dhcal_pin.measurements import Measurement, Position
+from dhcal_pin.plausibility import diagnose_mixups, mend_lines
+
+ARMS = ["ur10", "panda", "xarm7", "ur5"]
+COUNT = 100
+# Mistakes: the change that undoes each, with names of the joints by number, and what it makes of the samples.
+MISTAKES = {
+    "lengths:m-not-mm": lambda q, p: (q, 1e-3 * p),
+    "lengths:in-not-mm": lambda q, p: (q, p / 25.4),
+    "sign:{2}": lambda q, p: (q * np.where(np.arange(q.shape[1]) == 2, -1, 1), p),
+    "swap:{1}:{2}": lambda q, p: (q[:, [0, 2, 1, *range(3, q.shape[1])]], p),
+}
+CASES = [(arm, key, seed) for seed in range(5) for arm in ARMS for key in MISTAKES]
+FAST = [0, 6, 11]
+
+
+def spoiled(sim: Simulation, data: Measurement, key: str, inside: slice) -> tuple[str, Measurement]:
+    """Return the change that undoes a mistake, and samples with this mistake in some rows."""
+    q, positions = data.q.copy(), data.positions().copy()
+    q[inside], positions[inside] = MISTAKES[key](q[inside], positions[inside])
+    return key.format(*sim.chain.joint_names), Position(q, positions).replace(source="m.csv")
+
+
+def remedies(fit: Result) -> list[tuple[str, tuple[int, int]]]:
+    """Return the changes of lines of m.csv that the verdict names."""
+    found = re.findall(r"--mend (\S+)@m\.csv:(\d+)-(\d+)", " ".join(fit.verdict.reasons))
+    return [(key, (int(first), int(last))) for key, first, last in found]
+
+
+def calibrate_parts(sim: Simulation, data: Measurement) -> Result:
+    """Calibrate with a part of the samples held out."""
+    fitted, holdout = split(data, 0.3, 0)
+    return calibrate(sim.chain, fitted, holdout=holdout)
+
+
+@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
+def test_a_mistake_in_most_rows_is_stated_for_their_lines(arm, key, seed):
+    sim = Simulation(arm, COUNT, seed)
+    name, wrong = spoiled(sim, sim.measure(), key, slice(30, None))
+    fit = calibrate_parts(sim, wrong)
+    assert fit.verdict.status == "refused"
+    reason = fit.verdict.reasons[0]
+    assert reason.startswith("In lines 31 to 100 of m.csv, ")
+    assert (name, (31, 100)) in remedies(fit)
+    # The advice, each of several.
+    for change, lines in remedies(fit):
+        (mended,) = mend_lines(sim.chain, [wrong], change, lines)
+        again = calibrate_parts(sim, mended)
+        assert again.verdict.status == "ok"
+        assert sim.true_error(again.chain) < 2e-4
+
+
+@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
+def test_no_change_of_a_whole_file_is_advised_if_a_part_is_right(arm, key, seed):
+    sim = Simulation(arm, COUNT, seed)
+    for inside in (slice(50, None), slice(0, 50), slice(20, 70), np.arange(COUNT) % 2 == 0):
+        _, wrong = spoiled(sim, sim.measure(), key, inside)
+        text = " ".join(calibrate_parts(sim, wrong).verdict.reasons)
+        rows = np.arange(1, COUNT + 1)[inside]
+        allowed = f"@m.csv:{rows[0]}-{rows[-1]}" if isinstance(inside, slice) else None
+        for mend in re.findall(r"--mend (\S+)", text):
+            assert allowed and mend.rstrip(".").endswith(allowed), text
+
+
+@pytest.mark.parametrize("seed", some_slow(range(10), [0]))
+def test_right_samples_far_from_wrong_ones_are_counted(seed):
+    """Positions in mm beside those in m are far away, and are not drawn for the evidence."""
+    sim = Simulation("ur10", COUNT, seed)
+    _, wrong = spoiled(sim, sim.measure(), "lengths:m-not-mm", slice(40, None))
+    found = diagnose_mixups(sim.chain, [wrong])
+    assert [each.key for each in found.hypotheses] == ["lengths:m-not-mm"]
+    assert found.lines == (41, 100)
+    # Every other row is right: no range of lines has the mistake.
+    _, wrong = spoiled(sim, sim.measure(), "lengths:m-not-mm", np.arange(COUNT) % 3 > 0)
+    assert not diagnose_mixups(sim.chain, [wrong]).hypotheses
+
+
+@pytest.mark.parametrize("seed", some_slow(range(10), [0]))
+def test_outliers_do_not_restrict_a_mistake(seed):
+    sim = Simulation("panda", COUNT, seed)
+    data = sim.measure()
+    positions = data.positions().copy()
+    positions[sim.rng.permutation(COUNT)[:20]] += 0.3 * sim.rng.normal(size=(20, 3))
+    _, wrong = spoiled(sim, Position(data.q, positions), "sign:{2}", slice(None))
+    found = diagnose_mixups(sim.chain, [wrong])
+    assert found.lines is None
+    assert found.hypotheses[0].key == f"sign:{sim.chain.joint_names[2]}"
