@@ -17,7 +17,9 @@ from ..estimation.problem import CHUNK_SIZE
 from ..estimation.qr import TriangularSystem, rank
 from ..estimation.uncertainty import Uncertainty
 from ..measurements.base import Measurement, residual_of
+from ..measurements.groups import error_group
 from ..measurements.measured_region import MeasuredRegion
+from ..plausibility.deviating_lines import DeviatingLines, extend, find_deviating_lines, find_mistake
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import diagnose_images, diagnose_mixups, has_enough_rows
@@ -39,9 +41,11 @@ from .evaluation import (
     PairedErrors,
     accuracy,
     compute_errors,
+    error_norms,
+    find_inliers,
     take_errors,
 )
-from .fitted import FittedModel
+from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
 from .partition import configuration_groups, is_same_file, k_fold
 
@@ -53,6 +57,9 @@ MAX_LEAVE_ONE_OUT = 10
 N_PREDICTED = 300
 # Of more configurations, each counts as one sample.
 MAX_EXAMINED = 1000
+# Held-out samples beside deviating lines belong to them if their errors exceed the largest one of the fitted
+# samples by this factor.
+MIN_FAR_RATIO = 2.0
 # Reduced chi-square of hold-out samples that the model does not explain, and the largest probability of it.
 MIN_UNEXPLAINED, MAX_UNEXPLAINED_CHANCE = 1.25, 1e-3
 
@@ -129,6 +136,88 @@ class Evidence(FittedModel):
     def hidden_majority(self) -> tuple[int, float] | None:
         """Number of samples that a majority does not agree with, and by what ratio; None without one."""
         return find_hidden_majority(self.inlier_problem, self.solution.x, configuration_groups(self.inliers))
+
+    @cached_property
+    def deviating_lines(self) -> DeviatingLines | None:
+        """Consecutive lines of a file that do not agree with the fit of the others; None without them."""
+        if self.session is None or not self.session.is_ordered:
+            return None
+        found = []
+        for item, is_counted in zip(self.data, self.is_counted, strict=True):
+            # Samples of one configuration are often wrong together.
+            _, first = np.unique(configuration_groups([item]), return_index=True)
+            order = np.sort(first)
+            order = order[np.argsort(item.rows[order], kind="stable")]
+            lines = find_deviating_lines(
+                item.take(order), ~is_counted[order], self.n_outliers / self.n_samples, self.n_samples
+            )
+            found += [(lines, item)] if lines else []
+        if not found:
+            return None
+        lines, item = max(found, key=lambda each: each[0].n_outliers)
+        for held_out, is_far in zip(self.holdout, self._is_holdout_far, strict=True):
+            if is_same_file(item, held_out):
+                lines = extend(lines, item, held_out, is_far)
+        return lines
+
+    @cached_property
+    def _is_holdout_far(self) -> tuple[Array, ...]:
+        """Whether each held-out sample is farther from the model than all that were fitted, by a factor."""
+        errors = compute_errors(self.chain, self.counted, self.instruments)
+        largest = {group: norms.max() for group, norms in error_norms(errors).items()}
+        held_out = compute_errors(self.chain, self.holdout, self.instruments)
+        norms = [np.linalg.norm(next(iter(each.values())), axis=1) for each in held_out]
+        groups = [error_group(next(iter(each))) for each in held_out]
+        return tuple(
+            each > MIN_FAR_RATIO * largest.get(group, np.inf)
+            for each, group in zip(norms, groups, strict=True)
+        )
+
+    @cached_property
+    def is_holdout_judged(self) -> tuple[Array, ...]:
+        """Whether each held-out sample is outside the deviating lines of its file, or agrees with the fit."""
+        everything = tuple(np.ones(len(item.rows), bool) for item in self.holdout)
+        if (lines := self.deviating_lines) is None:
+            return everything
+        fitted = [item for item in self.data if item.source == lines.source]
+        masks = tuple(
+            ~(lines.contains(item) & is_far) if any(is_same_file(item, each) for each in fitted) else mask
+            for item, is_far, mask in zip(self.holdout, self._is_holdout_far, everything, strict=True)
+        )
+        # Figures need samples.
+        return masks if any(mask.any() for mask in masks) else everything
+
+    @cached_property
+    def is_holdout_counted(self) -> tuple[Array, ...]:
+        """Whether figures of the accuracy contain each held-out sample, shape (m,) per measurement.
+
+        They contain all but outliers, which are far from most other samples of their measurement, and samples
+        of consecutive lines that do not agree with the others, see `deviating_lines`.
+        """
+        out = []
+        errors = compute_errors(self.chain, self.holdout, self.instruments)
+        for each, is_judged in zip(errors, self.is_holdout_judged, strict=True):
+            is_counted = is_judged.copy()
+            if is_judged.any():
+                is_counted[is_judged] = find_inliers(take_errors([each], [is_judged]))[0]
+            out.append(is_counted)
+        return tuple(out)
+
+    @cached_property
+    def deviating_mistake(self) -> Diagnosis | None:
+        """Mistake in the deviating lines that the fit of the others confirms; None without one."""
+        if (lines := self.deviating_lines) is None:
+            return None
+        fitted = [item for item in self.data if item.source == lines.source]
+        held_out = [item for item in self.holdout if any(is_same_file(item, each) for each in fitted)]
+        return find_mistake(
+            self.errors.chain,
+            (self.chain, self.instruments),
+            lines,
+            [*fitted, *held_out],
+            self.counted,
+            _usual_errors(self),
+        )
 
     @property
     def shrinkage_notes(self) -> list[str]:
@@ -233,9 +322,10 @@ class Evidence(FittedModel):
         if not self.holdout:
             return self.random_folds.paired if self.random_folds else None
         nominal, instruments = self._nominal
-        before = compute_errors(nominal, self.holdout, instruments)
-        after = compute_errors(self.chain, self.holdout, self.instruments)
-        return PairedErrors.from_errors(before, after, configuration_groups(self.holdout)).without_outliers()
+        judged = take_samples(self.holdout, self.is_holdout_judged)
+        before = compute_errors(nominal, judged, instruments)
+        after = compute_errors(self.chain, judged, self.instruments)
+        return PairedErrors.from_errors(before, after, configuration_groups(judged)).without_outliers()
 
     @cached_property
     def noise_factors(self) -> dict[tuple[str, bool, str], float]:

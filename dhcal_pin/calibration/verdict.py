@@ -121,8 +121,8 @@ MAX_FILE_OUTLIER_SHARE = 0.5
 MIN_FILE_SAMPLES = 12
 # Share of outliers above which the samples are rather those of two set-ups, tools or robots.
 MIN_MIXED_SHARE = 1 / 3
-# Consecutive outliers are named if independent outliers would form such a series with a lower probability.
-MAX_RUN_CHANCE = 1e-3
+# Largest share of the lines of a file that may disagree with the others, which are then the right ones.
+MAX_DEVIATING_SHARE = 0.5
 # With fewer independent rows for each direction that they determine, a fit can adapt to 40 % of outliers.
 MIN_ROWS_PER_DIRECTION = 2.7
 # With fewer, it is examined whether a majority of the samples agrees far better than all of them.
@@ -198,6 +198,7 @@ def judge(fit: Evidence) -> Verdict:
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
         hidden = _hidden_outliers(fit)
         found = [
+            *_deviating_lines(fit),
             *([*errors, *correction] if explains_correction else [*correction, *errors]),
             *_session(fit),
             *_contradictions(fit),
@@ -774,7 +775,8 @@ def _alternate(item: Measurement, other: Measurement) -> bool:
 
 def _regional_errors(fit: Evidence) -> list[Finding]:
     """Advise caution if the samples of one part of joint space agree better by themselves."""
-    if fit.stage != robust.REGIONAL or (fit.extension and fit.extension.families):
+    is_explained = bool(fit.extension and fit.extension.families) or fit.deviating_lines is not None
+    if fit.stage != robust.REGIONAL or is_explained:
         return []
     return [
         Finding(
@@ -857,38 +859,40 @@ def _outliers(fit: Evidence) -> list[Finding]:
     is_explained = fit.hand_eye is not None and bool(fit.hand_eye.causes) and not is_refused
     if is_explained:
         return []
-    run = _consecutive_outliers(fit)
-    if n_outliers < MAX_OUTLIER_SHARE * fit.n_samples:
-        return [Finding("caution", run)] if run else []
+    # Those of deviating lines are named with these.
+    n_explained = 0 if is_refused or fit.deviating_lines is None else fit.deviating_lines.n_outliers
+    if n_outliers - n_explained < MAX_OUTLIER_SHARE * fit.n_samples:
+        return []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
     text = f"{n_outliers} of {fit.n_samples} samples ({share}) are outliers{_outlying_images(fit)}"
     remedy = "Check the measurements."
     if n_outliers > MIN_MIXED_SHARE * fit.n_samples:
         remedy = "They may be of another set-up, tool or robot: calibrate them by themselves, too."
-    return [Finding("refused" if is_refused else "caution", f"{text}. {run or remedy}")]
+    return [Finding("refused" if is_refused else "caution", f"{text}. {remedy}")]
 
 
-def _consecutive_outliers(fit: Evidence) -> str:
-    """Describe the longest run of outliers in the order of measurement; empty if it is due to chance."""
-    if fit.session is None or not fit.session.is_ordered:
-        return ""
-    best, where = 0, ""
-    for item, is_counted in zip(fit.data, fit.is_counted, strict=True):
-        # Samples of one configuration are often wrong together.
-        _, first = np.unique(configuration_groups([item]), return_index=True)
-        is_outlier, lines = ~is_counted[np.sort(first)], item.rows[np.sort(first)]
-        edges = np.flatnonzero(np.diff(is_outlier.astype(int), prepend=0, append=0)).reshape(-1, 2)
-        for begin, end in edges.tolist():
-            if end - begin > best:
-                best = end - begin
-                where = f"{item.source and f'{item.source}: '}lines {lines[begin]} to {lines[end - 1]}"
-    share = fit.n_outliers / fit.n_samples
-    if best < 2 or fit.n_samples * share**best > MAX_RUN_CHANCE:
-        return ""
-    return (
-        f"{best} outliers follow each other ({where}): something happened during these measurements. "
-        "Check what, and measure them again."
+def _deviating_lines(fit: Evidence) -> list[Finding]:
+    """Advise caution if consecutive lines do not agree with the others; refuse a file most of which does not."""
+    lines = fit.deviating_lines
+    if lines is None:
+        return []
+    parts = [item for item in (*fit.data, *fit.holdout) if item.source == lines.source]
+    share = sum(int(np.sum(lines.contains(item))) for item in parts) / sum(len(item.rows) for item in parts)
+    status: Status = "refused" if share > MAX_DEVIATING_SHARE else "caution"
+    left_out = f"{lines.n_outliers} of {fit.n_samples} fitted"
+    if n_held_out := sum(int(np.sum(~mask)) for mask in fit.is_holdout_judged):
+        left_out += f" and {n_held_out} of {sum(len(item.rows) for item in fit.holdout)} hold-out"
+    note = f"The figures leave out {left_out} samples of these lines."
+    if mistake := fit.deviating_mistake:
+        return [Finding(status, f"{mistake.sentence} {mistake.remedy} {note}")]
+    count = f"{lines.n_outliers} outliers follow each other ({lines.name})"
+    if lines.n_outliers < lines.n_fitted:
+        count = f"{lines.n_outliers} of {lines.n_fitted} consecutive samples are outliers ({lines.name})"
+    text = (
+        f"{count}: these lines do not agree with the others. {note} Check what differs in them, such as the "
+        "set-up, the units, or signs and order of the joints, and correct them or measure them again."
     )
+    return [Finding(status, text)]
 
 
 def _outlying_images(fit: Evidence) -> str:

@@ -1,10 +1,10 @@
 """Confirmation of a mistake by all samples of the files that its remedy changes.
 
-A hypothesis is decisive for the samples that were drawn, without those far away. A mistake that begins or ends
-within a file leaves other samples right: as they were read they are nearer to the robot of the hypothesis than
-after the change. If there are such samples, a robot is fitted again to each sample in the nearer of both forms.
-Samples that fit it only as they were read are right. The mistake is then restricted to the lines between which
-no sample is right. It is not stated if right and wrong samples alternate.
+A hypothesis is decisive for the samples that were drawn, without those far away. A mistake that begins or
+ends within a file leaves other samples right: as they were read they are nearer to the robot of the
+hypothesis than after the change. If there are such samples, a robot is fitted again to each sample in the
+nearer of both forms. Samples that fit it only as they were read are right. The mistake is then restricted to
+the lines between which no sample is right. It is not stated if right and wrong samples alternate.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ Reference: D. J. C. MacKay, Bayesian Interpolation, Neural Computation 4, 1992.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 
 import numpy as np
 
@@ -80,8 +80,9 @@ class Evidence:
     #: Values of the instrument parameters by name [m or rad].
     instruments: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
 
-    def misfits(self, item: Measurement) -> Array | None:
-        """Compute the residuals (m,) of samples relative to the noise; None for another instrument."""
+    def residuals(self, item: Measurement) -> list[tuple[str, Array]] | None:
+        """Compute unit and rows (k, m) of each group of residuals, relative to the noise."""
+        # None without a fit, for another instrument and for another unit.
         if self.chain is None:
             return None
         equal = _with_equal_sigmas(item).matched_to(self.instruments).mounted(self.chain)
@@ -91,7 +92,31 @@ class Evidence:
         if not is_known or any(not scales.get(group.unit, 0.0) > 0 for group in groups):
             return None
         r = residual_of(equal, self.chain, self.instruments)
-        return np.max([np.sqrt(np.mean(r[g.rows] ** 2, 0)) / scales[g.unit] for g in groups], 0)
+        return [(g.unit, r[g.rows] / scales[g.unit]) for g in groups]
+
+    def misfits(self, item: Measurement) -> Array | None:
+        """Compute the residuals (m,) of samples relative to the noise; None for another instrument."""
+        residuals = self.residuals(item)
+        return residuals and np.max([np.sqrt(np.mean(rows**2, 0)) for _, rows in residuals], 0)
+
+
+def with_noise_of(
+    chain: Chain, instruments: Mapping[str, float], data: Sequence[Measurement]
+) -> Evidence | None:
+    """Return a fitted robot with the RMS residuals of measurements as noise; None for other instruments."""
+    model = Evidence(0.0, 1.0, LENGTH_SIGMA, ANGLE_SIGMA, chain, instruments=instruments)
+    squares: dict[str, list[Array]] = {"m": [], "rad": []}
+    for item in data:
+        residuals = model.residuals(item)
+        if residuals is None:
+            return None
+        for unit, rows in residuals:
+            squares[unit].append(np.mean(rows**2, 0))
+    scales = [
+        max(float(np.sqrt(np.mean(np.concatenate(each)))), _MIN_SCALE) if each else np.nan
+        for each in squares.values()
+    ]
+    return replace(model, length_scale=scales[0] * LENGTH_SIGMA, angle_scale=scales[1] * ANGLE_SIGMA)
 
 
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from sessions import Simulation
+from sessions import Changes, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, split
@@ -71,7 +71,95 @@ def test_no_change_of_a_whole_file_is_advised_if_a_part_is_right(arm, key, seed)
         rows = np.arange(1, COUNT + 1)[inside]
         allowed = f"@m.csv:{rows[0]}-{rows[-1]}" if isinstance(inside, slice) else None
         for mend in re.findall(r"--mend (\S+)", text):
-            assert allowed and mend.rstrip(".").endswith(allowed), text
+            assert allowed is not None, text
+            assert mend.rstrip(".").endswith(allowed), text
+
+
+@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
+def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed):
+    sim = Simulation(arm, COUNT, seed)
+    for inside in (slice(55, None), slice(0, 40), slice(30, 70)):
+        name, wrong = spoiled(sim, sim.measure(), key, inside)
+        first, last, _ = inside.indices(COUNT)
+        fit = calibrate_parts(sim, wrong)
+        assert fit.verdict.status == "caution"
+        reason, text = fit.verdict.reasons[0], " ".join(fit.verdict.reasons)
+        assert reason.startswith(f"In lines {first + 1} to {last} of m.csv, ")
+        assert (name, (first + 1, last)) in remedies(fit)
+        assert not re.search("Measure more|measure more|all regions", text)
+        # No figure contains these lines, and the reason says so.
+        rows = np.arange(first + 1, last + 1)
+        left_out = [np.isin(item.rows, rows).sum() for item in (*fit.data, *fit.holdout)]
+        counts = f"{left_out[0]} of 70 fitted and {left_out[1]} of 30 hold-out samples"
+        assert f"The figures leave out {counts}" in reason
+        for comparison in (fit.comparisons[0], fit.generalization.cross_validated):
+            assert comparison is not None
+            assert comparison.after["position_rms_m"] < 2e-4
+        assert sim.true_error(fit.chain) < 5e-4
+        # The advice, each of several.
+        for change, lines in remedies(fit):
+            (mended,) = mend_lines(sim.chain, [wrong], change, lines)
+            assert calibrate_parts(sim, mended).verdict.status == "ok"
+
+
+UNKNOWN = {
+    "random signs": lambda rng, q, p: (q * rng.choice([-1, 1], q.shape), p),
+    "another order": lambda rng, q, p: (rng.permutation(q), p),
+    "5 mm": lambda rng, q, p: (q, p + 5e-3 * rng.normal(size=p.shape)),
+}
+
+
+@pytest.mark.parametrize("what", UNKNOWN)
+@pytest.mark.parametrize("seed", some_slow(range(10), [0]))
+def test_lines_with_an_unknown_mistake_are_named_without_a_cause(what, seed):
+    sim = Simulation(ARMS[seed % 4], COUNT, seed)
+    data = sim.measure()
+    q, positions = data.q.copy(), data.positions().copy()
+    q[60:], positions[60:] = UNKNOWN[what](sim.rng, q[60:], positions[60:])
+    fit = calibrate_parts(sim, Position(q, positions).replace(source="m.csv"))
+    reason, text = fit.verdict.reasons[0], " ".join(fit.verdict.reasons)
+    assert fit.verdict.status == "caution"
+    assert "these lines do not agree with the others" in reason
+    first, last = map(int, re.findall(r"lines (\d+) to (\d+) of m.csv", reason)[0])
+    assert 61 <= first <= 63
+    assert 98 <= last <= 100
+    assert "--mend" not in text
+    assert not re.search("Measure more|measure more|all regions", text)
+    assert fit.comparisons[0].after["position_rms_m"] < 1e-3
+
+
+@pytest.mark.parametrize("seed", some_slow(range(20), [0, 1]))
+def test_random_outliers_and_clean_samples_are_no_deviating_lines(seed):
+    sim = Simulation(ARMS[seed % 4], COUNT, seed)
+    data = sim.measure()
+    for share, size in ((0.0, 0.0), (0.01, 0.02), (0.05, 5e-3), (0.2, 0.01), (0.2, 0.5)):
+        positions = data.positions().copy()
+        rows = sim.rng.permutation(COUNT)[: round(share * COUNT)]
+        positions[rows] += size * sim.rng.normal(size=(len(rows), 3))
+        fit = calibrate_parts(sim, Position(data.q, positions).replace(source="m.csv"))
+        assert fit.deviating_lines is None
+        assert all(mask.all() for mask in fit.is_holdout_judged)
+        assert "--mend" not in " ".join(fit.verdict.reasons)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(10), [0]))
+def test_a_moved_base_is_no_mistake_in_lines(seed):
+    sim = Simulation(ARMS[seed % 4], COUNT, seed)
+    for size in (5e-4, 5e-3):
+        data = sim.measure(Position, Changes("base", size)).replace(source="m.csv")
+        fit = calibrate_parts(sim, data)
+        text = " ".join(fit.verdict.reasons)
+        assert "The base" in text
+        assert fit.deviating_lines is None
+        assert "--mend" not in text
+
+
+@pytest.mark.parametrize("seed", some_slow(range(10), [0]))
+def test_joint_errors_are_no_deviating_lines(seed):
+    sim = Simulation(ARMS[seed % 4], COUNT, seed, is_path=bool(seed % 2))
+    sim.add_eccentricities(5e-4)
+    fit = calibrate_parts(sim, sim.measure().replace(source="m.csv"))
+    assert fit.deviating_lines is None
 
 
 @pytest.mark.parametrize("seed", some_slow(range(10), [0]))
