@@ -872,7 +872,7 @@ def _outliers(fit: Evidence) -> list[Finding]:
 
 
 def _deviating_lines(fit: Evidence) -> list[Finding]:
-    """Advise caution if consecutive lines do not agree with the others; refuse a file most of which does not."""
+    """Advise caution if consecutive lines do not agree with the others; refuse if they are the majority."""
     lines = fit.deviating_lines
     if lines is None:
         return []

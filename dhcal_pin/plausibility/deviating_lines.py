@@ -57,7 +57,7 @@ class DeviatingLines:
 def find_deviating_lines(
     item: Measurement, is_outlier: Array, share: float, n_samples: int
 ) -> DeviatingLines | None:
-    """Find consecutive outliers (m,) of one file, with the share of outliers and the number of all samples."""
+    """Find consecutive outliers (m,) of one file; share of outliers and number are those of all samples."""
     score, begin, best, found = 0.0, 0, 0.0, (0, 0)
     for i, outlying in enumerate(is_outlier.tolist()):
         if score <= 0:

@@ -97,7 +97,9 @@ class Evidence:
     def misfits(self, item: Measurement) -> Array | None:
         """Compute the residuals (m,) of samples relative to the noise; None for another instrument."""
         residuals = self.residuals(item)
-        return residuals and np.max([np.sqrt(np.mean(rows**2, 0)) for _, rows in residuals], 0)
+        if residuals is None:
+            return None
+        return np.max([np.sqrt(np.mean(rows**2, 0)) for _, rows in residuals], 0)
 
 
 def with_noise_of(

@@ -26,7 +26,9 @@ CASES = [(arm, key, seed) for seed in range(5) for arm in ARMS for key in MISTAK
 FAST = [0, 6, 11]
 
 
-def spoiled(sim: Simulation, data: Measurement, key: str, inside: slice) -> tuple[str, Measurement]:
+def spoiled(
+    sim: Simulation, data: Measurement, key: str, inside: slice | np.ndarray
+) -> tuple[str, Measurement]:
     """Return the change that undoes a mistake, and samples with this mistake in some rows."""
     q, positions = data.q.copy(), data.positions().copy()
     q[inside], positions[inside] = MISTAKES[key](q[inside], positions[inside])
@@ -89,9 +91,10 @@ def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed
         assert not re.search("Measure more|measure more|all regions", text)
         # No figure contains these lines, and the reason says so.
         rows = np.arange(first + 1, last + 1)
-        left_out = [np.isin(item.rows, rows).sum() for item in (*fit.data, *fit.holdout)]
-        counts = f"{left_out[0]} of 70 fitted and {left_out[1]} of 30 hold-out samples"
-        assert f"The figures leave out {counts}" in reason
+        counts = re.findall(r"leave out (\d+) of 70 fitted and (\d+) of 30 hold-out samples of", reason)[0]
+        for item, count in zip((*fit.data, *fit.holdout), counts, strict=True):
+            # A sign has no effect at zero.
+            assert 0 <= np.isin(item.rows, rows).sum() - int(count) <= 2
         for comparison in (fit.comparisons[0], fit.generalization.cross_validated):
             assert comparison is not None
             assert comparison.after["position_rms_m"] < 2e-4
@@ -104,7 +107,7 @@ def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed
 
 UNKNOWN = {
     "random signs": lambda rng, q, p: (q * rng.choice([-1, 1], q.shape), p),
-    "another order": lambda rng, q, p: (rng.permutation(q), p),
+    "joint values of other rows": lambda rng, q, p: (np.roll(q, 7, 0), p),
     "5 mm": lambda rng, q, p: (q, p + 5e-3 * rng.normal(size=p.shape)),
 }
 
