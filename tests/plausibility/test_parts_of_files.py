@@ -6,10 +6,13 @@ import re
 
 import numpy as np
 import pytest
-from sessions import Changes, Simulation
+from robots import robot_file
+from sessions import ARMS as ARMS_OF_SESSIONS
+from sessions import Changes, Simulation, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, split
+from dhcal_pin.cli.main import main
 from dhcal_pin.measurements import Measurement, Position
 from dhcal_pin.plausibility import diagnose_mixups, mend_lines
 
@@ -75,6 +78,32 @@ def test_no_change_of_a_whole_file_is_advised_if_a_part_is_right(arm, key, seed)
         for mend in re.findall(r"--mend (\S+)", text):
             assert allowed is not None, text
             assert mend.rstrip(".").endswith(allowed), text
+
+
+def test_the_command_names_lines_and_mends_them(tmp_path, capsys):
+    sim = Simulation("ur10", COUNT, 1)
+    name, wrong = spoiled(sim, sim.measure(), "sign:{2}", slice(50, None))
+    path = tmp_path / "m.csv"
+    write_csv(path, sim, wrong)
+    robot, tip = ARMS_OF_SESSIONS["ur10"]
+    command = ["calibrate", str(robot_file(robot)), str(path), "--tip", tip, "--holdout", "0.3"]
+    command += ["-o", str(tmp_path / "out.urdf")]
+    # The header is line 1.
+    mend = f"{name}@{path}:52-101"
+    main(command)
+    out = "".join(capsys.readouterr().out.split())
+    assert "".join(f"In lines 52 to 101 of {path}, the sign of joint".split()) in out
+    assert f"--mend{mend}." in out
+    assert main([*command, "--mend", mend]) == 0
+    assert "ok" in capsys.readouterr().out
+    for target, text in (
+        (f"{path}:200-300", "no samples in lines 200 to 300"),
+        ("x.csv:1-9", "unknown file"),
+    ):
+        assert main([*command, "--mend", f"{name}@{target}"]) != 0
+        assert text in " ".join(capsys.readouterr().err.split())
+    assert main([*command, "--mend", f"rows:above@{path}:52-101"]) != 0
+    assert "expected a whole file, without lines" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
