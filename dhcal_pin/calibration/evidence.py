@@ -21,8 +21,9 @@ from ..measurements.groups import error_group
 from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.deviating_lines import DeviatingLines, extend, find_deviating_lines, find_mistake
 from ..plausibility.diagnosis import Diagnosis
+from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import diagnose_images, diagnose_mixups, has_enough_rows
+from ..plausibility.mixups import diagnose_images, diagnose_mixups
 from ..session import Session
 from ..session.linear_model import measures_positions
 from . import cameras

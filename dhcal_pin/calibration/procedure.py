@@ -54,8 +54,8 @@ from ..measurements.base import Measurement, known_conditions
 from ..measurements.camera import with_shown_entries
 from ..parallel import SERIAL, TaskExecutor, one_blas_thread
 from ..plausibility.displacement import workspace_radius
+from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.mixups import has_enough_rows
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import FAMILIES

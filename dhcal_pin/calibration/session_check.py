@@ -27,8 +27,9 @@ from ..estimation.solver import SolverResult, minimize
 from ..measurements.base import Measurement
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from ..plausibility.displacement import workspace_radius
+from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import Evidence
-from ..plausibility.mixups import diagnose_mixups, fit_drawn_samples
+from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
 from ..session import Session, find_session
 from ..session.causes import Step

@@ -19,9 +19,9 @@ from .._typing import Array
 from ..measurements.base import Measurement, concatenate
 from ..robot.chain import Chain
 from .diagnosis import Diagnosis, leaves_residuals
+from .drawn_samples import fit_drawn_samples
 from .evidence import Evidence
 from .hypotheses import BothChanges, Hypothesis, LagChange, RowShift
-from .mixups import fit_drawn_samples
 
 # Samples fit a robot if their residuals are at most this multiple of the noise, and do not if they exceed the
 # second one. Between both they decide nothing.

@@ -21,9 +21,9 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .confirmation import confirm, needs_neighbours
 from .diagnosis import Diagnosis
+from .drawn_samples import comparable_items
 from .evidence import with_noise_of
 from .hypotheses import list_hypotheses
-from .mixups import comparable_items
 
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.
 _MAX_CHANCE = 1e-3

@@ -39,19 +39,14 @@ from .._typing import Progress, no_progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious, leaves_residuals
-from .evidence import MANUFACTURED, Evidence, fit_evidence
+from .drawn_samples import comparable_items, draw_samples, fit_samples
+from .evidence import MANUFACTURED
 
 if TYPE_CHECKING:
     from .trials import Trial
 
-# Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
-_MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
-# Positions this many times farther from the centre than the median are wrong by themselves.
-_MAX_DISTANCE_RATIO = 8.0
-# Largest number of measurements that are examined, those with the most samples.
-_MAX_ITEMS = 6
-# Smallest numbers of samples and rows that the evidence is computed from, and of samples of each measurement.
-_N_SAMPLES, _N_ROWS, _MIN_SAMPLES_PER_ITEM = 50, 200, 8
+# Smallest number of samples of a part of a file.
+_MIN_SAMPLES_PER_PART = 8
 # Number of parts of a file.
 _N_PARTS = 3
 
@@ -92,7 +87,7 @@ def _diagnose(chain: Chain, items: Sequence[Measurement], sets: str, report: Pro
     found = trial.find_pair()
     if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):
         return found
-    if len(items[0].rows) < _N_PARTS * _MIN_SAMPLES_PER_ITEM:
+    if len(items[0].rows) < _N_PARTS * _MIN_SAMPLES_PER_PART:
         return found
     return trial.find_common(_find_in_parts(chain, items[0], sets, report))
 
@@ -128,49 +123,12 @@ def _parts(item: Measurement) -> list[Measurement]:
     return [item.take(part) for part in np.array_split(order, _N_PARTS)]
 
 
-def comparable_items(data: Sequence[Measurement]) -> list[Measurement]:
-    """Return the measurements, at most `_MAX_ITEMS`, that distinguish hypotheses about joints."""
-    # A robot with other errors can touch an unknown surface exactly, whatever the mistake is. The mistakes
-    # listed here do not concern image coordinates.
-    items = [item for item in data if item.configurations_per_row and not _is_surface_contact(item)]
-    items = [item for item in items if item.rig is None]
-    return sorted(items, key=lambda item: -len(item.rows))[:_MAX_ITEMS]
-
-
-def _is_surface_contact(item: Measurement) -> bool:
-    """Return whether the samples touch a surface, which gives one equation each."""
-    return item.is_contact and item.residual_dim == 1
-
-
-def has_enough_rows(samples: Sequence[Measurement]) -> bool:
-    """Return whether samples have enough rows for the unknowns of frames and instrument."""
-    n_rows = sum(item.residual_dim * len(item.rows) for item in samples)
-    n_instrument = len({parameter.name for item in samples for parameter in item.instrument_parameters})
-    return n_rows >= _MIN_ROWS_PER_UNKNOWN * (_N_FRAME_UNKNOWNS + n_instrument)
-
-
-def fit_drawn_samples(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
-    """Compute the evidence of samples that are drawn from measurements."""
-    return _fit_samples(chain, draw_samples(comparable_items(data))[0], sets)
-
-
-def _fit_samples(chain: Chain, samples: Sequence[Measurement], sets: str) -> Evidence:
-    """Compute the evidence of samples; that of nothing if they are too few."""
-    if not has_enough_rows(samples):
-        return NO_EVIDENCE
-    before = fit_evidence(chain, samples, sets)
-    if is_suspicious(before) and chain.error_families:
-        # The joint errors of the robot may be wrong instead of the measurements.
-        return max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)
-    return before
-
-
 def _find_single(
     chain: Chain, data: Sequence[Measurement], sets: str, progress: Progress
 ) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
-    before = _fit_samples(chain, samples, sets)
+    before = fit_samples(chain, samples, sets)
     if not is_suspicious(before):
         return Diagnosis(before), None
     from .trials import try_hypotheses  # lazy import: few measurements are suspicious
@@ -188,28 +146,3 @@ def _find_one_or_two(chain: Chain, item: Measurement, sets: str, progress: Progr
     """Look for one mistake or two in one measurement."""
     diagnosis, trial = _find_single(chain, [item], sets, progress)
     return trial.find_pair() if trial else diagnosis
-
-
-def draw_samples(data: Sequence[Measurement]) -> tuple[list[Measurement], list[Measurement]]:
-    """Draw samples of each measurement; return them, and the same with the rows above and below each."""
-    samples, neighbourhood = [], []
-    for measured in data:
-        needed = max(_N_SAMPLES, _N_ROWS // measured.residual_dim)
-        count = max(_MIN_SAMPLES_PER_ITEM, -(-needed // len(data)))
-        item = _without_far_positions(measured)
-        item = item.take(np.argsort(item.rows, kind="stable"))
-        m = len(item.rows)
-        index = np.sort(np.random.default_rng(0).permutation(m)[:count])
-        nearby = np.unique(np.clip(np.concatenate([index - 1, index, index + 1]), 0, m - 1))
-        samples.append(item.take(index))
-        neighbourhood.append(item.take(nearby))
-    return samples, neighbourhood
-
-
-def _without_far_positions(item: Measurement) -> Measurement:
-    """Leave out positions far from all others, which would spoil the initial frames."""
-    positions = item.positions()
-    if not len(positions):
-        return item
-    distances = np.linalg.norm(positions - np.median(positions, 0), axis=1)
-    return item.take(distances <= _MAX_DISTANCE_RATIO * np.median(distances))

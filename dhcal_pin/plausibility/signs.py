@@ -27,9 +27,9 @@ from ..measurements.pose import Pose
 from ..robot.chain import Chain
 from ..robot.sampling import random_configurations
 from ..robot.urdf_edit import with_turned_joints
+from .drawn_samples import comparable_items, draw_samples, has_enough_rows
 from .evidence import HAND_BUILT, Evidence, fit_evidence
 from .hypotheses import Hypothesis, JointChange
-from .mixups import comparable_items, draw_samples, has_enough_rows
 
 # Logarithm of the ratio of evidence above which a sign is decided. Where the signs of simulated arms are
 # decided wrongly, with few or similar poses, it is below 3; with 25 different poses it is above 15.
