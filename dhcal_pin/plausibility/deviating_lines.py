@@ -19,11 +19,9 @@ from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .confirmation import confirm, needs_neighbours
 from .diagnosis import Diagnosis
 from .drawn_samples import comparable_items
 from .evidence import with_noise_of
-from .hypotheses import list_hypotheses
 
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.
 _MAX_CHANCE = 1e-3
@@ -102,6 +100,9 @@ def find_mistake(
     sets: str,
 ) -> Diagnosis | None:
     """Find the mistake in deviating lines, from the parts of their file and the good samples of the fit."""
+    from .confirmation import confirm, needs_neighbours  # lazy import, as the following: rarely needed
+    from .hypotheses import list_hypotheses
+
     # `fitted` is the calibrated chain and the instrument parameters by name.
     parts = comparable_items(parts)
     wrong = [item.take(lines.contains(item)) for item in parts]
