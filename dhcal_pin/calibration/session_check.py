@@ -45,6 +45,8 @@ from .verdict import MAX_USUAL_ERROR
 COST_PER_COEFFICIENT = 5.0
 # Largest number of iterations of the fit of changes and joint errors.
 MAX_ITERATIONS = 20
+# Robust weight above which a sample is no outlier of the first fit with changes.
+MIN_KEPT_WEIGHT = 0.5
 # Ratio of the residuals without changes to those with them above which joint errors need not be compared.
 MIN_GROSS_RATIO = 10.0
 
@@ -191,7 +193,7 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
     if max(np.max(a / b) for a, b in zip(*sizes, strict=True)) > MIN_GROSS_RATIO:
         return True
     unchanged, _ = extended(without)
-    residuals = [residuals_of(each) for each in (unchanged, _with_changes(unchanged, fit.data, session))]
+    residuals = [residuals_of(each) for each in (unchanged, _with_changes(unchanged, fit, session))]
     noise = [MAD_TO_STD * size for size in _sizes(residuals[1], 0.5)]
     costs = [
         sum(
@@ -206,16 +208,20 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
     return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
 
 
-def _with_changes(fit: Fit, data: tuple[Measurement, ...], session: Session) -> Fit:
-    """Fit the same model to measurements with changes; samples that are outliers without them may count."""
+def _with_changes(fit: Fit, changed: Fit, session: Session) -> Fit:
+    """Fit the model of a fit to measurements with changes; what is no outlier with them counts."""
     x, timeline = fit.solution.x, session.timeline
     unweighted = [item.with_weights(1 / w) for item, w in zip(fit.problem.data, fit.weights, strict=True)]
     fitted, _ = session.applied(tuple(unweighted), timeline.data[timeline.n_fitted :])
     problem = fit.problem.with_data(fitted)
-    weights = outlier_weights(problem, x, fit.weights)
+    # Samples that were outliers without the changes may be far from x, which was fitted to the others.
+    weights = [
+        np.where(w > MIN_KEPT_WEIGHT, 1.0, at_x)
+        for w, at_x in zip(changed.weights, outlier_weights(problem, x, fit.weights), strict=True)
+    ]
     problem = problem.with_data([item.with_weights(w) for item, w in zip(fitted, weights, strict=True)])
     solution = minimize(problem, "lm", x, MAX_ITERATIONS, loose=True)
-    return replace(fit, data=data, problem=problem, solution=solution, weights=weights)
+    return replace(fit, data=changed.data, problem=problem, solution=solution, weights=tuple(weights))
 
 
 def _sizes(residuals: Sequence[Array], share: float) -> list[Array]:

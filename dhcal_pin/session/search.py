@@ -70,6 +70,9 @@ MIN_LOG_EVIDENCE, MIN_EFFECT = 12.0, 0.5
 MIN_PREDICTED_SHARE = 0.4
 # Number of these blocks, fewest of them on either side of a step, and most of them.
 N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
+# Smallest logarithm of the ratio of the evidences of a change over time and over the configuration, and
+# largest correlation of both orders that are compared.
+MIN_ORDER_EVIDENCE, MAX_ORDER_CORRELATION = 4.0, 0.9
 # Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
 MAX_OUTLIER_SHARE = 0.25
 # Smallest lag, relative to the time between samples.
@@ -303,18 +306,45 @@ class _Search:
     # ------------------------------------------------------------------------------------------- test
     def best_cause(self, fit: LinearFit) -> Cause | None:
         """Return the cause of greatest evidence that is not in a fit."""
+        return max(self._candidates(fit), key=lambda cause: cause.log_evidence, default=None)
+
+    def _candidates(self, fit: LinearFit) -> Iterator[Cause]:
+        """Yield the causes that are not in a fit, the function of time of greatest evidence of each."""
         cells, cross = self._products(fit)
         # Blocks with the same number of columns and the same functions of time are tested at once.
         alike: dict[tuple[int, tuple[Shape, ...]], list[Block]] = {}
         for block in self.layout.blocks:
             for shapes in self._shapes(block):
                 alike.setdefault((len(block.columns), tuple(shapes)), []).append(block)
-        found = [
-            cause
-            for (_, shapes), blocks in alike.items()
-            for cause in self._scores(fit, blocks, shapes, cells, cross)
-        ]
-        return max(found, key=lambda cause: cause.log_evidence, default=None)
+        for (_, shapes), blocks in alike.items():
+            yield from self._scores(fit, blocks, shapes, cells, cross)
+
+    def _follows_configuration(self, rows: Array, i: int) -> bool:
+        """Return whether a function of the configuration explains the samples as well as a cause does."""
+        # Errors of the arm that the model does not contain depend on the configuration. Along a smooth path
+        # they change slowly over time, too.
+        without = copy.copy(self)
+        without.causes = [*self.causes[:i], *self.causes[i + 1 :]]
+        fit = self.solve(self._undone(rows, self.causes[i]), without.causes)
+
+        def evidence(order: Array) -> float:
+            """Return the greatest evidence of a change over the samples in an order."""
+            parts = (each[order] for each in (fit.rows, fit.columns, fit.weights, fit.noise))
+            rows, columns, weights, noise = parts
+            ordered = replace(fit, rows=rows, columns=columns, weights=weights, noise=noise)
+            changes = (c for c in without._candidates(ordered) if not c.block.is_constant)
+            return max((c.log_evidence for c in changes), default=-np.inf)
+
+        q = np.concatenate([item.q for item in self.part.data])[self.order]
+        frames = self.chain.forward_kinematics(q)
+        heights = np.concatenate([frames.bodies[:, 3, 2], frames.tool[3:, 2]])
+        in_time = np.arange(len(q))
+        # Joint positions, and the rise of each link: gravity bends an arm in proportion to its direction.
+        orders = [np.argsort(values, kind="stable") for values in (*q.T, *np.diff(heights, axis=0))]
+        # A joint that moved one way during the session does not tell the order from its position.
+        others = [each for each in orders if abs(np.corrcoef(each, in_time)[0, 1]) < MAX_ORDER_CORRELATION]
+        needed = evidence(in_time) - MIN_ORDER_EVIDENCE
+        return any(evidence(each) > needed for each in others)
 
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
@@ -463,7 +493,7 @@ class _Search:
         return fit
 
     def _change_drifts(self, fit: LinearFit) -> bool:
-        """Give each drift the law and the time constant that fit best; return whether one changed."""
+        """Replace each drift by the drift or step that fits best; return whether one changed."""
         n_rows, scaled = float(np.sum(self.groups >= 0)), np.sqrt(fit.weights)[:, None] / fit.noise
         has_changed = False
         for i, cause in enumerate(self.causes):
@@ -478,6 +508,7 @@ class _Search:
             ]
             if isinstance(old, FreeDrift):
                 tried.append(cause)
+            tried += [replace(simple, shape=step) for step in self._best_steps(cause, rows, others)]
             products = _information(self._columns_without(cause, rows, [*others, *tried]), scaled)
             prior = self._prior([*others, *tried])
             ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
@@ -495,6 +526,15 @@ class _Search:
             self._drop_others()
             has_changed = True
         return has_changed
+
+    def _best_steps(self, drift: Cause, rows: Array, others: Sequence[Cause]) -> list[Step]:
+        """Return the step of greatest evidence in place of a drift; none if no place is left."""
+        places = [shapes for shapes in self._shapes(drift.block) if isinstance(shapes[0], Step)]
+        if not places:
+            return []
+        fit = self.solve(self._undone(rows, drift), others)
+        found = self._scores(fit, [drift.block], places[0], *self._products(fit))
+        return [cause.shape for cause in found if isinstance(cause.shape, Step)]
 
     def _drop_others(self) -> None:
         """Drop the changes of causes that are not among the present ones."""
@@ -551,7 +591,11 @@ class _Search:
             worst = min(judged_ones, key=lambda i: judged[i].log_evidence)
             if judged[worst].log_evidence >= MIN_LOG_EVIDENCE:
                 self.causes = judged
-                break
+                changes = (i for i in judged_ones if not judged[i].block.is_constant)
+                imitated = next((i for i in changes if self._follows_configuration(rows, i)), None)
+                if imitated is None:
+                    break
+                worst = imitated
             self._remove(worst)
 
     def _judge(self, rows: Array, full: LinearFit, i: int) -> Cause:
