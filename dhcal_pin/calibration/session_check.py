@@ -7,8 +7,11 @@ robot fits with them.
 
 Errors that the geometry leaves, such as gear errors, differ between configurations. If the configurations at
 the begin of a session differ from those at its end, such errors look like a change; and they hide small
-changes. Changes are therefore looked for with the families of joint errors that the measurements support
-without changes. They are kept only if the measurements support them beside all families, too.
+changes. The other way round, joint errors imitate a change along a smooth path. Changes are therefore looked
+for with the geometry alone first. They are kept if no joint errors are supported beside them and the noise is
+not larger than with joint errors in place of the changes. Otherwise changes are looked for with the families
+of joint errors that the measurements support without changes, and kept only if the measurements support them
+beside all families, too.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import numpy as np
 from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation.error_model import ErrorModel
+from ..estimation.priors import effective_parameters
 from ..estimation.problem import Problem
 from ..estimation.robust import MAD_TO_STD
 from ..estimation.solver import SolverResult, minimize
@@ -36,7 +40,7 @@ from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
-from .model_selection import ExtendedFit, Extension, outlier_weights, with_joint_errors
+from .model_selection import ExtendedFit, outlier_weights, with_joint_errors
 from .partition import is_same_file
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
@@ -45,6 +49,8 @@ from .verdict import MAX_USUAL_ERROR
 COST_PER_COEFFICIENT = 5.0
 # Largest number of iterations of the fit of changes and joint errors.
 MAX_ITERATIONS = 20
+# Smallest share of the degrees of freedom that the noise is estimated with.
+MIN_FREEDOM = 0.05
 # Robust weight above which a sample is no outlier of the first fit with changes.
 MIN_KEPT_WEIGHT = 0.5
 # Ratio of the residuals without changes to those with them above which joint errors need not be compared.
@@ -97,33 +103,72 @@ def fit_session(
     progress: Progress | None,
 ) -> SessionFit:
     """Find what happened during a session, and fit the measurements of a first fit again with it."""
-    chain, errors = fit.problem.errors.chain, models.errors
-    searched = _with_joint_errors(fit, *models.supported(fit))
-    found = replace(find_session(*searched, holdout, is_ordered), chain=chain)
-    if found.changes.is_empty:
-        return SessionFit(fit, holdout, found)
-    changed, changed_holdout = found.applied(data, holdout)
-    held = errors if found.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
-    refit = models.start(changed, held)
-    if not (found.has_two_robots or _confirm_changes(found, fit, models.reweighted(refit), models.extended)):
-        found, refit, changed_holdout = without_changes(found), fit, holdout
-    if found.changes.is_empty and not found.causes:
-        return SessionFit(fit, holdout, found)
+    found = _find_confirmed(fit, data, holdout, models, is_ordered)
+    session = found.session
+    if session is None or not _has_changes(found):
+        return found
     is_likely, diagnosis = _compare_with_mistakes(
-        found, chain, (data, holdout), (changed, changed_holdout), models.sets, progress
+        session, session.chain, (data, holdout), session.applied(data, holdout), models.sets, progress
     )
     if not is_likely:
-        return SessionFit(fit, holdout, Session(found.timeline, found.chain, found.is_ordered), diagnosis)
-    return SessionFit(refit, changed_holdout, found, diagnosis)
+        nothing = Session(session.timeline, session.chain, session.is_ordered)
+        return SessionFit(fit, holdout, nothing, diagnosis)
+    return replace(found, diagnosis=diagnosis)
 
 
-def _with_joint_errors(fit: Fit, extended: Fit, extension: Extension) -> tuple[Problem, Array]:
-    """Return the problem of a fit without robust weights, with its joint errors if there are enough rows."""
-    # Without them, their residuals hide small changes, and look like changes between configurations.
+def _find_confirmed(
+    fit: Fit,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    models: SessionModels,
+    is_ordered: bool,
+) -> SessionFit:
+    """Find what happened during a session, and keep the changes that are confirmed."""
+    extended, extension = models.supported(fit)
     problem, x = replace(fit.problem, data=fit.data), fit.solution.x
-    with_all, start = with_joint_errors(problem, x, extended, extension.families)
-    is_searched = has_enough_rows(with_all, order_samples(fit.data, ()))
-    return (with_all, start) if is_searched else (problem, x)
+
+    def find(problem: Problem, x: Array) -> SessionFit:
+        """Find what happened, from a solution, and fit again with the changes."""
+        chain = fit.problem.errors.chain
+        session = replace(find_session(problem, x, holdout, is_ordered), chain=chain)
+        if session.changes.is_empty:
+            return SessionFit(fit, holdout, session)
+        changed, changed_holdout = session.applied(data, holdout)
+        errors = models.errors
+        held = errors if session.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
+        return SessionFit(models.start(changed, held), changed_holdout, session)
+
+    found = find(problem, x)
+    if extension.families:
+        # Joint errors can imitate a change. They are dropped if none is supported beside the change.
+        if _has_changes(found):
+            changed, remaining = models.supported(found.fit)
+            if not remaining.families and _log_noise(changed) <= _log_noise(extended):
+                return found
+        with_all, start = with_joint_errors(problem, x, extended, extension.families)
+        # Joint errors that are not in the model hide small changes, and look like changes.
+        if has_enough_rows(with_all, order_samples(fit.data, ())):
+            found = find(with_all, start)
+    session = found.session
+    if session is None or not _has_changes(found) or session.has_two_robots:
+        return found
+    if _confirm_changes(session, fit, models.reweighted(found.fit), models.extended):
+        return found
+    return SessionFit(fit, holdout, without_changes(session))
+
+
+def _has_changes(found: SessionFit) -> bool:
+    """Return whether anything changed during a session."""
+    return found.session is not None and not found.session.changes.is_empty
+
+
+def _log_noise(fit: Fit) -> float:
+    """Return the mean logarithm of the noise of the rows of a fit, corrected for its unknowns."""
+    residuals = residuals_of(fit)
+    n_rows = sum(r.size for r in residuals)
+    freedom = 1 - effective_parameters(fit.problem, fit.solution) / n_rows
+    sizes = np.concatenate([size.ravel() for size in _sizes(residuals, 0.5)])
+    return float(np.mean(np.log(sizes)) - 0.5 * np.log(max(freedom, MIN_FREEDOM)))
 
 
 def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
