@@ -216,9 +216,10 @@ def calibrate(
         with_families = partial(supported, begun.fit, stages, setup.families)
         result = _calibrate_samples(setup, fitted, groups, with_families)
         # The scale of one axis and a zero far off make the robot longer or shorter, too.
-        if found and not found.scales and not result.diagnosis.zero:
-            scale = find_scale(result.problem, result.x)
-            found = replace(found, scales=(scale,) if scale else ())
+        is_examined = setup.finds_session and not (found and found.scales) and not result.diagnosis.zero
+        if is_examined and (scale := find_scale(result.problem, result.x)):
+            found = found or Session(order_samples(setup.data, setup.holdout), setup.chain, session == "auto")
+            found = replace(found, scales=(scale,))
         result = replace(result, session=found)
     return replace(result, **settings)
 

@@ -175,9 +175,9 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         jacobian = chain.tool_jacobian(frames, bodies, twists, body=observation.body)
         growth = chain.growth_motions(frames)
         by_joint = chain.joint_jacobian(frames, observation.body)
-        torque = np.zeros((len(by_joint), len(item.rows)))
+        torque = np.zeros((len(by_joint), by_joint.shape[-1]))
         if layout.has_payload:
-            torque = errors.chain.loads.torques_per_kilogram(item.q.T)
+            torque = errors.chain.loads.torques_per_kilogram(item.configurations().T)
         motions = np.concatenate(
             [
                 jacobian,

@@ -1,8 +1,8 @@
 """Scale of all measured lengths, which the size of the robot imitates.
 
-Positions and poses do not distinguish a scale of the instrument from the size of the robot. A wrong scale
-changes all lengths of the estimated arm by one factor, which manufacturing errors do not. The corrections x
-of the arm are therefore
+Positions, poses and lengths do not distinguish a scale of the instrument from the size of the robot. A wrong
+scale changes all lengths of the estimated arm, and the gains of its prismatic joints, by one factor, which
+manufacturing errors do not. The corrections x of the arm are therefore
 
     x = k·s + M·e + n,
 
@@ -25,15 +25,17 @@ from dataclasses import replace
 import numpy as np
 
 from .._typing import Array
+from ..estimation.error_model import ErrorModel, ErrorParameter
 from ..estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, base, placement, tool
 from ..estimation.problem import Problem
+from ..robot.error_families import FAMILIES, GAIN
 from .facts import MAX_SCALE_CHANGE, Scale
-from .linear_model import Layout, inverse, measures_positions, whitened_rows
+from .linear_model import Layout, inverse, whitened_rows
 
 # Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
 # Smallest number of lengths that the measurements determine, and largest share of the largest factors.
-MIN_LENGTHS, EDGE = 3.0, 1e-2
+MIN_LENGTHS, EDGE = 2.5, 1e-2
 # Smallest norm of the corrections by a scale of 1, in standard deviations.
 MIN_PATTERN = 1e-2
 # Probability that chance makes the correction of an arm look like a change of scale.
@@ -51,10 +53,21 @@ MAX_SAMPLES = 100
 def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
     errors = problem.errors
-    is_arm = errors.is_of_arm & np.array([p.coefficient_index is None for p in errors.parameters], bool)
-    is_length = is_arm & np.array([p.unit == "m" for p in errors.parameters], bool)
+    slide_gains = _slide_gains(errors)
+    is_arm, is_length = (
+        errors.is_of_arm
+        & np.array(
+            [
+                p in slide_gains or (p.coefficient_index is None and p.unit in units)
+                for p in errors.parameters
+            ],
+            bool,
+        )
+        for units in (("m", "rad"), ("m",))
+    )
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
-    if not measures_positions(problem.data) or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
+    shows_size = all(item.has_length_scale and item.rig is None for item in problem.data)
+    if not shows_size or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
         return None
     (arm,) = np.nonzero(is_arm)
     noise, by_scale, by_lengths, by_angles = _responses(problem, x, arm)
@@ -96,6 +109,13 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     return Scale(factor, factor**2 * float(np.sqrt(variance)), "")
 
 
+def _slide_gains(errors: ErrorModel) -> list[ErrorParameter]:
+    """Return the gains of prismatic joints, which are sizes of an arm as its lengths are."""
+    name, chain = FAMILIES[GAIN].name, errors.chain
+    slides = {f"{joint}.{name}" for joint in np.array(chain.moving_joints)[chain.is_prismatic]}
+    return [parameter for parameter in errors.parameters if parameter.name in slides]
+
+
 def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Array, Array]:
     """Return the covariances of estimates `arm` by noise, lengths and angles, and their change by a scale."""
     names = [parameter.name for parameter in problem.errors.parameters]
@@ -105,6 +125,8 @@ def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Ar
         replace(p, prior=LENGTH_PRIOR if p.unit == "m" else ANGLE_PRIOR)
         for p in (*placement(chain), *base(chain), *tool(chain))
     ]
+    slide_gains = _slide_gains(problem.errors)
+    origins += slide_gains
     extended = problem.errors.with_parameters(p for p in origins if p.name not in names)
     all_names = [parameter.name for parameter in extended.parameters]
     n_instrument = len(x) - len(names)
@@ -122,7 +144,7 @@ def _responses(problem: Problem, x: Array, arm: Array) -> tuple[Array, Array, Ar
     covariance = inverse(information)
     gain = (covariance @ model[:, own].T)[arm]
     carried = gain @ model[:, [all_names.index(p.name) for p in origins]] * [p.prior for p in origins]
-    is_length = np.array([p.unit == "m" for p in origins], bool)
+    is_length = np.array([p.unit == "m" or p in slide_gains for p in origins], bool)
     lengths, angles = carried[:, is_length], carried[:, ~is_length]
     # The sum of these two is the covariance. In spite of rounding it has no negative eigenvalue.
     priors = covariance[arm] * weights
