@@ -85,6 +85,12 @@ FEW_CONFIGURATIONS = (
     "the measured configurations do not determine the errors between them",
     "measure more poses, in random configurations",
 )
+SAME_ORIENTATION = (
+    "the tool kept its orientation, so that the measured point on it is hardly determined",
+    "measure poses in which the tool is turned",
+)
+# Largest angle between orientations of the tool that count as one [rad].
+MAX_SAME_ORIENTATION = 0.1
 # Largest number of iterations of such a fit.
 MAX_FRAME_ITERATIONS = 20
 # Largest number of further iterations that are tried where a fit did not converge.
@@ -657,10 +663,19 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
     if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
         return []
     is_measured = all(len(item.positions()) == len(item.rows) for item in fit.data)
-    statement, advice = unknown or (FEW_CONFIGURATIONS if is_measured else PART_OF_POSITION)
+    of_positions = SAME_ORIENTATION if _keeps_orientation(fit) else FEW_CONFIGURATIONS
+    statement, advice = unknown or (of_positions if is_measured else PART_OF_POSITION)
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]
+
+
+def _keeps_orientation(fit: Evidence) -> bool:
+    """Return whether the tool has nearly one orientation in all samples."""
+    rotations = fit.chain.poses(np.concatenate([item.configurations() for item in fit.data]))[:, :3, :3]
+    from_first = rotations @ rotations[0].T
+    cosines = (np.trace(from_first, axis1=1, axis2=2) - 1) / 2
+    return bool(cosines.min() > np.cos(MAX_SAME_ORIENTATION))
 
 
 def _shown_position_error(fit: Evidence) -> float:

@@ -52,9 +52,11 @@ OFFSET_PRIOR = np.deg2rad(2.0)
 LOW_COST = "low-cost"
 LOW_COST_LENGTH_PRIOR, LOW_COST_ANGLE_PRIOR = 3e-3, np.deg2rad(2.0)
 LOW_COST_OFFSET_PRIOR, LOW_COST_SLIDE_PRIOR = np.deg2rad(15.0), 1e-2
-# Prior standard deviations of base and tool [m, rad]: anywhere in a room.
+# Prior standard deviations of base and tool [m, rad]: the base is anywhere in a room, the measured point near
+# the tip. If the tool keeps its orientation, the measurements hardly show where the point is.
 FRAME_LENGTH_PRIOR = 10.0
 FRAME_ANGLE_PRIOR = 10.0
+TOOL_LENGTH_PRIOR = 0.5
 
 # Largest number of harmonics of a joint that messages list one by one.
 MAX_LISTED_HARMONICS = 4
@@ -239,7 +241,7 @@ def base(chain: Chain) -> list[ErrorParameter]:
 
 def tool(chain: Chain) -> list[ErrorParameter]:
     """Build the pose of the measured point in the tip frame."""
-    return _frame_parameters("tool", chain.tool_frame_index, FRAME_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
+    return _frame_parameters("tool", chain.tool_frame_index, TOOL_LENGTH_PRIOR, FRAME_ANGLE_PRIOR)
 
 
 def joint_errors(chain: Chain, family: ErrorFamily) -> list[ErrorParameter]:
