@@ -112,7 +112,8 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
 def _slide_gains(errors: ErrorModel) -> list[ErrorParameter]:
     """Return the gains of prismatic joints, which are sizes of an arm as its lengths are."""
     name, chain = FAMILIES[GAIN].name, errors.chain
-    slides = {f"{joint}.{name}" for joint in np.array(chain.moving_joints)[chain.is_prismatic]}
+    joints = zip(chain.moving_joints, chain.prismatic, strict=True)
+    slides = {f"{joint}.{name}" for joint, is_prismatic in joints if is_prismatic}
     return [parameter for parameter in errors.parameters if parameter.name in slides]
 
 

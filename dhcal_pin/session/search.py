@@ -99,8 +99,6 @@ PASS_TOL = 0.01
 MIN_UNEXPLAINED = 1e-8
 # Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do.
 MIN_ROBOT_GAIN = 0.3
-# Smaller prior standard deviations are those of the arm, not of base and tool.
-MAX_ARM_PRIOR = 1.0
 # Fewer rows for each unknown show nothing but the unknowns.
 MIN_ROWS_PER_UNKNOWN = 1.5
 # The same for rows of different configurations with which scales and a lag are looked for.
@@ -734,7 +732,7 @@ class _Search:
             return None
         difference, std = best[2].step[-len(sizes) :], np.sqrt(np.diag(best[2].covariance)[-len(sizes) :])
         # The most significant difference of the arm itself.
-        is_arm = [names[c].prior < MAX_ARM_PRIOR for c in geometric]
+        is_arm = self.layout.problem.errors.is_of_arm[geometric]
         worst = max(range(len(is_arm)), key=lambda i: (is_arm[i], abs(difference[i]) / std[i]))
         before, after = (self.timeline.place(best[1] + i) for i in (-1, 0))
         name, unit = names[geometric[worst]].name, names[geometric[worst]].unit

@@ -26,7 +26,7 @@ def simulated(seed: int, count: int = 120) -> tuple[Chain, Result]:
     rng, chain = np.random.default_rng(seed), Chain.from_dh(paper("sim_6dof"))
     errors = select_parameters(chain, SETS)
     truth = errors.at(
-        np.where(errors.priors < 1, errors.priors, 0.0) * rng.standard_normal(len(errors.priors))
+        np.where(errors.is_of_arm, errors.priors, 0.0) * rng.standard_normal(len(errors.priors))
     )
     q = rng.uniform(-np.pi, np.pi / 2, (count, 6))
     data = Pose.simulate(truth, q, NOISE, rng)

@@ -24,7 +24,7 @@ NOISE = Noise(1e-4, np.deg2rad(0.01))
 def test_predicted_uncertainty_equals_the_errors_of_calibrated_robots(sim_6dof):
     """Poses in one corner of joint space give small errors there and larger ones elsewhere."""
     errors = select_parameters(sim_6dof, "minimal,base,tool")
-    prior = np.where(errors.priors < 1, errors.priors, 1e-3)
+    prior = np.where(errors.is_of_arm, errors.priors, 1e-3)
     rng = np.random.default_rng(0)
     q = ConfigurationSampler.from_chain(sim_6dof, WorkspaceConstraints(), 0.0, 0.0).draw(1500, rng)
     squares, expected = [], []

@@ -56,7 +56,7 @@ def test_a_loose_solution_is_not_a_step_that_damping_shortened(seed):
     nominal = measured_arm("paper")
     errors = select_parameters(nominal, "minimal,base,tool")
     rng = np.random.default_rng(seed)
-    size = np.where(errors.priors < 1, errors.priors, 0.3)
+    size = np.where(errors.is_of_arm, errors.priors, 0.3)
     truth = errors.at(size * rng.uniform(-1, 1, len(size)))
     data = SphereContact.simulate(truth, joint_sample(nominal, 40, rng), Noise(1e-4), rng)
     problem = make_problem(errors, (data.initialized(nominal),), 1 / errors.priors, {})

@@ -188,7 +188,7 @@ def check_predicted_std(seeds: int, tolerance: float) -> None:
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         # Base and tool are not known before: their values do not matter.
-        truth = np.where(errors.priors < 1, errors.priors, 0.0) * rng.standard_normal(len(names))
+        truth = np.where(errors.is_of_arm, errors.priors, 0.0) * rng.standard_normal(len(names))
         data = Pose.simulate(errors.at(truth), found.q, NOISE, rng)
         fit = calibrate(chain, data, sets, extend="none")
         estimated = {parameter.name: value for parameter, value in zip(fit.parameters, fit.x, strict=False)}

@@ -19,7 +19,7 @@ def test_a_calibration_replaces_the_priors(kind, count):
     """Few positions leave some parameters nearly unknown; their priors must not count a second time."""
     nominal, rng = measured_arm("ur5"), np.random.default_rng(0)
     errors = select_parameters(nominal, SETS)
-    truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
+    truth = errors.at(np.where(errors.is_of_arm, errors.priors, 0.3) * rng.standard_normal(36))
     data = kind.simulate(truth, joint_sample(nominal, count, rng), NOISE, rng)
     fit = calibrate(nominal, data, SETS, extend="none")
     assert fit.shrinkage_factor == 1

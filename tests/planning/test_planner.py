@@ -153,7 +153,7 @@ def simulated(chain: Chain, kind: str, choices, seed: int) -> list[float]:
     errors = select_parameters(chain, SETS)
     # The base pose is arbitrary; the tool is known to some millimetres.
     frames = [0.3 if parameter.error_frame == 0 else 2e-3 for parameter in errors.parameters]
-    prior = np.where(errors.priors < 1, errors.priors, frames)
+    prior = np.where(errors.is_of_arm, errors.priors, frames)
     truth = errors.at(prior * rng.standard_normal(len(prior)))
     held = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0).draw(100, rng)
     out = []
@@ -327,7 +327,7 @@ def test_existing_measurements_are_complemented():
     chain = arm("ur10")
     rng = np.random.default_rng(2)
     errors = select_parameters(chain, SETS)
-    truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
+    truth = errors.at(np.where(errors.is_of_arm, errors.priors, 0.3) * rng.standard_normal(36))
     # The existing poses are in one corner of the joint space.
     taken = rng.uniform(0.2, 0.8, (25, 6))
     old = KINDS["pose"].simulate(truth, taken, NOISE, rng)
@@ -348,7 +348,7 @@ def test_uncertainty_of_a_calibrated_robot_replaces_its_measurements(tmp_path):
     chain = arm("ur10")
     rng = np.random.default_rng(2)
     errors = select_parameters(chain, SETS)
-    truth = errors.at(np.where(errors.priors < 1, errors.priors, 0.3) * rng.standard_normal(36))
+    truth = errors.at(np.where(errors.is_of_arm, errors.priors, 0.3) * rng.standard_normal(36))
     old = KINDS["pose"].simulate(truth, rng.uniform(0.2, 0.8, (25, 6)), NOISE, rng)
     write_urdf(calibrate(chain, old, SETS), tmp_path / "arm.urdf")
     sidecar, calibrated = tmp_path / "arm.calibration.toml", read_robot(tmp_path / "arm.urdf", "tool0")
