@@ -14,7 +14,8 @@ The search alternates between two steps until nothing more is found:
    of which the greatest over a grid of s counts. Steps between all samples are tested at once with cumulative
    sums of the inner products.
 
-A cause is kept only if it also predicts blocks of consecutive samples that are left out.
+A cause is kept only if it also predicts blocks of consecutive samples that are left out, and if no function
+of the configuration explains the samples as well as a function of time does.
 
 Reference: P. J. Huber, Robust Estimation of a Location Parameter, Annals of Mathematical Statistics 35, 1964.
 
@@ -334,11 +335,12 @@ class _Search:
             return max((c.log_evidence for c in changes), default=-np.inf)
 
         q = np.concatenate([item.q for item in self.part.data])[self.order]
-        frames = self.chain.forward_kinematics(q)
-        heights = np.concatenate([frames.bodies[:, 3, 2], frames.tool[3:, 2]])
+        frames = [self.chain.forward_kinematics(item.conditions()) for item in self.part.data]
+        heights = [np.concatenate([each.bodies[:, 3, 2], each.tool[3:, 2]]) for each in frames]
+        # Gravity bends an arm in proportion to the direction of its links.
+        rises = np.diff(np.concatenate(heights, 1)[:, self.order], axis=0)
         in_time = np.arange(len(q))
-        # Joint positions, and the rise of each link: gravity bends an arm in proportion to its direction.
-        orders = [np.argsort(values, kind="stable") for values in (*q.T, *np.diff(heights, axis=0))]
+        orders = [np.argsort(values, kind="stable") for values in (*q.T, *rises)]
         # A joint that moved one way during the session does not tell the order from its position.
         others = [each for each in orders if abs(np.corrcoef(each, in_time)[0, 1]) < MAX_ORDER_CORRELATION]
         needed = evidence(in_time) - MIN_ORDER_EVIDENCE
