@@ -245,7 +245,7 @@ def test_messages_of_the_troubleshooting_page_exist():
 def test_priors_are_those_of_their_page():
     page = (DOCS / "explanation" / "priors.md").read_text(encoding="utf-8")
     stated = {name: float(value) for name, value in re.findall(r"^\| (.*?) \| (\d[\d.e-]*)", page, re.M)}
-    sets = "placement,offset,gain,harmonics,compliance,base"
+    sets = "placement,offset,gain,harmonics,compliance,base,tool"
     errors = dhcal_pin.select_parameters(nominal_arm("ur10"), sets).parameters
     camera = Camera("c", "tip", 640, 480, np.pad([500.0, 500.0, 319.5, 239.5], (0, 5)))
     found = {p.name: p.prior for p in (*errors, *camera_parameters(camera))}
@@ -253,7 +253,8 @@ def test_priors_are_those_of_their_page():
         ("lengths", "elbow_joint.x", 1e-3),
         ("angles", "elbow_joint.rx", 1e-3),
         ("joint offsets, θ", "elbow_joint.offset", np.deg2rad(1)),
-        ("base, tool", "base.x", 1),
+        ("base", "base.x", 1),
+        ("tool", "tool.x", 1),
         ("gain, coupling", "elbow_joint.gain", 1),
         ("harmonics of order 1 and 2", "elbow_joint.sin1", 1e-3),
         ("compliance", "elbow_joint.compliance", 1),
