@@ -48,7 +48,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, is_same_file, k_fold
+from .partition import configuration_groups, is_same_file, k_fold, of_same_files
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
@@ -182,7 +182,7 @@ class Evidence(FittedModel):
             return everything
         fitted = [item for item in self.data if item.source == lines.source]
         masks = tuple(
-            ~(lines.contains(item) & is_far) if any(is_same_file(item, each) for each in fitted) else mask
+            ~(lines.contains(item) & is_far) if of_same_files([item], fitted) else mask
             for item, is_far, mask in zip(self.holdout, self._is_holdout_far, everything, strict=True)
         )
         # Figures need samples.
@@ -210,7 +210,7 @@ class Evidence(FittedModel):
         if (lines := self.deviating_lines) is None:
             return None
         fitted = [item for item in self.data if item.source == lines.source]
-        held_out = [item for item in self.holdout if any(is_same_file(item, each) for each in fitted)]
+        held_out = of_same_files(self.holdout, fitted)
         return find_mistake(
             self.errors.chain,
             (self.chain, self.instruments),
@@ -388,7 +388,7 @@ class Evidence(FittedModel):
         if not self.is_holdout_unexplained:
             return None
         # A remedy changes the fitted samples of the same file, too.
-        others = [item for item in self.data if any(is_same_file(item, each) for each in self.holdout)]
+        others = of_same_files(self.data, self.holdout)
         found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self), holdout=others)
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
@@ -445,7 +445,7 @@ def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
     """Look for mistakes in the measurements of a calibration, if this was not done before."""
     if fit.earlier_diagnosis:
         return fit.earlier_diagnosis
-    held_out = [item for item in fit.holdout if any(is_same_file(item, each) for each in fit.data)]
+    held_out = of_same_files(fit.holdout, fit.data)
     return diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
 
 

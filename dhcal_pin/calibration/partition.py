@@ -59,6 +59,11 @@ def is_same_file(item: Measurement, other: Measurement) -> bool:
     return item.source == other.source and not np.intersect1d(item.rows, other.rows).size
 
 
+def of_same_files(items: Sequence[Measurement], others: Sequence[Measurement]) -> list[Measurement]:
+    """Return the measurements that are parts of the same files as others."""
+    return [item for item in items if any(is_same_file(item, other) for other in others)]
+
+
 def configuration_groups(data: Sequence[Measurement]) -> Array:
     """Label the samples of measurements, those of the same configuration by the same label."""
     # Many parts of a calibration need the labels of one measurement.

@@ -41,7 +41,7 @@ from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
 from .model_selection import ExtendedFit, outlier_weights, with_joint_errors
-from .partition import is_same_file
+from .partition import of_same_files
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
 
@@ -214,8 +214,7 @@ def _diagnose(
 ) -> Diagnosis:
     """Look for a mistake in fitted measurements; held-out ones of the same files confirm it."""
     data, holdout = measured
-    held_out = [item for item in holdout if any(is_same_file(item, each) for each in data)]
-    return diagnose_mixups(chain, data, sets, progress, held_out)
+    return diagnose_mixups(chain, data, sets, progress, of_same_files(holdout, data))
 
 
 def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:

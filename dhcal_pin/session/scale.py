@@ -54,17 +54,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     """Look for one factor of all lengths that explains most of the correction x (p,) of an arm."""
     errors = problem.errors
     slide_gains = _slide_gains(errors)
-    is_arm, is_length = (
-        errors.is_of_arm
-        & np.array(
-            [
-                p in slide_gains or (p.coefficient_index is None and p.unit in units)
-                for p in errors.parameters
-            ],
-            bool,
-        )
-        for units in (("m", "rad"), ("m",))
-    )
+    is_size = np.array([p.coefficient_index is None or p in slide_gains for p in errors.parameters], bool)
+    is_arm = errors.is_of_arm & is_size
+    is_length = is_arm & np.array([p.unit != "rad" for p in errors.parameters], bool)
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
     shows_size = all(item.has_length_scale and item.rig is None for item in problem.data)
     if not shows_size or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
