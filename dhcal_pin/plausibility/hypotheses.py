@@ -42,9 +42,11 @@ from ..units import ANGLES, LENGTHS
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
-JOINT_CHANGES = ("sign", "zero", "swap", "columns", "joint", "joints")
+JOINT_CHANGES = ("sign", "zero", "ratio", "swap", "columns", "joint", "joints")
 # Sign between the keys of two mistakes.
 _AND = "+"
+# Name of all joints in a key.
+ALL = "all"
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Motion of the tool per unit of a joint that counts as none [m].
@@ -476,16 +478,16 @@ def mend(chain: Chain, data: Measurement, key: str) -> Measurement:
 
 def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Measurement]:
     """Undo a mistake in all measurements to which it applies."""
-    change = _change_of_size(key) or _change_of_zero(chain, key)
+    change = _change_of_size(key) or _change_of_joint(chain, key)
     if change is None:
         by_key = {hypothesis.key: hypothesis for hypothesis in list_hypotheses(chain, data)}
         if key not in by_key:
             for at in re.finditer(re.escape(_AND), key):
                 first, rest = key[: at.start()], key[at.end() :]
-                if first in by_key or _change_of_zero(chain, first):
+                if first in by_key or _change_of_joint(chain, first):
                     return mend_files(chain, mend_files(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
-            kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), "lag", "scale"])
+            kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), "ratio", "lag", "scale"])
             raise UnknownNameError(
                 f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}; kinds of changes are "
                 f"{', '.join(kinds)}"
@@ -538,16 +540,21 @@ def _change_of_size(key: str) -> Change | None:
     raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
 
 
-def _change_of_zero(chain: Chain, key: str) -> Change | None:
-    """Return the change `zero:JOINT:ANGLEdeg` of a revolute joint; None for other keys."""
-    found = re.fullmatch(r"zero:(.+):([-+]?[0-9.]+)deg", key)
-    revolute = [
-        name for name, slides in zip(chain.joint_names, chain.is_prismatic, strict=True) if not slides
-    ]
-    if found is None or found[1] not in revolute:
+def _change_of_joint(chain: Chain, key: str) -> Change | None:
+    """Return the change `zero:JOINT:ANGLEdeg` or `ratio:JOINT:FACTOR`; None for other keys."""
+    found = re.fullmatch(r"(?:(zero)|ratio):(.+):([-+]?[0-9.]+)(?(1)deg)", key)
+    joints = {chain.joint_names[j]: [j] for j in range(chain.n_joints)}
+    if found and not found[1]:
+        joints[ALL] = revolute_joints(chain)
+    if found is None or found[2] not in joints:
         return None
+    members = joints[found[2]]
     with suppress(ValueError):
-        return zero_hypothesis(chain, chain.joint_names.index(found[1]), -float(found[2])).change
+        size = float(found[3])
+        if not found[1]:
+            return ratio_hypothesis(chain, members, size).change if size > 0 else None
+        if members[0] in revolute_joints(chain):
+            return zero_hypothesis(chain, members[0], -size).change
     return None
 
 
@@ -559,9 +566,23 @@ def zero_hypothesis(chain: Chain, joint: int, wrong: float) -> Hypothesis:
     return Hypothesis(f"zero:{name}:{-wrong:+g}deg", text, JointChange.of(n, offsets=offsets))
 
 
+def ratio_hypothesis(chain: Chain, joints: Sequence[int], factor: float) -> Hypothesis:
+    """Return the hypothesis that the values of a joint, or of all revolute ones, need a factor."""
+    name = chain.joint_names[joints[0]] if len(joints) == 1 else ALL
+    of_joints = f"joint {name}" if len(joints) == 1 else "all revolute joints"
+    text = f"the values of {of_joints} are {_times(factor)}, as with a wrong gear ratio"
+    factors = [factor if j in joints else 1.0 for j in range(chain.n_joints)]
+    return Hypothesis(f"ratio:{name}:{factor:.4g}", text, JointChange.of(chain.n_joints, factors=factors))
+
+
+def revolute_joints(chain: Chain) -> list[int]:
+    """Return the numbers of the revolute joints."""
+    return [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
+
+
 def inner_revolute_joints(chain: Chain) -> list[int]:
     """Return the numbers of the joints whose zeros base and tool cannot absorb."""
-    return [j for j in range(1, chain.n_joints - 1) if not chain.is_prismatic[j]]
+    return [j for j in revolute_joints(chain) if 0 < j < chain.n_joints - 1]
 
 
 def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
@@ -571,7 +592,7 @@ def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         signs = [-1 if i == j else 1 for i in range(n)]
         text = f"the sign of joint {name} is wrong"
         yield Hypothesis(f"sign:{name}", text, JointChange.of(n, signs=signs))
-    yield Hypothesis("sign:all", "the signs of all joints are wrong", JointChange.of(n, signs=[-1] * n))
+    yield Hypothesis(f"sign:{ALL}", "the signs of all joints are wrong", JointChange.of(n, signs=[-1] * n))
     for j, wrong in product(inner_revolute_joints(chain), (90, -90, 180)):
         yield zero_hypothesis(chain, j, wrong)
 
@@ -597,7 +618,7 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
 
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
     """Yield wrong units of joints, lengths, and rotation vectors or Euler angles."""
-    n, revolute = chain.n_joints, [j for j in range(chain.n_joints) if not chain.is_prismatic[j]]
+    n, revolute = chain.n_joints, revolute_joints(chain)
     for members, kind, large, small, factor in (
         (revolute, "revolute", "deg", "rad", ANGLES["deg"]),
         ([j for j in range(n) if j not in revolute], "prismatic", "mm", "m", LENGTHS["mm"]),
@@ -622,8 +643,12 @@ def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypo
 
 def _misread(true: str, read: str, factor: float) -> str:
     """Describe values that a factor corrects; their unit in the file may be another one than `read`."""
-    times, word = (factor, "small") if factor > 1 else (1 / factor, "large")
-    return f"{times:.4g} times too {word}, as if {true} had been read as {read}"
+    return f"{_times(factor)}, as if {true} had been read as {read}"
+
+
+def _times(factor: float) -> str:
+    """Describe the size of values that a factor corrects."""
+    return f"{factor:.4g} times too small" if factor > 1 else f"{1 / factor:.4g} times too large"
 
 
 def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from heapq import nsmallest
 from itertools import islice, permutations, product, starmap
 from typing import NamedTuple
@@ -27,6 +28,8 @@ from .hypotheses import (
     both,
     inner_revolute_joints,
     list_hypotheses,
+    ratio_hypothesis,
+    revolute_joints,
     zero_hypothesis,
 )
 from .misfit import MAX_MISFIT, nominal_misfits
@@ -53,8 +56,14 @@ _MIN_SHIFTED_SHARE = 0.25
 # Smallest angle by which the zero of a joint is called wrong [deg]. Smaller ones are errors of the robot,
 # which the calibration corrects; from the second angle on they are named if its correction is implausible.
 _MIN_ZERO, _MIN_LIKELY_ZERO = 9.0, 3.0
-# Steps in which the angle is searched, then reach and step around the angle of greatest evidence [deg].
-_ZERO_STEPS, _FINE_ZERO_STEPS = (20.0, 4.0, 1.0, 0.2), ((6.0, 2.0), (1.5, 0.5))
+# Largest angle, steps in which it is searched, then reach and step around that of greatest evidence [deg].
+_MAX_ZERO, _ZERO_STEPS, _FINE_ZERO_STEPS = 180.0, (20.0, 4.0, 1.0, 0.2), ((6.0, 2.0), (1.5, 0.5))
+# The same of the ratio of true to read joint values, as 100 times its logarithm. Smaller ones are errors of
+# the robot, which the calibration corrects.
+_MAX_RATIO, _RATIO_STEPS, _FINE_RATIO_STEPS = 110.0, (5.0, 1.0, 0.2), ((1.5, 0.5), (0.3, 0.1))
+_MIN_RATIO = 4.0
+# A ratio is refined if it brings the nominal robot nearer by this factor.
+_MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
 _MIN_TURN_DIFFERENCE = 5.0
 # Phases of the progress.
@@ -138,20 +147,21 @@ def try_hypotheses(
     trial = Trial(chain, samples, sets, before, misfit, candidates, Diagnosis(before), progress)
     scores = _scores(trial, _near(trial, candidates), SINGLES)
     found = _decide(trial, scores)
-    # The zeros of a hand-built arm are unknown in any case.
-    if not found.is_certain and sets == MANUFACTURED:
+    if not found.is_certain:
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
-        joints = [j for j in inner_revolute_joints(chain) if misfit or j in changed]
-        zeros = _refine_zeros(trial, _near(trial, _measure_zeros(trial, joints)))
-        large = [zero for zero in zeros if abs(_angle(zero)) >= _MIN_ZERO]
+        # The zeros of a hand-built arm are unknown in any case.
+        inner = inner_revolute_joints(chain) if sets == MANUFACTURED else []
+        zeros = _measure_zeros(trial, [j for j in inner if misfit or j in changed])
+        large = [zero.candidate for zero in zeros if abs(zero.size) >= _MIN_ZERO]
+        large += [ratio.candidate for ratio in _measure_ratios(trial)]
         scores += _scores(trial, _near(trial, large), SINGLES)
         measured = _decide(trial, scores)
         is_refuted = changed and set(measured.hypotheses).isdisjoint(found.hypotheses)
         if measured.is_certain or is_refuted:
-            # An angle that fits far better refutes other zeros, even if it is not certain itself.
+            # A size that fits far better refutes other zeros, even if it is not certain itself.
             found = measured if measured.is_certain else Diagnosis(before)
         if not found.is_certain:
-            small = [zero for zero in zeros if abs(_angle(zero)) < _MIN_ZERO]
+            small = [zero.candidate for zero in zeros if abs(zero.size) < _MIN_ZERO]
             likely = _decide(trial, [*scores, *_scores(trial, _near(trial, small), SINGLES)])
             if likely.is_certain:
                 return Diagnosis(before, zero=likely), None
@@ -164,44 +174,79 @@ def _near(trial: Trial, candidates: Sequence[_Candidate]) -> list[_Candidate]:
     return [each for each in candidates if each.misfit <= largest]
 
 
-def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Candidate]:
-    """Return, for the zero of each joint, the angle with which the robot fits the samples best."""
-    out = []
+class _Measured(NamedTuple):
+    """Mistake whose size is measured: an angle [deg], or 100 times the logarithm of a ratio."""
+
+    of_size: Callable[[float], Hypothesis]
+    size: float
+    candidate: _Candidate
+
+
+def _measured(trial: Trial, of_size: Callable[[float], Hypothesis], size: float) -> Iterator[_Measured]:
+    """Yield a mistake with its size if it applies to the samples."""
+    hypothesis = of_size(size)
+    for candidate in _candidates(trial.chain, [(hypothesis, hypothesis.apply(trial.samples))]):
+        yield _Measured(of_size, size, candidate)
+
+
+def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
+    """Return the zeros of joints that are wrong, by the angles of greatest evidence."""
+    zeros = []
     for joint in joints:
-        best, reach = 0.0, 180.0
-        for step in _ZERO_STEPS:
-            angles = np.arange(best - reach, best + reach, step).round(1).tolist()
-            zeros = [zero_hypothesis(trial.chain, joint, angle) for angle in angles]
-            costs = _costs(trial, [zero.apply(trial.samples) or trial.samples for zero in zeros])
-            best, reach = angles[int(np.argmin(costs))], step
-        zero = zero_hypothesis(trial.chain, joint, best)
+        of_angle = partial(zero_hypothesis, trial.chain, joint)
+        best = _closest(trial, of_angle, _MAX_ZERO, _ZERO_STEPS)
         is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
         if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:
-            out += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
-    return out
+            zeros += _measured(trial, of_angle, best)
+    return _refine(trial, zeros, _FINE_ZERO_STEPS, _MIN_LIKELY_ZERO)
 
 
-def _refine_zeros(trial: Trial, zeros: Sequence[_Candidate]) -> list[_Candidate]:
-    """Return the zeros that are wrong, by the angles of greatest evidence."""
-    # The misfit of the nominal robot is smallest at another angle if the robot has errors.
-    refined = []
-    for each in zeros:
-        (joint,), best = each.hypothesis.offsets, _angle(each)
-        for reach, step in _FINE_ZERO_STEPS:
-            angles = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
-            changed = [zero_hypothesis(trial.chain, joint, angle).apply(trial.samples) for angle in angles]
-            evidence = [fit_evidence(trial.chain, item or trial.samples, trial.sets).log for item in changed]
-            best = angles[int(np.argmax(evidence))]
-        if abs(best) >= _MIN_LIKELY_ZERO:
-            zero = zero_hypothesis(trial.chain, joint, best)
-            refined += _candidates(trial.chain, [(zero, zero.apply(trial.samples))])
+def _measure_ratios(trial: Trial) -> list[_Measured]:
+    """Return the joint values that need a factor, of one joint or of all revolute ones, by positions."""
+    ratios, single = [], [[joint] for joint in range(trial.chain.n_joints)]
+    for joints in [*single, revolute_joints(trial.chain)] if trial.misfit else []:
+        of_logarithm = partial(_ratio_of_logarithm, trial.chain, joints)
+        best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
+        if abs(best) >= _MIN_RATIO:
+            ratios += _measured(trial, of_logarithm, best)
+    near = [each for each in ratios if _MIN_RATIO_GAIN * each.candidate.misfit <= trial.misfit]
+    return _refine(trial, near, _FINE_RATIO_STEPS, _MIN_RATIO)
+
+
+def _ratio_of_logarithm(chain: Chain, joints: Sequence[int], size: float) -> Hypothesis:
+    """Return the hypothesis of a ratio by 100 times its logarithm."""
+    return ratio_hypothesis(chain, joints, float(f"{np.exp(size / 100):.4g}"))
+
+
+def _closest(
+    trial: Trial, of_size: Callable[[float], Hypothesis], reach: float, steps: Sequence[float]
+) -> float:
+    """Return the size of a mistake, up to a reach, with which the nominal robot is nearest to the samples."""
+    best = 0.0
+    for step in steps:
+        sizes = np.arange(best - reach, best + reach, step).round(1).tolist()
+        costs = _costs(trial, [of_size(size).apply(trial.samples) or trial.samples for size in sizes])
+        best, reach = sizes[int(np.argmin(costs))], step
+    return best
+
+
+def _refine(
+    trial: Trial, found: Sequence[_Measured], steps: Sequence[tuple[float, float]], smallest: float
+) -> list[_Measured]:
+    """Return the mistakes that are near, with the sizes of greatest evidence."""
+    # The misfit of the nominal robot is smallest at another size if the robot has errors.
+    largest, refined = _largest_misfit(trial, [each.candidate for each in found]), list[_Measured]()
+    for of_size, best, candidate in found:
+        if candidate.misfit > largest:
+            continue
+        for reach, step in steps:
+            sizes = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
+            changed = [of_size(size).apply(trial.samples) or trial.samples for size in sizes]
+            evidence = [fit_evidence(trial.chain, each, trial.sets).log for each in changed]
+            best = sizes[int(np.argmax(evidence))]
+        if abs(best) >= smallest:
+            refined += _measured(trial, of_size, best)
     return refined
-
-
-def _angle(zero: _Candidate) -> float:
-    """Return the angle by which a hypothesis says that the zero of a joint is off [deg]."""
-    (offset,) = zero.hypothesis.offsets.values()
-    return float(-np.rad2deg(offset))
 
 
 def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
