@@ -35,9 +35,9 @@ MIN_DIFFERENT = 10
 # Range of the expected RMS error relative to the one that the fit leaves. It was 0.81 to 1.29 for rounded
 # values of simulated arms whose noise is small beside the rounding.
 MIN_SHARE, MAX_SHARE = 0.7, 1.5
-# Logarithm of the ratio of the likelihoods: the rounding explains the errors 20 times better. Positions and
-# poses at rounded values have 7 to 910. Commanded values that were reached have -632 to -6, although their
-# noise is as large as the effect of the step would be.
+# Logarithm of the ratio of the likelihoods: the rounding explains the errors 20 times better. 50 or more
+# positions and poses at rounded values have 7 to 910, unless joint errors were added that fit the rounding.
+# Commanded values that were reached have -632 to -6 with a noise as large as the effect of the step would be.
 MIN_LOG_LIKELIHOOD_RATIO = 3.0
 # Samples of a measurement that are examined.
 MAX_EXAMINED = 2000
