@@ -24,6 +24,7 @@ from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..plausibility.mixups import diagnose_images, diagnose_mixups
+from ..plausibility.rounding import find_rounding
 from ..session import Session
 from ..session.linear_model import measures_positions
 from . import cameras
@@ -227,6 +228,16 @@ class Evidence(FittedModel):
             return []
         applied = f"only {100 * self.shrinkage_factor:.0f} % of the" if self.shrinkage_factor else "no"
         return [f"Too few measurements: {applied} correction applied. Measure more poses."]
+
+    @cached_property
+    def rounding_notes(self) -> list[str]:
+        """One note for each measurement whose errors are those of joint values with too few digits."""
+        instruments, notes = self.problem.instruments(self.x), []
+        for item, mask in zip(self.data, self.is_counted, strict=True):
+            found = find_rounding(item.take(mask), self.chain, instruments, self._rows_per_freedom)
+            if found:
+                notes.append(f"{item.source}: {found.sentence}" if len(self.data) > 1 else found.sentence)
+        return notes
 
     @property
     def hand_eye(self) -> cameras.HandEyeDiagnosis | None:

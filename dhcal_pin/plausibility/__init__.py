@@ -4,7 +4,8 @@ A `Hypothesis` (`hypotheses`) is one assumption about what was mixed up in measu
 joint, and the change that undoes it. The evidence of the measurements with and without that change
 (`evidence`) decides between hypotheses (`mixups`). In the same way `signs` decides which joints of a low-cost
 arm turn the other way. `displacement` compares the size of a correction with manufacturing errors.
-`contradictions` compares the fit of one measurement with that of all.
+`contradictions` compares the fit of one measurement with that of all. `rounding` compares the errors that a
+fit leaves with those of joint values with few digits.
 
 Not here: single implausible values, such as joints beyond their limits (`diagnostics`), and the judgement of
 a calibration (`calibration.verdict`).

@@ -80,7 +80,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
         headline=head.text,
         values=values,
         details=_details(head),
-        remarks=[*context.source.remarks, *regions],
+        remarks=[*context.source.remarks, *regions, *context.fit.rounding_notes],
         note=note,
         warnings=_warnings(context),
         samples=lambda: context.samples.page_data(),
