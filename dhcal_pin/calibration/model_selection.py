@@ -143,8 +143,8 @@ MAX_HINT_RATIO = 0.9
 MIN_ROWS_PER_PARAMETER = 5
 # Largest number of samples of each measurement that a hint is computed from.
 MAX_HINT_SAMPLES = 500
-# Negative logarithm of the largest p-value for which a hint is given: one in a million.
-HINT_LOG_P = 14
+# Families that are no correction curves.
+LOW_ORDER = tuple(name for name in EXTENSIONS if not FAMILIES[name].is_curve)
 
 # Function that factors the rows of a problem at x, all of them and random folds.
 FactorFolds = Callable[[Problem, Array, Sequence[Fold]], tuple[NoisyRows, tuple[NoisyFold, ...]]]
@@ -813,11 +813,13 @@ def _are_residuals_correlated(fit: Fit, noise: float) -> bool:
     )
 
 
-def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[str, FamilyGain]:
-    """Compute what each family that is not in the model would explain of the residuals."""
+def family_gains(
+    solved: Problem, x: Array, weights: Sequence[Array], names: Sequence[str] = LOW_ORDER
+) -> dict[str, FamilyGain]:
+    """Compute what each of some families that are not in the model would explain of the residuals."""
     data = [item.take(w > robust.ZERO_WEIGHT) for item, w in zip(solved.data, weights, strict=True)]
     data = [item.take(np.s_[:: max(1, -(-len(item.rows) // MAX_HINT_SAMPLES))]) for item in data]
-    missing = _missing_parameters(solved, [name for name in EXTENSIONS if not FAMILIES[name].is_curve])
+    missing = _missing_parameters(solved, names)
     problem, x, family = _with_families(replace(solved, data=tuple(data)), x, missing)
     system, n_rows = linearize_and_factor(problem, x, small_angle=False), count_rows(problem)
     before = solve_columns(system, problem.weights, x, family == "")[1]
@@ -835,12 +837,9 @@ def family_gains(solved: Problem, x: Array, weights: Sequence[Array]) -> dict[st
 
 def family_hint(solved: Problem, x: Array, weights: Sequence[Array]) -> str:
     """Suggest an extension if one family explains a significant part of the residuals."""
-    # Chance causes such a change of the cost less than once in a million fits: P(χ²_q > q + 2·sqrt(q·t) +
-    # 2·t) <= exp(-t) (Laurent and Massart 2000).
     best = MAX_HINT_RATIO, ""
     for name, each in family_gains(solved, x, weights).items():
-        threshold = each.added + 2 * np.sqrt(HINT_LOG_P * each.added) + 2 * HINT_LOG_P
-        if each.gain > threshold and each.remaining >= MIN_ROWS_PER_PARAMETER * each.added:
+        if each.is_significant and each.remaining >= MIN_ROWS_PER_PARAMETER * each.added:
             best = min(best, (each.ratio, name))
     ratio, name = best
     return name and (

@@ -58,7 +58,7 @@ from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
-from ..robot.error_families import FAMILIES
+from ..robot.error_families import BACKLASH, FAMILIES
 from ..session import Session, can_have_session, find_scale
 from ..session.timeline import order_samples
 from . import cameras, model_selection
@@ -76,7 +76,7 @@ from .evaluation import accuracy
 from .evidence import diagnose, positions_beside_images
 from .result import Result, make_result
 from .reweighting import Fit, reweight
-from .session_check import SessionFit, SessionModels, fit_session
+from .session_check import SessionFit, SessionModels, fit_session, with_directions
 from .shrinkage import compute_shrinkage_factor
 from .verdict import MAX_USUAL_ERROR, needed_frames
 
@@ -211,7 +211,10 @@ def calibrate(
     elif has_images(setup.data) and setup.priors != "none":
         result = _calibrate_images(setup, begun, groups)
     else:
-        stages, found = robust.LOSSES[loss].stages, begun.session
+        stages = robust.LOSSES[loss].stages
+        if session == "auto" and setup.finds_session and BACKLASH in setup.families:
+            begun = with_directions(begun, lambda fit: supported(fit, stages, setup.families))
+        found = begun.session
         fitted = replace(begun, fit=reweighted(begun.fit, stages))
         with_families = partial(supported, begun.fit, stages, setup.families)
         result = _calibrate_samples(setup, fitted, groups, with_families)

@@ -12,6 +12,11 @@ for with the geometry alone first. They are kept if no joint errors are supporte
 not larger than with joint errors in place of the changes. Otherwise changes are looked for with the families
 of joint errors that the measurements support without changes, and kept only if the measurements support them
 beside all families, too.
+
+Backlash depends on the direction of the last motion of a joint. A file that states no directions may be in
+the order of measurement, from which they follow, or not: then they are those of chance, and explain nothing.
+They are taken from the order if backlash then explains a considerable part of the residuals that all other
+families of joint errors leave, and if it is supported like other families.
 """
 
 from __future__ import annotations
@@ -28,19 +33,21 @@ from ..estimation.priors import effective_parameters
 from ..estimation.problem import Problem
 from ..estimation.robust import MAD_TO_STD
 from ..estimation.solver import SolverResult, minimize
-from ..measurements.base import Measurement
+from ..estimation.uncertainty import FamilyGain
+from ..measurements.base import Measurement, known_conditions
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import Evidence
 from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
+from ..robot.error_families import BACKLASH, FAMILIES
 from ..session import Session, find_session
 from ..session.causes import Step
 from ..session.robot_changes import RobotChanges
 from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
-from .model_selection import ExtendedFit, outlier_weights, with_joint_errors
+from .model_selection import MAX_HINT_RATIO, ExtendedFit, family_gains, outlier_weights, with_joint_errors
 from .partition import of_same_files
 from .reweighting import Fit
 from .verdict import MAX_USUAL_ERROR
@@ -55,6 +62,13 @@ MIN_FREEDOM = 0.05
 MIN_KEPT_WEIGHT = 0.5
 # Ratio of the residuals without changes to those with them above which joint errors need not be compared.
 MIN_GROSS_RATIO = 10.0
+# Condition that backlash depends on.
+APPROACH = FAMILIES[BACKLASH].condition
+# What a user is told.
+ASSUMED_ORDER = (
+    "the measurements show backlash of the joints, with directions of motion that follow from the order of "
+    "the rows; confirm this order by the line '# rows: in order' above the header, or use --unordered"
+)
 
 # Largest growth of links, relative to the reach of the robot: ten times that of aluminium at 50 K.
 MAX_GROWTH = 0.01
@@ -300,3 +314,48 @@ def without_changes(session: Session) -> Session:
     kept = tuple(cause for cause in session.causes if cause.block.is_constant)
     lag = replace(session.lag, is_corrected=False) if session.lag else None
     return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=(), lag=lag)
+
+
+def with_directions(begun: SessionFit, supported: Callable[[Fit], ExtendedFit]) -> SessionFit:
+    """Return a first fit with the directions of motion if its samples show that these are true."""
+    data, holdout = begun.fit.data, begun.holdout
+    is_path = all(item.configurations_per_row == 1 for item in (*data, *holdout))
+    if not is_path or APPROACH in known_conditions((*data, *holdout)):
+        return begun
+    directions = order_samples(data, holdout).directions
+    gain = _gain(supported(begun.fit)[0], directions)
+    if gain is None or not gain.is_significant or gain.ratio > MAX_HINT_RATIO:
+        return begun
+    of_fit, of_holdout = directions[: len(data)], directions[len(data) :]
+    first = replace(
+        begun.fit,
+        data=_with_directions(data, of_fit),
+        problem=begun.fit.problem.with_data(_with_directions(begun.fit.problem.data, of_fit)),
+    )
+    is_supported = BACKLASH in supported(first)[1].supported
+    return replace(begun, fit=first, holdout=_with_directions(holdout, of_holdout)) if is_supported else begun
+
+
+def _gain(fit: Fit, directions: Sequence[Array]) -> FamilyGain | None:
+    """Return what backlash would explain of the residuals of a fit, all other errors unchanged."""
+    problem, x = fit.problem, fit.solution.x
+    problem = replace(
+        problem,
+        errors=ErrorModel(problem.chain(x), ()),
+        data=_with_directions(problem.data, directions),
+        known=problem.instruments(x),
+        weights=np.empty(0),
+        bounds=None,
+    )
+    return family_gains(problem, np.empty(0), fit.weights, (BACKLASH,)).get(BACKLASH)
+
+
+def _with_directions(data: Sequence[Measurement], directions: Sequence[Array]) -> tuple[Measurement, ...]:
+    """Return measurements with directions of motion."""
+    pairs = zip(data, directions, strict=False)
+    return tuple(item.with_conditions(**{APPROACH: each}) for item, each in pairs)
+
+
+def has_assumed_directions(data: Sequence[Measurement], fitted: Sequence[Measurement]) -> bool:
+    """Return whether the directions of fitted measurements were taken from their order."""
+    return APPROACH in known_conditions(fitted) and APPROACH not in known_conditions(data)

@@ -30,6 +30,7 @@ from ..calibration.cross_validation import leave_regions_out
 from ..calibration.evidence import diagnose
 from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
+from ..calibration.session_check import ASSUMED_ORDER, has_assumed_directions
 from ..calibration.verdict import suggest_full_set
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
@@ -437,7 +438,8 @@ def _add_warnings(job: Job, fit: Result, data: JobData, sets: str, on_images: Se
         data.warnings[path] += texts if not data.warnings[path] else []
     hint = _family_hint(fit, data, sets, job)
     turned = [fit.signs.note] if fit.signs and fit.signs.turned else []
-    data.warnings.setdefault(job.robot, []).extend([*turned, *on_images, *find_lattices(fit)])
+    assumed = [ASSUMED_ORDER] if has_assumed_directions(tuple(data.fitted.values()), fit.data) else []
+    data.warnings.setdefault(job.robot, []).extend([*turned, *assumed, *on_images, *find_lattices(fit)])
     if job.curves and not joint_corrections(fit.chain) and _is_kept(job, fit):
         data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
     return hint

@@ -109,6 +109,10 @@ class Predictor(Protocol):
         ...
 
 
+# Negative logarithm of the probability of a change that is no chance.
+MAX_LOG_P = 14
+
+
 @frozen
 class FamilyGain:
     """What a family of joint errors that a model lacks would explain of the residuals."""
@@ -121,6 +125,12 @@ class FamilyGain:
     def ratio(self) -> float:
         """Ratio of the residuals with the family to those without it."""
         return float(np.sqrt((self.remaining + self.added) / (self.remaining + self.gain)))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether chance causes such a change of the cost less than once in a million fits."""
+        # P(χ²_q > q + 2·sqrt(q·t) + 2·t) <= exp(-t) (Laurent and Massart 2000).
+        return self.gain > self.added + 2 * np.sqrt(MAX_LOG_P * self.added) + 2 * MAX_LOG_P
 
 
 @frozen

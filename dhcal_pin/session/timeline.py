@@ -15,6 +15,7 @@ from .._frozen import frozen
 from .._typing import Array
 from ..measurements.base import Measurement
 from ..measurements.configurations import group_by_configuration
+from ..robot.conditions import directions_in_order
 
 
 @frozen
@@ -57,6 +58,16 @@ class Timeline:
         order = np.argsort(self.fitted_numbers, kind="stable")
         q = np.concatenate([item.q for item in self.data[: self.n_fitted]])[order]
         return order[np.diff(group_by_configuration(q), prepend=-1) != 0]
+
+    @property
+    def directions(self) -> tuple[Array, ...]:
+        """Direction of the last motion of each joint (m, n) of each measurement; 0 at the begin of a file."""
+        order = np.argsort(np.concatenate(self.numbers))
+        q = np.concatenate([item.q for item in self.data])
+        directions = np.empty_like(q)
+        files = np.split(q[order], self.file_starts)
+        directions[order] = np.concatenate([directions_in_order(each) for each in files])
+        return tuple(np.split(directions, np.cumsum([len(each) for each in self.numbers])[:-1]))
 
     def thinned(self, count: int) -> Timeline:
         """Return the timeline of at most `count` fitted samples, evenly spaced, without held-out ones."""

@@ -1,0 +1,72 @@
+"""Backlash of the joints of files that state no directions of motion, from the order of their samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import with_small_errors
+from sessions import nominal_arm
+from slow_cases import some_slow
+
+from dhcal_pin import calibrate
+from dhcal_pin.measurements import Position
+
+NOISE = 5e-5
+BACKLASH = np.deg2rad(0.03)
+
+
+def measure(seed, width=BACKLASH, m=120):
+    """Return a nominal UR10, the true one, and positions in order; its joints lag by half of the width."""
+    rng = np.random.default_rng(seed)
+    nominal = nominal_arm("ur10")
+    true = with_small_errors(nominal, rng)
+    q = rng.uniform(-2, 2, (m, 6))
+    lag = 0.5 * width * np.sign(np.diff(q, axis=0, prepend=rng.uniform(-2, 2, (1, 6))))
+    positions = true.poses(q - lag)[:, :3, 3] + NOISE * rng.standard_normal((m, 3))
+    return nominal, true, Position(q, positions)
+
+
+def families(fit):
+    return fit.extension.families if fit.extension else ()
+
+
+@pytest.mark.parametrize("seed", some_slow(range(6), {0}))
+def test_backlash_follows_from_the_order_of_the_samples(seed):
+    nominal, true, data = measure(seed)
+    fit = calibrate(nominal, data)
+    assert "backlash" in families(fit)
+    assert fit.verdict.status == "ok"
+    values = dict(zip((p.name for p in fit.parameters), fit.x, strict=False))
+    widths = [values[f"{name}.backlash"] for name in nominal.joint_names]
+    np.testing.assert_allclose(widths[1:4], BACKLASH, rtol=0.2)
+    # In the middle of the backlash, as in the truth.
+    q = np.random.default_rng(99).uniform(-2, 2, (200, 6))
+    error = np.linalg.norm(fit.chain.poses(q)[:, :3, 3] - true.poses(q)[:, :3, 3], axis=1)
+    assert np.sqrt(np.mean(error**2)) < 1.5e-4
+
+
+@pytest.mark.parametrize("seed", some_slow(range(6), {1}))
+def test_samples_in_another_order_show_no_backlash(seed):
+    nominal, _, data = measure(seed)
+    order = np.random.default_rng(seed).permutation(len(data.rows))
+    shuffled = Position(data.q[order], data.positions()[order])
+    for fit in (calibrate(nominal, shuffled), calibrate(nominal, data, session="unordered")):
+        assert "backlash" not in families(fit)
+        assert fit.data[0].recorded is None
+
+
+@pytest.mark.parametrize("seed", some_slow(range(20), {2, 3}))
+def test_an_arm_without_backlash_keeps_its_samples(seed):
+    nominal, _, data = measure(seed, width=0.0, m=50)
+    fit = calibrate(nominal, data)
+    assert "backlash" not in families(fit)
+    assert fit.data[0].recorded is None
+
+
+def test_held_out_samples_have_the_directions_of_the_same_order():
+    nominal, _, data = measure(4)
+    is_held_out = np.random.default_rng(4).random(len(data.rows)) < 0.3
+    fit = calibrate(nominal, data.take(~is_held_out), holdout=data.take(is_held_out))
+    assert "backlash" in families(fit)
+    (comparison,) = (each for each in fit.comparisons if each.title == "hold-out")
+    assert comparison.after.groups["position"].rms < 1.5e-4
