@@ -106,6 +106,7 @@ def simulate(
     n_boards: int = 1,
     intrinsics_error: float = 0.05,
     aspect: float = 1.0,
+    home: np.ndarray | None = None,
 ) -> Setup:
     """Simulate images of boards by cameras that stand still or are on the wrist.
 
@@ -124,12 +125,13 @@ def simulate(
         n_boards: Number of boards.
         intrinsics_error: Relative error of the focal lengths and the image centre in the rig file.
         aspect: Ratio of the focal lengths.
+        home: Home configuration; a random one by default.
 
     Returns:
         The set-up.
     """
     ends = ("tip", "world") if is_on_wrist else ("world", "tip")
-    home = home_configuration(chain, rng)
+    home = home_configuration(chain, rng) if home is None else home
     tool = truth.poses(home[None])[0]
     cameras, boards = {}, {}
     board_poses = []
@@ -183,7 +185,7 @@ def simulate(
     if len(rows) < n_images:
         return simulate(chain, truth, rng, is_on_wrist=is_on_wrist, n_images=n_images, sigma=sigma,
                         spread=spread, model=model, n_cameras=n_cameras, n_boards=n_boards,
-                        intrinsics_error=intrinsics_error, aspect=aspect)  # fmt: skip
+                        intrinsics_error=intrinsics_error, aspect=aspect, home=home)  # fmt: skip
     q, camera, board, corner, pixels = (np.concatenate(each) for each in zip(*rows, strict=True))
     names = [f"camera{i}" for i in camera], [f"board{i}" for i in board]
     noisy = pixels + sigma * rng.standard_normal(pixels.shape)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras.board_size import BoardSize, _rms_correction, _scaled, find_board_size
+from dhcal_pin.calibration.model_selection import family_hint
+from dhcal_pin.estimation.initialization import align
 from dhcal_pin.estimation.problem import whitened_residuals
 from dhcal_pin.measurements import CameraCorners
 
@@ -49,6 +52,57 @@ def test_large_errors_of_the_arm_are_not_taken_for_a_wrong_size(seed):
     fit = dh.calibrate(arm, images, loss="linear")
     assert fit.camera_stages[-1].is_kept
     assert fit.board_size is None
+
+
+def photograph_wrong_gear_ratio(seed, is_on_wrist=True):
+    """Simulate a UR10 whose elbow turns by 1 % more than reported; return it, the truth and images."""
+    rng, arm = np.random.default_rng(seed), ARMS["ur10"]()
+    errors = dh.select_parameters(arm, "placement,gain")
+    std = {"m": 5e-4, "rad": 1.5e-3, "1": 0.0}
+    x = np.array([std[p.unit] * rng.standard_normal() for p in errors.parameters])
+    x[[p.name for p in errors.parameters].index("elbow_joint.gain")] = 0.01
+    home, truth = np.array([0.2, -1.3, 1.6, -1.9, -1.5, 0.3]), errors.at(x)
+    setup = simulate(arm, truth, rng, is_on_wrist=is_on_wrist, n_images=40, sigma=0.15, spread=0.35,
+                     intrinsics_error=0.01, home=home)  # fmt: skip
+    return arm, truth, setup.images
+
+
+def tool_error(arm, truth, images):
+    """Return the RMS error [m] of a point 0.1 m in front of the flange where images were taken."""
+    poses, true_poses = (each.poses(images.q) for each in (arm, truth))
+    points, true_points = (each[:, :3, :3] @ [0, 0, 0.1] + each[:, :3, 3] for each in (poses, true_poses))
+    return align(points, true_points)[1]
+
+
+@pytest.mark.parametrize(("seed", "is_on_wrist"), some_slow(list(product(range(6), (True, False))), {6}))
+def test_a_wrong_gear_ratio_is_not_taken_for_a_wrong_size(seed, is_on_wrist):
+    """A board of 99 % of its size would shorten the arm by as much as the geometry imitates the gear."""
+    arm, truth, images = photograph_wrong_gear_ratio(seed, is_on_wrist)
+    nominal = tool_error(arm, truth, images)
+    geometry = dh.calibrate(arm, images, extend="none", session="off")
+    assert geometry.board_size is None
+    assert tool_error(geometry.chain, truth, images) > 0.1 * nominal
+    hint = family_hint(geometry.problem, geometry.x, geometry.weights)
+    assert "gear ratio errors" in hint
+    assert "--extend auto" in hint
+    fit = dh.calibrate(arm, images, extend="auto", session="off")
+    assert fit.extension is not None
+    assert "gain" in fit.extension.supported
+    assert fit.board_size is None
+    assert fit.verdict.status == "ok"
+    assert tool_error(fit.chain, truth, images) < 0.07 * nominal
+
+
+def test_a_wrong_size_is_named_beside_a_wrong_gear_ratio():
+    arm, _, images = photograph_wrong_gear_ratio(3)
+    (board,) = images.rig.boards
+    stated = replace(board, type="points", listed_points=board.points / 0.99)
+    fit = dh.calibrate(arm, with_rig(images, boards=(stated,)), session="off")
+    assert fit.extension is not None
+    assert "gain" in fit.extension.supported
+    assert fit.verdict.status == "refused"
+    assert fit.board_size is not None
+    assert fit.board_size.size == pytest.approx(0.99, abs=2e-3)
 
 
 @pytest.mark.slow

@@ -155,7 +155,7 @@ def test_arms_without_play_and_sag_keep_the_geometry():
     fit = calibrated(shot, session="off")
     assert not families(fit)
     assert fit.extension
-    assert {trial.family for trial in fit.extension.trials} == {"backlash", "compliance"}
+    assert {trial.family for trial in fit.extension.trials} == {"backlash", "compliance", "gain"}
     assert tool_errors(shot, fit)[0] < 1e-3
 
 
@@ -230,7 +230,7 @@ def test_priors_of_low_cost_arms_are_wider():
 
 
 def test_families_that_images_do_not_show_are_refused(shot):
-    with pytest.raises(InvalidArgumentError, match="only compliance and backlash are selected from images"):
-        calibrate(shot.nominal, shot.images, turned="none", extend="gain")
+    with pytest.raises(InvalidArgumentError, match="only compliance, backlash and gain are selected"):
+        calibrate(shot.nominal, shot.images, turned="none", extend="coupling")
     with pytest.raises(InvalidArgumentError, match="'backlash' needs the direction"):
         calibrate(shot.nominal, shot.images.replace(recorded=None), turned="none", extend="backlash")

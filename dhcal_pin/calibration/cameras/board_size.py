@@ -5,6 +5,10 @@ larger or smaller than the rig states therefore changes all lengths of the estim
 Manufacturing errors do not. If another size of the boards makes the correction of the arm far smaller, the
 stated size is probably wrong. If it makes it smaller by less, the stated size may be wrong.
 
+Errors of the joints that the model lacks change the lengths of the estimated arm, too: a gear ratio that is
+1 % wrong as much as a board that is 1 % wrong. The size is therefore judged with the joint errors that the
+images support, see `joint_errors`.
+
 The corrections of the lengths of the arm, in units of their default prior standard deviations, have the RMS w
 with the stated size and w' with the one that fits best. For a common width of their normal distribution, each
 time of greatest likelihood, the logarithm of the ratio of the likelihoods is n·log(w/w') with the effective
@@ -72,7 +76,7 @@ class BoardSize:
 
 def find_board_size(fit: Fit) -> BoardSize | None:
     """Look for a size of the boards that makes the correction of the arm far smaller."""
-    problem, x = fit.problem, fit.solution.x
+    problem, x = fit.problem.at_temperature(1.0), fit.solution.x
     stated = _rms_correction(problem.errors, x)
     lengths = _lengths(problem.errors)
     if stated < MIN_DOUBTFUL_CORRECTION or len(select_images(problem.data)) < len(problem.data):

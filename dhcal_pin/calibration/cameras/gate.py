@@ -13,7 +13,7 @@ of the arm are those of greatest evidence at T, however narrow.
   (`arm_types`).
 - r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
   arm is demonstrably wrong, too, whatever the images show.
-- Otherwise the nominal arm is kept, unless elasticity and play complete the model (`joint_errors`). Errors of
+- Otherwise the nominal arm is kept, unless joint errors complete the model (`joint_errors`). Errors of
   another kind, such as periodic ones of the joints, can be imitated by errors of the links where images were
   taken, with a ratio of 0.3 to 0.5, but not elsewhere.
 
@@ -125,7 +125,8 @@ class GatedFit:
     nominal: Fit  # Fit of independent corners with the nominal arm
     with_arm: Fit  # Fit with the arm estimated
     gate: Gate  # Whether the arm is estimated in the final fit
-    displaced: Fit | None = None  # Fit with the arm estimated and a displacement of each image, if any
+    # Fit with the arm estimated and a displacement of each image; None if the images share none with it.
+    displaced: Fit | None = None
 
 
 def fit_with_jitter(fit: Fit, max_iterations: int) -> tuple[Fit, Jitter]:
@@ -181,7 +182,8 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
         factor = 1.0 if best.model is shared else share
         opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
     opened = _solve(best.model, best.model.problem, opened_at, max_iterations)
-    return GatedFit(opened, nominal, opened, replace(gate, temperature=opened_at), opened)
+    gate = replace(gate, temperature=opened_at)
+    return GatedFit(opened, nominal, opened, gate, None if is_complete else shared)
 
 
 def open_fit(fit: Fit, gate: Gate, max_iterations: int) -> tuple[Fit, float]:

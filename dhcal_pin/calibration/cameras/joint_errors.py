@@ -11,7 +11,8 @@ s², and that of the components to 1 + s²·σ². The share of the noise s in th
 What remains of the displacements is then estimated again. Families that raise the error of left-out clusters
 of joint space are not added. If the gate keeps the nominal arm, it is judged again with the families: an arm
 with elastic joints is demonstrably wrong where geometry and elasticity together explain the images up to the
-noise of the corners.
+noise of the corners. Families are tried even if corners that are displaced independently are the better model
+of the geometry alone (`gate`). Images that only the geometry does not explain are no outliers.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, merge_r_factors
 from ...estimation.solver import minimize
 from ...measurements.camera import CameraCorners
-from ...robot.error_families import BACKLASH, COMPLIANCE
+from ...robot.error_families import BACKLASH, COMPLIANCE, GAIN
 from ..model_selection import (
     MIN_CONFIGURATIONS,
     Extension,
@@ -35,12 +36,14 @@ from ..model_selection import (
     select_families,
     with_selected,
 )
-from .gate import GatedFit, cluster_folds, open_fit, without_arm
+from ..reweighting import Fit, reweight
+from .gate import Gate, GatedFit, cluster_folds, open_fit, without_arm
 from .stages import held_out_error
 
-# Families that images show: displacements follow from the direction of approach and from gravity. Periodic
-# errors of the joints are imitated by errors of the links where images were taken.
-FAMILIES = (COMPLIANCE, BACKLASH)
+# Families that images show: displacements follow from gravity, from the direction of approach, and from the
+# joint positions in proportion. Errors of the links and gains imitate periodic errors of the joints where
+# images were taken.
+FAMILIES = (COMPLIANCE, BACKLASH, GAIN)
 # Smallest displacement σ of the rows that the noise of the corners does not hide, in standard deviations of
 # the corners, and number of classes, each of twice the σ of the one before.
 MIN_DISPLACEMENT, N_CLASSES = 0.5, 10
@@ -68,7 +71,7 @@ def add_joint_errors(
     solution = minimize(problem, "lm", x, max_iterations, loose=True)
     opened, temperature = open_fit(replace(fit, problem=problem, solution=solution), gate, max_iterations)
     folds = cluster_folds(fit.data)
-    errors = [held_out_error(each, folds) for each in (fit, opened)]
+    errors = [held_out_error(each, folds) for each in (gated.with_arm, opened)]
     before, after = (error.pixels if error else float("nan") for error in errors)
     if not gate.is_open:
         nominal = held_out_error(without_arm(opened, max_iterations), folds)
@@ -78,6 +81,7 @@ def add_joint_errors(
     if not gate.is_open or after > before:
         trials = tuple(replace(trial, is_selected=False) for trial in trials)
         return gated, replace(extension, trials=trials)
+    opened, temperature = _with_explained(opened, temperature, gate, max_iterations)
     extension = Extension(
         trials,
         temperature,
@@ -88,6 +92,16 @@ def add_joint_errors(
     with_arm = gated.with_arm if gated.gate.is_open else opened
     gate = replace(gate, temperature=temperature)
     return replace(gated, fit=opened, with_arm=with_arm, gate=gate), extension
+
+
+def _with_explained(opened: Fit, temperature: float, gate: Gate, max_iterations: int) -> tuple[Fit, float]:
+    """Fit with the samples, too, that were outliers of the geometry and are none with the joint errors."""
+    data = [item.with_weights(1 / w) for item, w in zip(opened.problem.data, opened.weights, strict=True)]
+    judged = replace(opened, data=tuple(data), problem=opened.problem.at_temperature(1.0))
+    weights = reweight(judged, (opened.stage,), (), max_iterations, None).weights
+    if all(np.array_equal(new, old) for new, old in zip(weights, opened.weights, strict=True)):
+        return opened, temperature
+    return open_fit(opened.solved_with_weights(weights, max_iterations), gate, max_iterations)
 
 
 def factor_displacements(

@@ -5,7 +5,8 @@ After the first fit these stages follow:
 1. Widths of the priors of lenses and noise of the corners (`lens_priors`, `reweighting`).
 2. Corners of boards as unknowns, where they improve left-out images (`target_points`).
 3. The gate decides how far the arm is corrected (`gate`).
-4. Backlash and elasticity are added if the displacements of the images support them (`joint_errors`).
+4. Errors of gear ratios, elasticity and backlash are added if the displacements of the images support them
+   (`joint_errors`).
 5. A wrong size of the boards, or the cause of a large error of a hand-eye calibration, is looked for
    (`board_size`, `diagnosis`).
 """
@@ -22,6 +23,7 @@ from ..._typing import Progress
 from ...estimation.priors import PriorGroups
 from ...estimation.robust import KEPT
 from ...exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
+from ...formatting import join_names
 from ...measurements.base import Measurement
 from ...measurements.camera import change_images, select_images
 from ...robot.chain import Chain
@@ -29,9 +31,9 @@ from ..result import Result, make_result
 from ..reweighting import Fit, reweight
 from .arm_types import CORNERS, IMAGES, ArmType
 from .axis_order import Exchange, axis_stages
-from .board_size import find_board_size
+from .board_size import BoardSize, find_board_size
 from .diagnosis import HandEyeFit
-from .gate import apply_gate, judge_stages, judge_target_points, residual_jitter, without_arm
+from .gate import GatedFit, apply_gate, judge_stages, judge_target_points, residual_jitter, without_arm
 from .image_checks import find_unrelated_images, seen_ranges_warning
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
@@ -45,7 +47,7 @@ def require_shown_families(extend: str | Sequence[str] | None, families: Sequenc
     others = [name for name in families if name not in FAMILIES]
     if others and extend not in (None, "auto"):
         raise InvalidArgumentError(
-            f"extend {others[0]!r}: only {' and '.join(FAMILIES)} are selected from images; name other "
+            f"extend {others[0]!r}: only {join_names(FAMILIES)} are selected from images; name other "
             f"families among the parameters, as in {DEFAULT_SETS.replace('offset', f'offset,{others[0]}', 1)}"
         )
 
@@ -155,7 +157,15 @@ def calibrate_images(
         arm_type=fitting.arm_type,
     )
     if gate.is_open and fitted_error(gated.fit).pixels < max_error:
-        return replace(result, board_size=find_board_size(ungated))
+        return replace(result, board_size=_judge_board_size(gated, families, fitting.max_iterations))
     frames = gated.nominal if has_arm else ungated
     unrelated = find_unrelated_images(frames, holdout, chain, max_error)
     return replace(result, hand_eye_fit=HandEyeFit(frames, result.pose_std, holdout, unrelated, has_arm))
+
+
+def _judge_board_size(gated: GatedFit, families: Sequence[str], max_iterations: int) -> BoardSize | None:
+    """Look for another size of the boards that no supported joint errors explain, selected or not."""
+    found = find_board_size(gated.fit)
+    if found is None or set(FAMILIES) <= set(families):
+        return found
+    return find_board_size(add_joint_errors(gated, FAMILIES, max_iterations)[0].fit)
