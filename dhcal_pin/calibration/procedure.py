@@ -145,7 +145,8 @@ def calibrate(
         bounds: Lowest and highest values by name or pattern of the robot's parameters [m or rad]; base and
             tool have no bounds.
         max_iterations: Largest number of iterations of one solution.
-        session: "auto" looks for what happened during the measurement and accounts for it, see `session`;
+        session: "auto" looks for what happened during the measurement and accounts for it, see `session`, and
+            takes the directions of motion from the order of the samples if backlash shows that they are true;
             "unordered" does so for samples that are not in the order of measurement, where only files may
             differ; "off" does not. Method "gn" does not either.
         turned: Names of the joints that turn the other way than in the URDF, or "none": their axes are

@@ -64,7 +64,7 @@ MIN_KEPT_WEIGHT = 0.5
 MIN_GROSS_RATIO = 10.0
 # Condition that backlash depends on.
 APPROACH = FAMILIES[BACKLASH].condition
-# What a user is told.
+# Warning where the directions were taken from the order.
 ASSUMED_ORDER = (
     "the measurements show backlash of the joints, with directions of motion that follow from the order of "
     "the rows; confirm this order by the line '# rows: in order' above the header, or use --unordered"

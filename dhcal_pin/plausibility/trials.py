@@ -203,8 +203,10 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
 
 def _measure_ratios(trial: Trial) -> list[_Measured]:
     """Return the joint values that need a factor, of one joint or of all revolute ones, by positions."""
-    ratios, single = [], [[joint] for joint in range(trial.chain.n_joints)]
-    for joints in [*single, revolute_joints(trial.chain)] if trial.misfit else []:
+    if not trial.misfit:
+        return []
+    ratios, groups, revolute = [], [[j] for j in range(trial.chain.n_joints)], revolute_joints(trial.chain)
+    for joints in [*groups, revolute] if len(revolute) > 1 else groups:
         of_logarithm = partial(_ratio_of_logarithm, trial.chain, joints)
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
         if abs(best) >= _MIN_RATIO:

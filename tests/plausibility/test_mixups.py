@@ -193,6 +193,22 @@ def test_a_wrong_gear_ratio_is_named_and_mended(path, tip, joints, factor, seed)
     assert np.sqrt(np.mean(np.sum(error**2, 1))) < 2e-4
 
 
+@pytest.mark.parametrize("joint", [1, 3])
+def test_a_ratio_of_the_only_revolute_joint_or_of_a_slide_is_named_once(joint):
+    up, free = np.array([np.pi / 2, np.pi / 2, 0, 0]), np.full(4, np.inf)
+    names, slides = ("x", "y", "z", "turn"), np.array([True, True, True, False])
+    table = DHTable("standard", names, slides, up, np.full(4, 0.2), np.full(4, 0.1), up, 0 * up, -free, free)
+    arm = Chain.from_dh(table)
+    rng = np.random.default_rng(joint)
+    q = rng.uniform(-1, 1, (60, 4)) * np.where(slides, 0.5, 2.5)
+    data = Position.simulate(arm.with_base_and_tool(*frames()), q, Noise(5e-5), rng)
+    found = diagnose_mixups(arm, [data.resample(data.q / np.where(np.arange(4) == joint, 1.2, 1))])
+    (hypothesis,) = found.hypotheses
+    kind, name, factor = hypothesis.key.split(":")
+    assert (kind, name) == ("ratio", names[joint])
+    assert float(factor) == pytest.approx(1.2, abs=5e-3)
+
+
 def test_zeros_of_any_angle_are_mended_beside_other_mistakes(ur10):
     data = measured(Pose)
     wrong = with_joints(with_joints(data, flipped(0)), shifted(2, 12.5))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from robots import with_small_errors
@@ -9,6 +11,7 @@ from sessions import nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
+from dhcal_pin.cli import main
 from dhcal_pin.measurements import Position
 
 NOISE = 5e-5
@@ -70,3 +73,23 @@ def test_held_out_samples_have_the_directions_of_the_same_order():
     assert "backlash" in families(fit)
     (comparison,) = (each for each in fit.comparisons if each.title == "hold-out")
     assert comparison.after.groups["position"].rms < 1.5e-4
+
+
+def test_the_warning_asks_for_the_order_and_stating_it_gives_the_same(tmp_path, capsys):
+    _, _, data = measure(0)
+    header = ",".join([*(f"{name}[rad]" for name in nominal_arm("ur10").joint_names), "x[m]", "y[m]", "z[m]"])
+    path, results = tmp_path / "data.csv", []
+    for comment in ("", "# rows: in order\n"):
+        path.write_text(f"{comment}{header}\n")
+        with path.open("a") as file:
+            np.savetxt(file, np.hstack([data.q, data.positions()]), "%.12f", ",")
+        result = tmp_path / "r.json"
+        command = ["calibrate", "example:ur10", path, "--tip", "tool0", "-o", tmp_path / "c.urdf"]
+        assert main.main([*map(str, command), "--json", str(result)]) == 0
+        results.append(json.loads(result.read_text()))
+        capsys.readouterr()
+    warned, stated = results
+    assert [text for text in warned["warnings"] if "# rows: in order" in text]
+    assert stated["warnings"] == []
+    after, again = (each["cross_validated_after"]["position_rms_m"] for each in (warned, stated))
+    assert again == pytest.approx(after, rel=1e-9)
