@@ -39,9 +39,11 @@ def test_backlash_follows_from_the_order_of_the_samples(seed):
     fit = calibrate(nominal, data)
     assert "backlash" in families(fit)
     assert fit.verdict.status == "ok"
-    values = dict(zip((p.name for p in fit.parameters), fit.x, strict=False))
-    widths = [values[f"{name}.backlash"] for name in nominal.joint_names]
-    np.testing.assert_allclose(widths[1:4], BACKLASH, rtol=0.2)
+    is_width = np.array([p.name.endswith(".backlash") for p in fit.parameters])
+    # The last joint hardly moves the measured point.
+    widths, std = fit.x[is_width][:5], fit.std[is_width][:5]
+    assert np.all(np.abs(widths - BACKLASH) < 4 * std)
+    assert np.all(std[:3] < 0.1 * BACKLASH)
     # In the middle of the backlash, as in the truth.
     q = np.random.default_rng(99).uniform(-2, 2, (200, 6))
     error = np.linalg.norm(fit.chain.poses(q)[:, :3, 3] - true.poses(q)[:, :3, 3], axis=1)
