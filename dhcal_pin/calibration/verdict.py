@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from .. import se3
 from .._frozen import frozen
 from ..estimation import robust
 from ..estimation.initialization import initialize_frames
@@ -481,7 +482,7 @@ def _too_small_sigmas(fit: Evidence) -> str:
 def _implausible_errors(fit: Evidence) -> list[Finding]:
     """Refuse a robot that does not fit the measurements after the calibration either."""
     for group, after in fit.comparisons[-1].after.groups.items():
-        error = after.rms / (workspace_radius(fit.chain) if after.unit == "m" else 1.0)
+        error = after.rms / (_workspace_size(fit) if after.unit == "m" else 1.0)
         if error <= MAX_USUAL_ERROR.get(after.unit, fit.arm_type.max_error):
             continue
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
@@ -494,6 +495,14 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
             return [Finding(status, text, has_cause=True)]
         return [Finding(status, f"{text}. {_plausible_cause(fit)}")]
     return []
+
+
+def _workspace_size(fit: Evidence) -> float:
+    """Return the RMS distance of the tool from its mean position [m], at most that of tip or measurements."""
+    # A fit to measurements of something else can put the tool hundreds of metres away.
+    tip = workspace_radius(fit.chain.with_base_and_tool(np.eye(4), np.eye(4)))
+    measured = [se3.rms_radius(item.positions()) for item in fit.data if len(item.positions())]
+    return min(workspace_radius(fit.chain), max(tip, *measured, 0.0) or np.inf)
 
 
 def _hand_eye_error(fit: Evidence) -> list[Finding]:
@@ -681,7 +690,7 @@ def _keeps_orientation(fit: Evidence) -> bool:
 def _shown_position_error(fit: Evidence) -> float:
     """Return the position error that residuals and stated standard deviations suggest [m]; NaN if none."""
     groups = headline(fit.comparisons).comparison.after.groups.values()
-    lever = {"m": 1.0, "rad": workspace_radius(fit.chain)}
+    lever = {"m": 1.0, "rad": _workspace_size(fit)}
     for unit in lever:
         errors = [group.rms * lever[unit] for group in groups if group.unit == unit]
         if errors:
