@@ -20,7 +20,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 import numpy as np
 from bench_common import clocked
 from exported_models import CModel, python_model, with_joint_errors, with_payload_and_frames
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin.robot import FAMILIES, Chain
 from dhcal_pin.robot.transmission import Transmission, split_coefficients
@@ -31,7 +31,7 @@ SAMPLES, REPEATS = 1000, 15
 def robots() -> dict[str, Chain]:
     """Return the arm without joint errors, with few and many harmonics, and with all families."""
     rng = np.random.default_rng(0)
-    bare = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    bare = nominal_arm("ur10")
     bare = with_payload_and_frames(bare, rng)
     waves = with_joint_errors(bare, rng, ["harmonics", "curves", "fine-curves"])
     assert waves.transmission is not None

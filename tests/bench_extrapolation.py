@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from robots import DATA, MAPS, robot_file
+from robots import DATA, MAPS, nominal_arm
 
 from dhcal_pin.calibration import Result, accuracy, calibrate
 from dhcal_pin.io import read_measurements
@@ -53,7 +53,7 @@ class Case:
 
 def read_series(folder: Path) -> tuple[Chain, dict[str, Measurement]]:
     """Read the nominal robot and both series."""
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     columns = MAPS / "ipa_ur10.toml"
     return arm, {name: read_measurements(folder / path, arm, columns=columns) for name, path in FILES.items()}
 

@@ -16,7 +16,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
-from robots import missing, paper
+from robots import missing, nominal_arm, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
@@ -57,6 +57,11 @@ def sim_6dof_actual() -> Chain:
 @pytest.fixture(scope="session")
 def sim_3dof() -> Chain:
     return Chain.from_dh(paper("sim_3dof"))
+
+
+@pytest.fixture(scope="session")
+def ur10() -> Chain:
+    return nominal_arm("ur10")
 
 
 @pytest.fixture(scope="session")

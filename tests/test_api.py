@@ -1,6 +1,7 @@
 """The public names of `dhcal_pin` and their parameters are those of `api.txt`.
 
-Members that several classes inherit stand once, under the base that the line of each class names. A change of the list is a change for users. Write the new list with
+Members that several classes inherit stand once, under the base that the line of each class names. A change
+of the list is a change for users. Write the new list with
 
     python tests/test_api.py
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import URDF, paper, robot_file
+from robots import URDF, nominal_arm, paper
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
@@ -49,11 +49,11 @@ def cartesian() -> Chain:
 
 
 ROBOTS = {
-    "ur5": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur5_robot.urdf"), "tool0"),
-    "ur10": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "ee_link"),
-    "panda": lambda: Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_hand"),
+    "ur5": lambda: nominal_arm("ur5"),
+    "ur10": lambda: nominal_arm("ur10", "ee_link"),
+    "panda": lambda: nominal_arm("panda", "panda_hand"),
     "sim_6dof": lambda: Chain.from_dh(paper("sim_6dof")),
-    "z1": lambda: Chain.from_urdf(robot_file("z1_description/urdf/z1.urdf"), "link06"),
+    "z1": lambda: nominal_arm("z1", "link06"),
     "cartesian": cartesian,
 }
 

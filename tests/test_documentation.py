@@ -34,8 +34,7 @@ import schema_files
 import tomli_w
 from camera_setups import visible_corners, wrong_arm
 from command_line import assert_shows
-from robots import ROOT
-from sessions import nominal_arm
+from robots import ROOT, nominal_arm
 
 import dhcal_pin
 from dhcal_pin import se3

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from robots import nominal_arm
 from scipy import stats
-from sessions import Simulation, nominal_arm
+from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, split

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from robots import paper, robot_file
+from robots import nominal_arm, paper
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -29,14 +29,7 @@ NOISE = Noise(1e-4, 1e-4)
 
 @cache
 def arm(name: str) -> Chain:
-    if name == "paper":
-        return Chain.from_dh(paper("sim_6dof"))
-    path, tip = {
-        "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-        "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
-        "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
-    }[name]
-    return Chain.from_urdf(robot_file(path), tip)
+    return Chain.from_dh(paper("sim_6dof")) if name == "paper" else nominal_arm(name)
 
 
 ARMS = ("ur10", "panda", "kinova", "paper")

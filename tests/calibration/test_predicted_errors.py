@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import DATA, MAPS, missing, nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -33,7 +33,7 @@ def simulated(seed: int, m: int, size: float) -> tuple[Chain, Pose, Pose]:
         Nominal chain, measured poses, and true poses at further configurations.
     """
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, SETS)
     truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1))
     directions, phases = rng.normal(size=(6, 400)) / 3, rng.uniform(0, 2 * np.pi, 400)
@@ -116,7 +116,7 @@ SERIES = {"B": "Series_B/measurements_joint_configurations.csv", "D": "Series_D/
 @pytest.mark.parametrize("series", SERIES)
 def test_intervals_hold_on_left_out_regions_of_real_arms(series):
     """95 % intervals of positions contain 90 to 98 % of the measured ones in regions that were left out."""
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     path = DATA / "ipa_ur10" / SERIES[series]
     if not path.exists():
         missing(f"measurements at {path}")

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from sessions import nominal_arm
+from robots import nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate

@@ -8,20 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import HEADER, json_of, positions_csv, tool_positions, unfolded
-from robots import DATA, MAPS, missing, robot_file
+from robots import DATA, MAPS, missing
 
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import Chain
 
 
 def inspect(run, *args):
     return json_of(run("inspect", *args, "--json", "-"))
-
-
-@pytest.fixture
-def ur10():
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 @pytest.fixture

@@ -10,9 +10,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from command_line import json_of, unfolded
-from robots import URDF, robot_file
+from robots import UR10, URDF
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 ARM = (UR10, "--tip", "tool0")
 
 # Distance of P2 and P4: 80 % of the diagonal of the cube.

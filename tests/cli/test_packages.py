@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 from command_line import stdout_of
-from robots import robot_file
+from robots import UR10
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 # Two links, the second with a mesh of a package that is not beside the URDF.
 ARM = """<robot name="arm"><link name="base"/>
 <link name="link"><VISUAL><geometry><mesh filename="package://my_arm/meshes/box.stl"/></geometry></VISUAL></link>

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from robots import URDF, robot_file
+from robots import URDF
 
 from dhcal_pin.cli import main
 from dhcal_pin.io import read_configurations, read_robot
@@ -132,7 +132,7 @@ def test_task_by_positions_and_by_joint_values(tmp_path, capsys):
 
 
 def test_box_and_visibility(tmp_path, capsys):
-    robot = robot_file("ur_description/urdf/ur10_robot.urdf")
+    robot = UR10
     poses = tmp_path / "poses.csv"
     space = ("--box", "0,-800,100:1200,800,1000mm", "--visible-from", "2.5,0,1m", "--cone", "40deg")
     options = ("-n", 8, "--tip", "tool0", "--kind", "position", "--candidates", 400)

@@ -19,7 +19,7 @@ from command_line import (
     tool_positions,
     unfolded,
 )
-from robots import URDF, robot_file
+from robots import UR10, URDF
 
 
 def test_sidecar_is_an_input(run, robot_folder):
@@ -45,7 +45,7 @@ def test_json_of_a_validation(run, robot_folder):
 
 def test_another_tip_than_that_of_the_calibration_is_named(run, robot_folder):
     """The tool of a UR10 is calibrated; with the link before the tip, the tool does not count."""
-    Path("ur10.urdf").write_text(robot_file("ur_description/urdf/ur10_robot.urdf").read_text())
+    Path("ur10.urdf").write_text(UR10.read_text())
     simulate = [
         "simulate",
         "ur10.urdf",

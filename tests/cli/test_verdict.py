@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import CALIBRATE, parse_json, positions_csv, unfolded
 from measurement_files import frames, joint_positions, real_ur10
-from robots import robot_file
+from robots import UR10, nominal_arm
 from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
@@ -98,7 +98,6 @@ def test_python_refuses_to_write(robot_folder):
 
 # --- results that must not be written --------------------------------------------------------------
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 JOINTS = [f"{name}_joint" for name in "shoulder_pan shoulder_lift elbow wrist_1 wrist_2 wrist_3".split()]
 
 
@@ -386,7 +385,7 @@ def test_too_small_sigmas_are_named_as_the_cause_of_a_large_correction(seed, con
 
     More iterations do not help, so they are not advised.
     """
-    chain = dh.Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     rng, errors = np.random.default_rng(seed), select_parameters(chain, "placement")
     sizes = np.array([1e-3 if p.unit == "m" else 5e-3 for p in errors.parameters])
     truth = errors.at(rng.normal(size=len(sizes)) * sizes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.estimation import select_parameters
@@ -21,7 +21,6 @@ from dhcal_pin.identifiability.residual_correlation import (
     find_residual_correlation,
 )
 from dhcal_pin.measurements import Measurement, Noise, Pose, Position
-from dhcal_pin.robot import Chain
 
 SETS = "minimal,base,tool"
 
@@ -36,7 +35,7 @@ def fitted(seed: int, m: int, kind: type[Measurement] = Pose, size: float = 0.0)
         size: Standard deviation of the smooth error of positions [m].
     """
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, SETS)
     truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1))
     q = rng.uniform(-2.5, 2.5, (m, 6))

@@ -8,8 +8,8 @@ from itertools import product
 
 import numpy as np
 import pytest
-from robots import robot_file
-from sessions import ANGLE_NOISE, ARMS, NOISE, Simulation
+from robots import ARMS, robot_file
+from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
+from robots import nominal_arm
+from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, select_parameters

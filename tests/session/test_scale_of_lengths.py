@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from robots import with_small_errors
-from sessions import nominal_arm
+from robots import nominal_arm, with_small_errors
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate

@@ -9,9 +9,9 @@ from itertools import product
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import ARMS, DATA, MAPS, missing, nominal_arm, robot_file
 from scipy.stats import multivariate_normal
-from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
+from sessions import Changes, Simulation, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, se3
@@ -770,7 +770,7 @@ def test_nothing_happened_in_the_public_series_of_a_ur10(series):
     """Left-out blocks of time of these series are not predicted better by any event or drift."""
     if not DATA.exists():
         missing(f"measurements at {DATA}")
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     data = read_measurements(DATA / f"ipa_ur10/Series_{series}.csv", chain, MAPS / "ipa_ur10.toml")
     assert not session_of(calibrate(chain, data, extend="none")).found
 
