@@ -80,6 +80,20 @@ def stdout_of(result):
     return out
 
 
+def stderr_of(result):
+    """Standard error of a command that must succeed."""
+    status, _, err = result
+    assert status == 0, err
+    return err
+
+
+def error_of(result):
+    """Message of a command that must refuse its input: one line, and nothing on standard output."""
+    status, out, err = result
+    assert (status, out, err.count("\n")) == (2, "", 1), err
+    return err
+
+
 def json_of(result):
     """JSON on standard output of a command that must succeed."""
     return parse_json(stdout_of(result))
