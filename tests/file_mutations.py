@@ -28,6 +28,7 @@ from command_line import positions_csv
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from mjcf_robots import BENCH, UR5E
+from mutations import Mutation, mutated, mutation_lists
 from recordings import JOINTS, POSES, Recording, write_bag
 from robots import URDF
 
@@ -344,49 +345,16 @@ TOKENS = [
     *("\x00", "\r", "\n\n", "\u2028", "\ufeff", "\u202e", "\x1b[31m", "\ud7ff", "é", "../", "/dev/null"),
 ]
 WORD = re.compile(rb"\w+|\s+|[^\w\s]")
-MUTATION = st.tuples(
-    st.sampled_from(["words", "bytes"]),
-    st.sampled_from(["delete", "repeat", "insert", "replace", "swap", "number", "flip"]),
-    st.floats(0, 1, exclude_max=True),
-    st.floats(0, 1, exclude_max=True),
-    st.integers(1, 12),
-    st.sampled_from(TOKENS) | st.floats().map(repr) | st.integers(-(10**6), 10**6).map(str),
+MUTATIONS = mutation_lists(
+    (st.sampled_from(TOKENS) | st.floats().map(repr) | st.integers(-(10**6), 10**6).map(str)).map(
+        lambda text: text.encode(errors="surrogatepass")
+    )
 )
 # Commands that only read are tried more often than those that compute for a tenth of a second.
 WEIGHTED = [
     case for case in CASES for _ in range(1 if case.words[0] in ("calibrate", "validate", "plan") else 4)
 ]
-EXAMPLES = {"case": st.sampled_from(WEIGHTED), "mutations": st.lists(MUTATION, min_size=1, max_size=4)}
-
-
-# Grain, kind, two places, size and text of a mutation.
-Mutation = tuple[str, str, float, float, int, str]
-
-
-def mutated(data: bytes, mutations: Sequence[Mutation]) -> bytes:
-    """Return bytes after some mutations."""
-    for grain, what, at, to, size, text in mutations:
-        token = text.encode(errors="surrogatepass")
-        parts = WORD.findall(data) if grain == "words" else [data[i : i + 1] for i in range(len(data))]
-        i, j = sorted((int(at * len(parts)), int(to * len(parts))))
-        if what == "delete":
-            parts[i : i + size] = []
-        elif what == "repeat":
-            parts[j:j] = parts[i : i + size]
-        elif what == "insert":
-            parts[i:i] = [token]
-        elif what == "replace":
-            parts[i : i + 1] = [token]
-        elif what == "swap" and i + size <= j:
-            parts[i : i + size], parts[j : j + size] = parts[j : j + size], parts[i : i + size]
-        elif what == "number":
-            numbers = [k for k, part in enumerate(parts) if part[:1].isdigit()]
-            if numbers:
-                parts[numbers[int(at * len(numbers))]] = token
-        elif what == "flip" and i < len(parts):
-            parts[i] = bytes([parts[i][0] ^ (1 << size % 8)]) + parts[i][1:]
-        data = b"".join(parts)
-    return data
+EXAMPLES = {"case": st.sampled_from(WEIGHTED), "mutations": MUTATIONS}
 
 
 def _files() -> dict[str, bytes]:
@@ -541,7 +509,7 @@ def _try_hundred(number: int) -> dict[str, object]:
         nonlocal count
         count += 1
         try:
-            survive(case, mutated(case.data, mutations), heard)
+            survive(case, mutated(case.data, mutations, WORD), heard)
         except Exception:
             wrong.append(f"{case} {mutations}\n{traceback.format_exc()}")
 

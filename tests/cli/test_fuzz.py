@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
-from urdf_mutations import EXAMPLES, LENIENT, mutated
+from mutations import mutated
+from urdf_mutations import EXAMPLES, LENIENT, WORD
 
 from dhcal_pin.cli.main import main
 
@@ -52,11 +53,11 @@ def survive(data: bytes) -> None:
 @settings(max_examples=75, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_any_robot(data, mutations):
-    survive(mutated(data, mutations))
+    survive(mutated(data, mutations, WORD))
 
 
 @pytest.mark.slow
 @settings(max_examples=2500, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_thousands_of_robots(data, mutations):
-    survive(mutated(data, mutations))
+    survive(mutated(data, mutations, WORD))
