@@ -19,8 +19,16 @@ ACCURACY = {"position_rms_m", "position_max_m", "orientation_rms_rad"}
 HEADER = "joint_1[deg],joint_2[deg],joint_3[deg],x[mm],y[mm],z[mm]"
 # Command that the folder of the fixture `robot_folder` is made for.
 CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
-
-
+# Column map of a file of another maker, with the same columns under other names.
+COLUMN_MAP = """
+[joints]
+order = ["A1", "A2", "A3"]
+unit = "deg"
+[columns]
+x = {from = "X", unit = "mm"}
+y = {from = "Y", unit = "mm"}
+z = {from = "Z", unit = "mm"}
+"""
 # Height of the shoulder and lengths of the links [mm]: of the paper's robot as designed, and of the robot
 # with errors that is measured here.
 DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
@@ -110,6 +118,15 @@ def with_column(name, values):
     """A measurement file with one more column, or several in one text."""
     head, *rows = positions_csv(len(values)).splitlines()
     return "\n".join([f"{head},{name}", *(f"{row},{value}" for row, value in zip(rows, values, strict=True))])
+
+
+def ur_kinematics(values):
+    """A UR kinematics file with these six values of each joint."""
+    pairs = list(zip("x y z roll pitch yaw".split(), values, strict=True))
+    lines = ["kinematics:"]
+    for name in ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"):
+        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in pairs)]
+    return "\n".join([*lines, "  hash: calib_1", ""])
 
 
 def assert_same_poses(a, b, atol=1e-12):

@@ -24,7 +24,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from command_line import positions_csv
+from command_line import COLUMN_MAP, positions_csv, ur_kinematics
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from mjcf_robots import BENCH, UR5E
@@ -39,16 +39,7 @@ from dhcal_pin.io import read_measurements, read_robot
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.studies import read_study
 
-MAP = """
-separator = ";"
-[joints]
-order = ["A1", "A2", "A3"]
-unit = "deg"
-[columns]
-x = {from = "X", unit = "mm"}
-y = {from = "Y", unit = "mm"}
-z = {from = "Z", unit = "mm"}
-"""
+MAP = f'separator = ";"\n{COLUMN_MAP}'
 ARM_CFX = """<?xml version="1.0" encoding="utf-8" ?>
 <arm>
   <DhArray name="dhOffset" >
@@ -76,7 +67,6 @@ compliance_rad_per_nm = 1e-6
 [joint.joint_1.coupling]
 joint_2 = 0.001
 """
-NAMES = "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
 STUDY = 'seeds = 2\n[settings]\nrobot = "arm.dh.toml"\nkind = ["pose", "position"]\nposes = 8\n'
 FLEET = '[[job]]\nrobot = "arm.urdf"\ndata = "data.csv"\noutput = "o.urdf"\njson = "j.json"\n'
 RIG = """
@@ -155,15 +145,6 @@ class Case:
 
     def __repr__(self) -> str:
         return f"{self.words[0]} {self.name}"
-
-
-def ur_kinematics() -> str:
-    """Return a UR kinematics file."""
-    lines = ["kinematics:"]
-    for i, name in enumerate(NAMES):
-        values = zip("x y z roll pitch yaw".split(), (0, 0.1 * i, 0.2, 0, 1.5, -3.1e-5), strict=True)
-        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in values)]
-    return "\n".join([*lines, "  hash: calib_1", ""])
 
 
 def _bags() -> dict[str, bytes]:
@@ -285,7 +266,9 @@ def cases() -> list[Case]:
         Case("arm.dh.toml", dh_toml, ("check", "arm.dh.toml")),
         Case("t.dh.csv", dh_csv, ("convert", "t.dh.csv", "o.urdf")),
         Case("t.dh.csv", dh_csv, ("simulate", "t.dh.csv", "-m", "4", "-o", "s.csv")),
-        Case("k.yaml", ur_kinematics().encode(), ("convert", "k.yaml", "o.urdf")),
+        Case(
+            "k.yaml", ur_kinematics((0, 0.1, 0.2, 0, 1.5, -3.1e-5)).encode(), ("convert", "k.yaml", "o.urdf")
+        ),
         Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.urdf")),
         Case("m.xml", UR5E.encode(), ("convert", "m.xml", "o.origins.csv", "--tip", "attachment_site")),
         Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.xml", "--template", "m.xml")),

@@ -9,28 +9,10 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import pytest
-from command_line import CALIBRATE, positions_csv, stderr_of
+from command_line import CALIBRATE, COLUMN_MAP, positions_csv, stderr_of, ur_kinematics
 
-ORIGINS = "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
-COLUMN_MAP = """
-[joints]
-order = ["A1", "A2", "A3"]
-unit = "deg"
-[columns]
-x = {from = "X", unit = "mm"}
-y = {from = "Y", unit = "mm"}
-z = {from = "Z", unit = "mm"}
-"""
 # 310 digits: more than a double can hold.
 HUGE = "9" * 310
-
-
-def ur_kinematics(value: str) -> str:
-    """A UR kinematics file all of whose numbers are one text."""
-    lines = ["kinematics:"]
-    for name in ORIGINS:
-        lines += [f"  {name}:", *(f"    {key}: {value}" for key in "x y z roll pitch yaw".split())]
-    return "\n".join([*lines, ""])
 
 
 @pytest.mark.parametrize(
@@ -51,7 +33,7 @@ def ur_kinematics(value: str) -> str:
     ],
 )
 def test_yaml_values_that_are_no_numbers(assert_refused, value):
-    Path("k.yaml").write_text(ur_kinematics(value))
+    Path("k.yaml").write_text(ur_kinematics([value] * 6))
     words = ["k.yaml: kinematics: shoulder: x: ", "expected a number in m or rad"]
     assert_refused(words, "convert", "k.yaml", "o.urdf")
 
