@@ -8,8 +8,6 @@ of an arm with six joints. Ratios depend less on the machine than times do, but 
 same class of machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

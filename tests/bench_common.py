@@ -1,7 +1,5 @@
 """Robots, measurements and timing that the benchmarks share."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ A UR10 with a payload: without joint errors, with harmonics to order 11 of each 
 64 of each joint (384 in all), and with all families. Inverse kinematics starts 0.05 rad beside the solution.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

@@ -13,8 +13,6 @@ the rest of the series that lie in their predicted 95 % interval, with the frame
 The data lie beside the project: shared/data/ipa_ur10 (MIT licence).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -1,7 +1,5 @@
 """The kernel's own figures: an iteration against LAPACK, the Jacobian against Pinocchio, growth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 from bench_common import Row, clocked, problem, robots, serial

@@ -8,8 +8,6 @@ cross-validated errors; a second one finds it computed. Each plot is drawn into 
 own. `--report` measures how soon the report of 1,500 samples answers in Chromium.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 import tempfile

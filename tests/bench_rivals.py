@@ -3,8 +3,6 @@
 The environments are built once, in a folder under the system's temporary one.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

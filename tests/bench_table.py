@@ -5,8 +5,6 @@ Rivals from PyPI get environments of their own in a folder under the system's te
 CPU time, medians of turns; `--quick` takes fewer turns and smaller cases.
 """
 
-from __future__ import annotations
-
 import os
 
 # Before NumPy is loaded: one thread for everybody.

@@ -1,7 +1,5 @@
 """Simulated set-ups of cameras and boards on robots, which tests calibrate without a first guess."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measurements of a small robot, and helpers for tests of the command line."""
 
-from __future__ import annotations
-
 import json
 import re
 

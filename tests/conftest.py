@@ -1,7 +1,5 @@
 """Fixtures that tests share: the paper's arms and a browser."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

@@ -4,8 +4,6 @@ Run as a script, it tries mutations for some minutes, and appends to a file thei
 all messages: `file_mutations.py SEED MINUTES FILE`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

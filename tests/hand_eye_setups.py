@@ -1,7 +1,5 @@
 """Simulated hand-eye calibrations in which one thing is wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

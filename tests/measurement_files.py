@@ -1,7 +1,5 @@
 """Measurement files for the tests of diagnostics, and a UR10 with errors."""
 
-from __future__ import annotations
-
 import numpy as np
 from robots import nominal_arm
 

@@ -1,7 +1,5 @@
 """Random mutations of the content of a file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

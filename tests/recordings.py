@@ -1,7 +1,5 @@
 """Recordings of a simulated arm that moves from stop to stop, written with rosbags."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rig files, a camera and a board, and joint positions that have the board in view."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dhcal_pin import se3

@@ -1,7 +1,5 @@
 """Robots that tests share: the paper's tables, robots of example-robot-data, random arms."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from importlib import metadata

@@ -8,8 +8,6 @@ of the list is a change for users. Write the new list with
 and describe the change in CHANGELOG.md.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from pathlib import Path

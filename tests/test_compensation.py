@@ -1,7 +1,5 @@
 """Compensation: the true robot, driven with what is returned, lands where it was asked to."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -11,8 +11,6 @@ N lines of the command before it, and one behind `<!-- start of: FILE -->` the f
 may differ, and … stands for any text.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re

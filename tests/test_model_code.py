@@ -1,7 +1,5 @@
 """Models as C and Python code: poses, Jacobians and joint positions are those of the package."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Programs for controllers, read back as the controllers read them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

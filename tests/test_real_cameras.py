@@ -1,7 +1,5 @@
 """Calibrations from images of real robots."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 The measurements are stored beside the project; see their own licences.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """URDF texts written by hand, random mutations of URDFs, and how Pinocchio reads them."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulated set-ups of cameras: they converge without a guess, and errors agree with their predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import camera_setups

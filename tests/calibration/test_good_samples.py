@@ -1,7 +1,5 @@
 """Least trimmed squares: the default fit is that of the good samples, whatever the outliers are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chi-square of hold-out samples of simulated arms, with and without errors that the model lacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm

@@ -1,7 +1,5 @@
 """Verdicts on simulated mistakes and on honest measurements of four arms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

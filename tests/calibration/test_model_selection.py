@@ -1,7 +1,5 @@
 """Model selection: families of joint errors are added only if the measurements support them."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

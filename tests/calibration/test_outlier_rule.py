@@ -1,7 +1,5 @@
 """Outliers are in no figure, no loss hides them, and few samples that cannot show them are not "ok"."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """Predicted errors of the tool: 95 % intervals hold with and without errors that the model lacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import DATA, MAPS, missing, nominal_arm

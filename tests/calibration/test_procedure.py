@@ -1,7 +1,5 @@
 """Calibration procedure: the minimum of the cost, bounds, the scale of robots without length measurements."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm, random_joints, random_table

@@ -1,7 +1,5 @@
 """An arm that keeps the orientation of its tool: the measured point on the tool is hardly determined."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm, with_small_errors

@@ -1,7 +1,5 @@
 """Without a measured length, the verdict states the errors of positions that residuals do not show."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

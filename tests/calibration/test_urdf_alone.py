@@ -1,7 +1,5 @@
 """The written URDF without its sidecar, against Pinocchio, known true arms and real series."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """First poses and intrinsics in closed form are exact for exact images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.distance import pdist

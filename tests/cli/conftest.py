@@ -1,7 +1,5 @@
 """Fixtures that run commands in a folder with a robot and its measurements."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """World joint and tool frame written by the command calibrate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import UR10

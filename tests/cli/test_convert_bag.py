@@ -1,7 +1,5 @@
 """Recordings of ROS as measurement files: the stops give the calibration of the same stops as CSV."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

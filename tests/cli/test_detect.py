@@ -1,7 +1,5 @@
 """Tests of `dhcal detect` and `dhcal board`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

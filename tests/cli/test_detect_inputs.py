@@ -1,7 +1,5 @@
 """`dhcal detect` with joint values from a recording, several boards, and pictures of the corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Command calibrate with a manifest of several robots."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

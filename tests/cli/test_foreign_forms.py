@@ -1,7 +1,5 @@
 """Measurement files as they come: every form of one table gives the same calibration to the last digit."""
 
-from __future__ import annotations
-
 import json
 import re
 from datetime import datetime, timedelta

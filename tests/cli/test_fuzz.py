@@ -1,7 +1,5 @@
 """Mutated URDFs through whole commands: done, or refused in one line with nothing written."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import tempfile

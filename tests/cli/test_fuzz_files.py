@@ -1,7 +1,5 @@
 """Mutated files of all formats through whole commands: done, or refused in one line with nothing written."""
 
-from __future__ import annotations
-
 import pytest
 from file_mutations import CASES, EXAMPLES, WORD, survive
 from hypothesis import HealthCheck, given, settings

@@ -1,7 +1,5 @@
 """Files that broke a command once: one line that helps, exit status 2, and nothing written."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

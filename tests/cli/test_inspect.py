@@ -1,7 +1,5 @@
 """Command inspect: ranges, limits, coverage, bad rows and suspected mistakes without a fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`dhcal plan --iso9283` and `dhcal validate --iso9283`."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

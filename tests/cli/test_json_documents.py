@@ -1,7 +1,5 @@
 """JSON documents of commands that write files, and one vocabulary of their options."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

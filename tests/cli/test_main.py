@@ -1,7 +1,5 @@
 """Parser and exit status of the command `dhcal`."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess

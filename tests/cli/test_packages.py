@@ -1,7 +1,5 @@
 """Robots of example-robot-data and folders with meshes, in the commands that read a robot."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Boards on a sheet of paper, with the measured scale of the printer, and photographs or a video of them."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From image files to a calibrated URDF: rendered images by a camera on the wrist of a wrong arm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Command plan, and the map of the command calibrate."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

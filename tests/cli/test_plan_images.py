@@ -1,7 +1,5 @@
 """Command plan with --rig: poses that are read back and looked at, existing images, and wrong input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Messages about mistakes in rig files and in files of corners: each names the file, and the line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Command calibrate with one robot: JSON, files, hold-out data and warnings."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Default output: one screen of 80 x 24, whatever the robot, the kind, the names and the result."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A servo arm from counts to LeRobot's calibration, ros2_control parameters and URDF."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

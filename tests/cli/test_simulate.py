@@ -1,7 +1,5 @@
 """Command simulate."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

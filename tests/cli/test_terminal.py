@@ -1,7 +1,5 @@
 """Names and labels of files do not control the terminal, and no library prints on it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Command validate."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Command validate with images: the estimates of the calibration count, not the values of an old rig file."""
 
-from __future__ import annotations
-
 import shutil
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Verdict of dhcal calibrate: exit status, files that are written, and reasons."""
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixtures for the tests of diagnostics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

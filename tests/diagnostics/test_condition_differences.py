@@ -1,7 +1,5 @@
 """Differences of calibrations at other conditions, against what was changed in simulated arms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

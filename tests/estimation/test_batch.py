@@ -1,7 +1,5 @@
 """Batches against the solver for single problems, and against the scatter over repetitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm, paper, random_joints, random_table

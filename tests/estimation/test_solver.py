@@ -1,7 +1,5 @@
 """Solvers: loose and continued iterations, dispatch by method, and the step rules for floats and arrays."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Predictions from a sidecar file, against those of the fit and of the parameter covariance."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

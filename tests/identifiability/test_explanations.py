@@ -1,7 +1,5 @@
 """Explanations are compared with theory, exact poses and Pinocchio's axes, and their advice is followed."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Correlation of residuals between configurations, and the design effect."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm

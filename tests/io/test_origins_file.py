@@ -1,7 +1,5 @@
 """Table of joint origins."""
 
-from __future__ import annotations
-
 import csv
 import re
 from dataclasses import replace

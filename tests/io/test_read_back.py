@@ -1,7 +1,5 @@
 """Robots that other programs read back before they are written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joint offsets of Stäubli arms, applied to a nominal robot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import UR10, write

@@ -1,7 +1,5 @@
 """Kinematics in another file of the same robot, between URDF and MJCF, against MuJoCo and Pinocchio."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace

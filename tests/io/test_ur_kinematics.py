@@ -1,7 +1,5 @@
 """Kinematics files of Universal Robots, and DH tables with the factory deltas of a UR arm."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

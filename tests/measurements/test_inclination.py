@@ -3,8 +3,6 @@
 Measurements are simulated with the link poses of Pinocchio, which has kinematics of its own.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import URDF, pinocchio_poses, with_masses, write

@@ -1,7 +1,5 @@
 """Wires with known and unknown anchors, also by files of instrument parameters and sidecars."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Plans that fill the bins of the joints: evenness, what decides then, and what simulated curves confirm."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

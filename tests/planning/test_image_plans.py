@@ -1,7 +1,5 @@
 """Plans of images: views by OpenCV, rows by the solver, displacements by differences, hidden boards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

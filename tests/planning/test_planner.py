@@ -1,7 +1,5 @@
 """Plans against random sets, calibrations of simulated robots, and collision checks by Pinocchio."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

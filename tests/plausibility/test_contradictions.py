@@ -1,7 +1,5 @@
 """Measurements of different kinds that contradict each other, simulated with a joint zero that differs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm

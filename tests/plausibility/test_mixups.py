@@ -1,7 +1,5 @@
 """Diagnosis of mixed-up joints, frames, rows and notations."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Report in a browser: what its scripts do with a mouse and a keyboard, and what is there without them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

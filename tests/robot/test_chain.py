@@ -1,7 +1,5 @@
 """Chain: kinematics against Pinocchio, the DH product and finite differences; refused arguments."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import paper, pinocchio_poses, random_joints, random_table

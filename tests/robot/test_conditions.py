@@ -1,7 +1,5 @@
 """Conditions of samples: from the file to backlash and thermal growth, and back to the sidecar."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Sequence

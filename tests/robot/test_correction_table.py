@@ -1,7 +1,5 @@
 """Tables of joint corrections: a corrected command brings the joint to the value that is meant."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

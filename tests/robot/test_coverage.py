@@ -1,7 +1,5 @@
 """Bins of joint values against plain counting, lattices against the rank of the harmonics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """DH tables from origins, against the chains they came from and against published tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """MJCF against MuJoCo: poses of the files as they are, and after their origins were written."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any

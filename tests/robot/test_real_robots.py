@@ -1,7 +1,5 @@
 """Real arms of example-robot-data: kinematics against other engines, write-back, DH, ranks, calibration."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

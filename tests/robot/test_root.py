@@ -1,7 +1,5 @@
 """Chains that begin at any link: the path leads up to the last common link and down to the tip."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import pinocchio_poses

@@ -1,7 +1,5 @@
 """Gains, harmonics, compliance and coupling: the formula, the sidecar, and what simulations give back."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

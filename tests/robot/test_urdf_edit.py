@@ -1,7 +1,5 @@
 """URDF rewriting against Pinocchio, yourdfpy, lxml and bytes written by hand."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

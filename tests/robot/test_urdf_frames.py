@@ -1,7 +1,5 @@
 """World joint and tool frame in a URDF, as Pinocchio reads them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

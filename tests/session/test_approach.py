@@ -1,7 +1,5 @@
 """Backlash of the joints of files that state no directions of motion, from the order of their samples."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

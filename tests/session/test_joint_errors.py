@@ -1,7 +1,5 @@
 """Sessions of an arm with gear errors and elastic joints: changes are found, and none are invented."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sessions of an elastic arm that takes up a load: the load is named, and no motion of the base."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Checks of calibrated arms, simulated with Pinocchio and NumPy only, against the change that was made."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from functools import cache

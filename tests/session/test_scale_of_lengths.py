@@ -1,7 +1,5 @@
 """A wrong scale of an instrument that measures lengths, or that measures an arm of prismatic joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import nominal_arm, with_small_errors

@@ -1,7 +1,5 @@
 """What happens during a session is found, named and accounted for, and nothing is found in clean sets."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import product

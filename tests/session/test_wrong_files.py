@@ -1,7 +1,5 @@
 """Mistakes in a whole file, with and without an event of the session."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

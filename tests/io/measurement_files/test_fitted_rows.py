@@ -1,7 +1,5 @@
 """Digests of fitted rows."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 
