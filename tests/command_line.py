@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -59,6 +60,11 @@ def positions_csv(count, seed=0, wrong=(), error=1.0):
 def folder_contents(folder):
     """Content of each file of a folder and its subfolders, by name."""
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def rows_of(path):
+    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
+    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
 
 
 def parse_json(text):

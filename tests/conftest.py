@@ -3,7 +3,8 @@
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 # The workers of pytest share the processors, and NumPy reads this when it is loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -18,6 +19,7 @@ from robots import missing, nominal_arm, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
+from dhcal_pin.cli import main
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
@@ -40,6 +42,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Spare the garbage collector the thousands of collected tests, which stay to the end."""
     gc.freeze()
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[Any, str, str]]:
+    """Function that runs a command and returns its exit status, stdout and stderr."""
+
+    def call(*args: object) -> tuple[Any, str, str]:
+        try:
+            status = main.main([str(arg) for arg in args])
+        except SystemExit as stop:
+            status = stop.code
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
 
 
 @pytest.fixture(scope="session")

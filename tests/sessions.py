@@ -14,9 +14,11 @@ import pinocchio as pin
 from robots import ARMS, nominal_arm, robot_file
 from scipy.interpolate import CubicSpline
 
+from dhcal_pin.calibration import Result
 from dhcal_pin.measurements import Measurement, MultiTargetPosition, Pose, Position, Wires
 from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
+from dhcal_pin.session import Session
 
 NOISE, ANGLE_NOISE = 5e-5, 1e-4
 ERRORS = 1e-3, np.deg2rad(0.2)
@@ -232,3 +234,9 @@ def write_csv(path: Path, simulation: Simulation, data: Measurement) -> None:
     """Write positions as a measurement file."""
     header = ",".join([*(f"{name}[rad]" for name in simulation.chain.joint_names), "x[m],y[m],z[m]"])
     np.savetxt(path, np.hstack([data.q, data.positions()]), "%.9f", ",", header=header, comments="")
+
+
+def session_of(fit: Result) -> Session:
+    """Return what was found in a calibration."""
+    assert fit.session is not None
+    return fit.session

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import stderr_of, stdout_of, unfolded
+from command_line import rows_of, stderr_of, stdout_of, unfolded
 from robots import DATA, missing
 
 pytest.importorskip("cv2")
@@ -33,11 +33,6 @@ def photographs(robot_folder):
         missing(f"images at {folder}")
     Path("rig.toml").write_text(RIG.format(columns=5, rows=7))
     return folder
-
-
-def rows_of(path):
-    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
-    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
 
 
 def test_corners_of_photographs_with_joint_values(run, photographs):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import error_of, stderr_of, unfolded
+from command_line import error_of, rows_of, stderr_of, unfolded
 from recordings import Recording, write_bag
 from robots import paper
 
@@ -52,11 +52,6 @@ def render(*names_and_boards):
     images = render_images(CAMERA, views, np.random.default_rng(0))
     for (name, _), image in zip(names_and_boards, images, strict=True):
         cv2.imwrite(f"images/{name}", image)
-
-
-def rows_of(path):
-    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
-    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
 
 
 def detect(*args):
