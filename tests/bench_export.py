@@ -73,11 +73,7 @@ def time_python(what: str, model: ModuleType, q: np.ndarray, start: np.ndarray, 
 
 
 def main() -> int:
-    """Measure and print the times.
-
-    Returns:
-        Exit status: 0.
-    """
+    """Measure and print the times."""
     rng = np.random.default_rng(1)
     compilers = sys.argv[1:] or [name for name in ("gcc", "clang") if shutil.which(name)]
     print(f"{'time per call [us]':44}{'pose':>10} {'Jacobian':>10} {'inverse':>10}")

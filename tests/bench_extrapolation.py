@@ -34,19 +34,13 @@ WIDE = ("wide", "few")
 
 @dataclass(frozen=True)
 class Case:
-    """Judged calibration of one subset.
+    """Judged calibration of one subset."""
 
-    Attributes:
-        kind: Kind of the subset.
-        ratios: Position RMS of the rule over that of the geometry, on the rest and on the other series.
-        coverage: Share of the errors on the rest that lie in their 95 % interval.
-        seconds: Processor time of the calibration.
-    """
-
-    kind: str
+    kind: str  # Kind of the subset
+    # Position RMS of the rule over that of the geometry, on the rest and on the other series.
     ratios: tuple[float, float]
-    coverage: float
-    seconds: float
+    coverage: float  # Share of the errors on the rest that lie in their 95 % interval
+    seconds: float  # Processor time of the calibration
 
 
 def read_series(folder: Path) -> tuple[Chain, dict[str, Measurement]]:

@@ -127,18 +127,12 @@ MAX_POSES_OF_STUDY = 10_000
 
 @dataclass(frozen=True)
 class Case:
-    """File that is mutated, and a command that reads it.
+    """File that is mutated, and a command that reads it."""
 
-    Attributes:
-        name: Name of the file.
-        data: Its content.
-        words: Words of the command.
-        others: Other files that the command reads, beside those that all cases have.
-    """
-
-    name: str
-    data: bytes
-    words: Sequence[str]
+    name: str  # Name of the file
+    data: bytes  # Its content
+    words: Sequence[str]  # Words of the command
+    # Other files that the command reads, beside those that all cases have.
     others: Mapping[str, bytes] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -389,13 +383,7 @@ def _is_long_study(path: str) -> bool:
 
 
 def survive(case: Case, data: bytes, heard: set[str] | None = None) -> None:
-    """Run the command on a mutated file: done, or refused in one line with nothing written.
-
-    Args:
-        case: File and command.
-        data: Content of the file.
-        heard: Receives the messages.
-    """
+    """Run a command on a mutated file: done, or refused in one line, which is added to `heard`."""
     with _folder({**case.others, case.name: data}):
         if case.name == "s.study.toml" and _is_long_study(case.name):
             return

@@ -17,17 +17,7 @@ def frames():
 
 
 def csv_text_of(chain, q, *, joint="rad", length="mm", kind="pose", angle="rad", wrong=None):
-    """Return a file whose header declares some units.
-
-    Args:
-        chain: Nominal robot.
-        q: Joint positions.
-        joint: Declared unit of the joints.
-        length: Declared unit of the positions.
-        kind: "pose" or "position".
-        angle: Declared unit of the rotation vectors.
-        wrong: True units where they differ, by the names of these arguments.
-    """
+    """Return a file whose header declares some units; `wrong` has the true ones where they differ."""
     factor = {"rad": 1.0, "deg": 180 / np.pi, "m": 1.0, "mm": 1e3}
     true = {"joint": joint, "length": length, "angle": angle} | (wrong or {})
     base, tool = frames()

@@ -160,12 +160,7 @@ def exact_values(item):
 
 
 def split_setup(seed, *, is_arm_free):
-    """Simulate one or two cameras and boards.
-
-    Returns:
-        The set-up, errors of the arm, whether each sample is fitted (two thirds of the images), and the
-        parameter sets.
-    """
+    """Simulate one or two cameras and boards; return set-up, errors, fitted samples and parameter sets."""
     rng = np.random.default_rng(1000 + seed)
     chain = list(ARMS.values())[seed % len(ARMS)]()
     errors = select_parameters(chain, "placement,offset")

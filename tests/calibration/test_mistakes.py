@@ -110,19 +110,12 @@ def exchanged(i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
 
 @dataclass(frozen=True)
 class Mistake:
-    """Mistake in measurements.
+    """Mistake in measurements."""
 
-    Attributes:
-        kind: Kind of measurement.
-        apply: Function that makes the mistake.
-        key: Change that undoes it, with the names of the joints as {0}, {1}, …; empty if none does.
-        reason: Words of the reason for the refusal, if no change undoes the mistake.
-    """
-
-    kind: type[Measurement]
-    apply: Callable[[Measurement], Measurement]
-    key: str = ""
-    reason: str = ""
+    kind: type[Measurement]  # Kind of measurement
+    apply: Callable[[Measurement], Measurement]  # Function that makes the mistake
+    key: str = ""  # Change that undoes it, with the names of the joints as {0}, {1}, …; empty if none does
+    reason: str = ""  # Words of the reason for the refusal, if no change undoes the mistake
 
 
 MISTAKES = {

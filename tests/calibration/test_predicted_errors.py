@@ -20,15 +20,9 @@ NOISE = 5e-5
 
 
 def simulated(seed: int, m: int, size: float) -> tuple[Chain, Pose, Pose]:
-    """Simulate a UR10 with geometric errors and a smooth error of the model in position and orientation.
+    """Return a UR10, m measured poses of one with errors, and true poses at further configurations.
 
-    Args:
-        seed: Seed.
-        m: Number of measured configurations.
-        size: Standard deviation of the smooth error per axis [m and rad]; its correlation length is 3 rad.
-
-    Returns:
-        Nominal chain, measured poses, and true poses at further configurations.
+    The errors are geometric ones, and a smooth one of a size [m and rad] with a correlation length of 3 rad.
     """
     rng = np.random.default_rng(seed)
     arm = nominal_arm("ur10")

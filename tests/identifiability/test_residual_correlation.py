@@ -24,14 +24,7 @@ SETS = "minimal,base,tool"
 
 
 def fitted(seed: int, m: int, kind: type[Measurement] = Pose, size: float = 0.0) -> Result:
-    """Calibrate a UR10 with geometric errors, noise of 0.1 mm, and a smooth error of the model.
-
-    Args:
-        seed: Seed.
-        m: Number of configurations.
-        kind: Kind of measurement.
-        size: Standard deviation of the smooth error of positions [m].
-    """
+    """Calibrate a UR10 with geometric errors, noise of 0.1 mm, and a smooth error of a size [m]."""
     rng = np.random.default_rng(seed)
     arm = nominal_arm("ur10")
     errors = select_parameters(arm, SETS)

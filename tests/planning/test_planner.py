@@ -61,9 +61,6 @@ def is_collision_free(chain: Chain, q) -> np.ndarray:
     """Check configurations (m,) for self-collisions, with the geometry that Pinocchio reads from the file.
 
     Neighbouring links and pairs that collide at the neutral configuration are ignored.
-
-    Returns:
-        Whether each configuration is free of self-collisions, shape (m,).
     """
     folders = [str(path) for path in robot_file("").parents]
     shapes = pin.buildGeomFromUrdf(chain.model, chain.urdf.source, pin.GeometryType.COLLISION, None, folders)
@@ -190,9 +187,6 @@ def relative_errors(name: str, kind: str, seeds: int) -> np.ndarray:
 
     The poses are selected by the criteria "robust" and "D" and at random. The robots have gains, harmonics
     and compliance of a tenth of their priors, which the fit does not estimate.
-
-    Returns:
-        Errors of the three selections.
     """
     chain = arm(name)
     space = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
