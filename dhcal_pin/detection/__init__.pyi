@@ -15,7 +15,10 @@ from .printing import black_rectangles as black_rectangles
 from .printing import board_pdf as board_pdf
 from .rendering import ImageQuality as ImageQuality
 from .rendering import render_images as render_images
+from .reprojection import Reprojection as Reprojection
 from .reprojection import camera_with_intrinsics as camera_with_intrinsics
 from .reprojection import reproject_corners as reproject_corners
+from .video import VIDEO_ENDINGS as VIDEO_ENDINGS
 from .video import is_video as is_video
+from .video import read_stills as read_stills
 from .video import save_stills as save_stills

@@ -2,6 +2,7 @@
 
 from .check import Recheck as Recheck
 from .check import recheck as recheck
+from .facts import History as History
 from .facts import Session as Session
 from .facts import histories as histories
 from .refinement import refine_changes as refine_changes
