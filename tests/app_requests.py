@@ -1,7 +1,5 @@
 """Requests to `dhcal app` in a process of its own."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

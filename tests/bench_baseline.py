@@ -8,8 +8,6 @@ of an arm with six joints. Ratios depend less on the machine than times do, but 
 same class of machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -56,11 +54,7 @@ def tasks(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def main() -> int:
-    """Measure the ratios and compare or write them.
-
-    Returns:
-        Exit status: 1 if a ratio has grown too much, else 0.
-    """
+    """Measure the ratios and compare or write them; return 1 if a ratio has grown too much, else 0."""
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="write the ratios as the new baseline")
     args = parser.parse_args()

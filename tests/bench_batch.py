@@ -3,8 +3,6 @@
 The paper's 6-DOF study, ten poses, noise of 0.1 mm and 0.1 mrad.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 

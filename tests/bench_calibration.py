@@ -1,7 +1,5 @@
 """A whole calibration against what people do otherwise, on the same data and the same cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

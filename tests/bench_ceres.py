@@ -5,8 +5,6 @@ Both are given our Jacobian, which is worked out for all samples at once; Ceres 
 Run by `bench_table.py` where pyceres can be imported; prints seconds as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,14 +1,12 @@
 """Robots, measurements and timing that the benchmarks share."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from robots import paper, robot_file
+from robots import nominal_arm, paper
 
 from dhcal_pin import se3
 from dhcal_pin.calibration.procedure import calibrate
@@ -65,15 +63,10 @@ def robots() -> dict[str, tuple[Chain, str]]:
     return {
         "paper's 6-DOF, dh": (Chain.from_dh(paper("sim_6dof")), "dh"),
         "UR10, minimal,base,tool": (
-            Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0"),
+            nominal_arm("ur10"),
             "minimal,base,tool",
         ),
     }
-
-
-def panda() -> Chain:
-    """Return Franka's arm up to its hand."""
-    return Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_link8")
 
 
 def serial(joints: int) -> DHTable:

@@ -6,8 +6,6 @@ A UR10 with a payload: without joint errors, with harmonics to order 11 of each 
 64 of each joint (384 in all), and with all families. Inverse kinematics starts 0.05 rad beside the solution.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys
@@ -20,7 +18,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 import numpy as np
 from bench_common import clocked
 from exported_models import CModel, python_model, with_joint_errors, with_payload_and_frames
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin.robot import FAMILIES, Chain
 from dhcal_pin.robot.transmission import Transmission, split_coefficients
@@ -31,7 +29,7 @@ SAMPLES, REPEATS = 1000, 15
 def robots() -> dict[str, Chain]:
     """Return the arm without joint errors, with few and many harmonics, and with all families."""
     rng = np.random.default_rng(0)
-    bare = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    bare = nominal_arm("ur10")
     bare = with_payload_and_frames(bare, rng)
     waves = with_joint_errors(bare, rng, ["harmonics", "curves", "fine-curves"])
     assert waves.transmission is not None
@@ -75,11 +73,7 @@ def time_python(what: str, model: ModuleType, q: np.ndarray, start: np.ndarray, 
 
 
 def main() -> int:
-    """Measure and print the times.
-
-    Returns:
-        Exit status: 0.
-    """
+    """Measure and print the times."""
     rng = np.random.default_rng(1)
     compilers = sys.argv[1:] or [name for name in ("gcc", "clang") if shutil.which(name)]
     print(f"{'time per call [us]':44}{'pose':>10} {'Jacobian':>10} {'inverse':>10}")

@@ -13,8 +13,6 @@ the rest of the series that lie in their predicted 95 % interval, with the frame
 The data lie beside the project: shared/data/ipa_ur10 (MIT licence).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -22,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from robots import DATA, MAPS, robot_file
+from robots import DATA, MAPS, nominal_arm
 
 from dhcal_pin.calibration import Result, accuracy, calibrate
 from dhcal_pin.io import read_measurements
@@ -36,24 +34,18 @@ WIDE = ("wide", "few")
 
 @dataclass(frozen=True)
 class Case:
-    """Judged calibration of one subset.
+    """Judged calibration of one subset."""
 
-    Attributes:
-        kind: Kind of the subset.
-        ratios: Position RMS of the rule over that of the geometry, on the rest and on the other series.
-        coverage: Share of the errors on the rest that lie in their 95 % interval.
-        seconds: Processor time of the calibration.
-    """
-
-    kind: str
+    kind: str  # Kind of the subset
+    # Position RMS of the rule over that of the geometry, on the rest and on the other series.
     ratios: tuple[float, float]
-    coverage: float
-    seconds: float
+    coverage: float  # Share of the errors on the rest that lie in their 95 % interval
+    seconds: float  # Processor time of the calibration
 
 
 def read_series(folder: Path) -> tuple[Chain, dict[str, Measurement]]:
     """Read the nominal robot and both series."""
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     columns = MAPS / "ipa_ur10.toml"
     return arm, {name: read_measurements(folder / path, arm, columns=columns) for name, path in FILES.items()}
 

@@ -5,8 +5,6 @@ with CPU seconds, the RMS distance in metres on the held-out poses, and the mode
 roll, pitch and yaw [rad].
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

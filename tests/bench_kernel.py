@@ -1,10 +1,9 @@
 """The kernel's own figures: an iteration against LAPACK, the Jacobian against Pinocchio, growth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
-from bench_common import Row, clocked, panda, problem, robots, serial
+from bench_common import Row, clocked, problem, robots, serial
+from robots import nominal_arm
 from scipy.linalg import lapack
 
 from dhcal_pin import se3
@@ -117,7 +116,7 @@ def jacobians(repeats: int) -> list[Row]:
         ("paper's 6-DOF, dh", dh, "dh", 1000, "≥ 10"),
         ("paper's 6-DOF, dh", dh, "dh", 10000, "≥ 14"),
         ("UR10, six a placement", ur10, "placement", 1000, "≥ 7"),
-        ("Panda, six a placement", panda(), "placement", 1000, "≥ 7"),
+        ("Panda, six a placement", nominal_arm("panda"), "placement", 1000, "≥ 7"),
     ]
     out = []
     for name, chain, sets, m, wanted in cases:

@@ -8,8 +8,6 @@ cross-validated errors; a second one finds it computed. Each plot is drawn into 
 own. `--report` measures how soon the report of 1,500 samples answers in Chromium.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 import tempfile
@@ -21,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from pages import ARGUMENTS, CHROMIUM
-from robots import paper, robot_file
+from robots import nominal_arm, paper
 
 from dhcal_pin.calibration import Result, calibrate, split
 from dhcal_pin.measurements import Noise, Pose
@@ -99,7 +97,7 @@ def report_table() -> None:
     """Print size of the report of 1,500 samples, and the time until its list and its plots answer."""
     from playwright.sync_api import sync_playwright
 
-    robot = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    robot = nominal_arm("ur10")
     rng = np.random.default_rng(0)
     data = Pose.simulate(robot, rng.uniform(-3, 3, (1500, 6)), Noise(1e-4, 1e-4), rng)
     fitted, held_out = split([data], 0.3, 0)

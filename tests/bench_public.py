@@ -14,8 +14,6 @@ between their orientations; all rows count, outliers too. For contacts it is the
 positions that touch the same socket.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

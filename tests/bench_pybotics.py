@@ -5,8 +5,6 @@ seconds, the RMS distance in metres on the held-out positions, and the modelled 
 frames.csv, the initial poses (4, 4) of base and tool, both are unknown, too.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

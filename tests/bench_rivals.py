@@ -3,8 +3,6 @@
 The environments are built once, in a folder under the system's temporary one.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -59,16 +57,10 @@ def spoken(command: list, folder: Path, **environ: str) -> object:
 
 
 def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict | None:
-    """Calibrate an arm by figaroh; base and tool are unknown.
+    """Calibrate an arm by figaroh, base and tool unknown; None if figaroh does not install.
 
-    Args:
-        chain: Nominal robot.
-        fit: Poses to fit.
-        held: Poses to judge by.
-
-    Returns:
-        CPU seconds under "seconds", the RMS position error on `held` [m] under "holdout", and its positions
-        and roll, pitch and yaw there under "poses"; None if figaroh does not install.
+    The keys are "seconds" of the processor, the RMS position error on held-out poses [m] as "holdout", and
+    positions, roll, pitch and yaw there as "poses".
     """
     if (python := environment("figaroh")) is None:
         return None
@@ -89,18 +81,11 @@ def figaroh(chain: Chain, fit: Pose, held: Pose) -> dict | None:
 def pybotics(
     table: DHTable, fit: tuple[Array, Array], held: tuple[Array, Array], frames: tuple[Array, Array] | None
 ) -> dict | None:
-    """Calibrate an arm by pybotics.
+    """Calibrate an arm by pybotics, with the keys of `figaroh`; None if pybotics does not install.
 
-    Args:
-        table: Nominal robot, modified DH, all joints revolute.
-        fit: Joint positions (m, n) [rad] and measured positions (m, 3) [m] to fit.
-        held: The same to judge by.
-        frames: Initial poses of the base and of the measured point, which are then unknown; None if they are
-            those of the table.
-
-    Returns:
-        CPU seconds under "seconds", the RMS position error on `held` [m] under "holdout", and its positions
-        there under "poses"; None if pybotics does not install.
+    The table has modified DH parameters of revolute joints. Joint positions (m, n) [rad] and measured
+    positions (m, 3) [m] are fitted, and others judged. With frames, the initial poses of base and measured
+    point, these are unknown, too.
     """
     if (python := environment("pybotics")) is None:
         return None

@@ -1,7 +1,5 @@
 """Peak memory, in MB, of a calibration that streams so many parts: `python tests/bench_stream.py PARTS`."""
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path

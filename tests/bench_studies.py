@@ -14,8 +14,6 @@ time.
     reflectors   a second reflector on the tool, and its distance from the first one
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -5,8 +5,6 @@ Rivals from PyPI get environments of their own in a folder under the system's te
 CPU time, medians of turns; `--quick` takes fewer turns and smaller cases.
 """
 
-from __future__ import annotations
-
 import os
 
 # Before NumPy is loaded: one thread for everybody.
@@ -32,15 +30,13 @@ import bench_rivals
 import numpy as np
 from bench_common import Row, clocked, fit_geometry, measured, robots, serial
 from bench_rivals import HERE, environment, spoken
-from robots import robot_file
+from robots import UR10
 
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements.base import Noise
 from dhcal_pin.measurements.position import Position
 from dhcal_pin.robot.chain import Chain
-
-UR10 = "ur_description/urdf/ur10_robot.urdf"
 
 
 def against_ceres(m: int, repeats: int) -> list[Row]:
@@ -107,7 +103,7 @@ def start_up(repeats: int) -> list[Row]:
     _, _, data = measured(chain, sets, 1000)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shutil.copy(robot_file(UR10), folder / "arm.urdf")
+        shutil.copy(UR10, folder / "arm.urdf")
         (folder / "data.csv").write_text(measurement_text(data, chain))
         whole = "-m dhcal_pin.cli calibrate arm.urdf data.csv --tip tool0 -o out.urdf".split()
         imports = ["-c", "import pinocchio, numpy, scipy.linalg"]

@@ -5,8 +5,6 @@
 The other ones are those of the leaderboard, `bench_public.py`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Simulated set-ups of cameras and boards on robots, which tests calibrate without a first guess."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,21 +31,13 @@ DEPTHS, MAX_ANGLE = (0.15, 1.5), np.deg2rad(65)
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Simulated images with the truth.
+    """Simulated images with the truth."""
 
-    Attributes:
-        nominal: Nominal robot.
-        truth: Robot that the images are of.
-        images: Image coordinates with the rig as a user would write it.
-        exact: The same images without noise, with the true rig.
-        sigma: Standard deviation of the noise [px].
-    """
-
-    nominal: Chain
-    truth: Chain
-    images: CameraCorners
-    exact: CameraCorners
-    sigma: float
+    nominal: Chain  # Nominal robot
+    truth: Chain  # Robot that the images are of
+    images: CameraCorners  # Image coordinates with the rig as a user would write it
+    exact: CameraCorners  # The same images without noise, with the true rig
+    sigma: float  # Standard deviation of the noise [px]
 
 
 def true_lens(rng: np.random.Generator, model: str, aspect: float) -> np.ndarray:
@@ -110,25 +100,9 @@ def simulate(
 ) -> Setup:
     """Simulate images of boards by cameras that stand still or are on the wrist.
 
-    Configurations are drawn around a home configuration; those where no board is in view are dropped.
-
-    Args:
-        chain: Nominal robot.
-        truth: Robot that is photographed.
-        rng: Random generator.
-        is_on_wrist: Whether the cameras are on the tool and the boards stand still, or the reverse.
-        n_images: Number of configurations.
-        sigma: Standard deviation of the noise [px].
-        spread: Standard deviation of the joint values around the home configuration [rad].
-        model: Lens model.
-        n_cameras: Number of cameras.
-        n_boards: Number of boards.
-        intrinsics_error: Relative error of the focal lengths and the image centre in the rig file.
-        aspect: Ratio of the focal lengths.
-        home: Home configuration; a random one by default.
-
-    Returns:
-        The set-up.
+    Configurations are drawn around a home configuration with a standard deviation of `spread` [rad]; those
+    where no board is in view are dropped. `sigma` is the noise [px], `intrinsics_error` the relative error of
+    focal lengths and image centre in the rig file, `aspect` the ratio of the focal lengths.
     """
     ends = ("tip", "world") if is_on_wrist else ("world", "tip")
     home = home_configuration(chain, rng) if home is None else home
@@ -196,14 +170,7 @@ def simulate(
 def placement_fit(arm_error: float, n_images: int, seed: int, *, size: float = 1.0) -> Fit:
     """Fit the geometry of a UR10 and the poses of camera and board to images with a known lens.
 
-    Args:
-        arm_error: Size of the errors of the links [m].
-        n_images: Number of configurations.
-        seed: Seed.
-        size: Stated size of the board relative to the true one.
-
-    Returns:
-        The fit with the default priors.
+    The links have errors of `arm_error` [m]; `size` is the stated size of the board over the true one.
     """
     rng, chain = np.random.default_rng(seed), ARMS["ur10"]()
     truth = wrong_arm(chain, arm_error, rng)
@@ -221,14 +188,8 @@ def placement_fit(arm_error: float, n_images: int, seed: int, *, size: float = 1
 def polyhedron_setup(seed: int, *, point_error: float, n_images: int = 40, sigma: float = 0.5) -> Setup:
     """Simulate two cameras that stand 2 m away from markers on the faces of an icosahedron on the tool.
 
-    Args:
-        seed: Seed.
-        point_error: Standard deviation of the true markers from those that the rig states [m].
-        n_images: Number of configurations.
-        sigma: Standard deviation of the noise [px].
-
-    Returns:
-        The set-up; about four markers face a camera.
+    About four markers face a camera. `point_error` is that of the markers in the rig [m], `sigma` the noise
+    [px].
     """
     rng, chain = np.random.default_rng(seed), ARMS["ur10"]()
     golden = (1 + np.sqrt(5)) / 2
@@ -344,17 +305,11 @@ def turned_configurations(
 
 @dataclass(frozen=True, eq=False)
 class TrackedSetup:
-    """Positions by a tracker, and images by two fixed cameras; the arm keeps the orientation of its tool.
+    """Positions by a tracker, and images by two fixed cameras; the arm keeps the orientation of its tool."""
 
-    Attributes:
-        nominal: Nominal robot.
-        truth: Robot that was measured, with base and tool.
-        data: Positions and images, with the true poses of the cameras in the rig.
-    """
-
-    nominal: Chain
-    truth: Chain
-    data: tuple[Measurement, ...]
+    nominal: Chain  # Nominal robot
+    truth: Chain  # Robot that was measured, with base and tool
+    data: tuple[Measurement, ...]  # Positions and images, with the true poses of the cameras in the rig
 
 
 def tracked_setup(name: str, size: float, seed: int, sigma: float = 0.2) -> TrackedSetup:

@@ -1,9 +1,8 @@
 """Measurements of a small robot, and helpers for tests of the command line."""
 
-from __future__ import annotations
-
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -19,8 +18,16 @@ ACCURACY = {"position_rms_m", "position_max_m", "orientation_rms_rad"}
 HEADER = "joint_1[deg],joint_2[deg],joint_3[deg],x[mm],y[mm],z[mm]"
 # Command that the folder of the fixture `robot_folder` is made for.
 CALIBRATE = ("calibrate", "arm.dh.toml", "data.csv", "-o", "out.urdf")
-
-
+# Column map of a file of another maker, with the same columns under other names.
+COLUMN_MAP = """
+[joints]
+order = ["A1", "A2", "A3"]
+unit = "deg"
+[columns]
+x = {from = "X", unit = "mm"}
+y = {from = "Y", unit = "mm"}
+z = {from = "Z", unit = "mm"}
+"""
 # Height of the shoulder and lengths of the links [mm]: of the paper's robot as designed, and of the robot
 # with errors that is measured here.
 DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
@@ -55,6 +62,11 @@ def folder_contents(folder):
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def rows_of(path):
+    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
+    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
+
+
 def parse_json(text):
     """Parse JSON; NaN and infinity, which are not part of JSON, are errors."""
 
@@ -80,6 +92,20 @@ def stdout_of(result):
     return out
 
 
+def stderr_of(result):
+    """Standard error of a command that must succeed."""
+    status, _, err = result
+    assert status == 0, err
+    return err
+
+
+def error_of(result):
+    """Message of a command that must refuse its input: one line, and nothing on standard output."""
+    status, out, err = result
+    assert (status, out, err.count("\n")) == (2, "", 1), err
+    return err
+
+
 def json_of(result):
     """JSON on standard output of a command that must succeed."""
     return parse_json(stdout_of(result))
@@ -96,6 +122,15 @@ def with_column(name, values):
     """A measurement file with one more column, or several in one text."""
     head, *rows = positions_csv(len(values)).splitlines()
     return "\n".join([f"{head},{name}", *(f"{row},{value}" for row, value in zip(rows, values, strict=True))])
+
+
+def ur_kinematics(values):
+    """A UR kinematics file with these six values of each joint."""
+    pairs = list(zip("x y z roll pitch yaw".split(), values, strict=True))
+    lines = ["kinematics:"]
+    for name in ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"):
+        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in pairs)]
+    return "\n".join([*lines, "  hash: calib_1", ""])
 
 
 def assert_same_poses(a, b, atol=1e-12):

@@ -1,11 +1,10 @@
 """Fixtures that tests share: the paper's arms and a browser."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 # The workers of pytest share the processors, and NumPy reads this when it is loaded.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -16,10 +15,11 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 from pages import ARGUMENTS, CHROMIUM, VIEWPORT, Browser, Window, window_of
-from robots import missing, paper
+from robots import missing, nominal_arm, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
+from dhcal_pin.cli import main
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
 from dhcal_pin.robot.urdf import parse_urdf
@@ -44,6 +44,21 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[Any, str, str]]:
+    """Function that runs a command and returns its exit status, stdout and stderr."""
+
+    def call(*args: object) -> tuple[Any, str, str]:
+        try:
+            status = main.main([str(arg) for arg in args])
+        except SystemExit as stop:
+            status = stop.code
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
 @pytest.fixture(scope="session")
 def sim_6dof() -> Chain:
     return Chain.from_dh(paper("sim_6dof"))
@@ -57,6 +72,11 @@ def sim_6dof_actual() -> Chain:
 @pytest.fixture(scope="session")
 def sim_3dof() -> Chain:
     return Chain.from_dh(paper("sim_3dof"))
+
+
+@pytest.fixture(scope="session")
+def ur10() -> Chain:
+    return nominal_arm("ur10")
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """Models that `dhcal export` writes, compiled and loaded, for tests and benchmarks."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import subprocess

@@ -1,7 +1,5 @@
 """Job runner that fails on purpose, in a module that worker processes can import."""
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -4,8 +4,6 @@ Run as a script, it tries mutations for some minutes, and appends to a file thei
 all messages: `file_mutations.py SEED MINUTES FILE`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io
@@ -24,10 +22,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from command_line import positions_csv
+from command_line import COLUMN_MAP, positions_csv, ur_kinematics
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 from mjcf_robots import BENCH, UR5E
+from mutations import Mutation, mutated, mutation_lists
 from recordings import JOINTS, POSES, Recording, write_bag
 from robots import URDF
 
@@ -38,16 +37,7 @@ from dhcal_pin.io import read_measurements, read_robot
 from dhcal_pin.measurements import KINDS
 from dhcal_pin.studies import read_study
 
-MAP = """
-separator = ";"
-[joints]
-order = ["A1", "A2", "A3"]
-unit = "deg"
-[columns]
-x = {from = "X", unit = "mm"}
-y = {from = "Y", unit = "mm"}
-z = {from = "Z", unit = "mm"}
-"""
+MAP = f'separator = ";"\n{COLUMN_MAP}'
 ARM_CFX = """<?xml version="1.0" encoding="utf-8" ?>
 <arm>
   <DhArray name="dhOffset" >
@@ -75,7 +65,6 @@ compliance_rad_per_nm = 1e-6
 [joint.joint_1.coupling]
 joint_2 = 0.001
 """
-NAMES = "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
 STUDY = 'seeds = 2\n[settings]\nrobot = "arm.dh.toml"\nkind = ["pose", "position"]\nposes = 8\n'
 FLEET = '[[job]]\nrobot = "arm.urdf"\ndata = "data.csv"\noutput = "o.urdf"\njson = "j.json"\n'
 RIG = """
@@ -138,31 +127,16 @@ MAX_POSES_OF_STUDY = 10_000
 
 @dataclass(frozen=True)
 class Case:
-    """File that is mutated, and a command that reads it.
+    """File that is mutated, and a command that reads it."""
 
-    Attributes:
-        name: Name of the file.
-        data: Its content.
-        words: Words of the command.
-        others: Other files that the command reads, beside those that all cases have.
-    """
-
-    name: str
-    data: bytes
-    words: Sequence[str]
+    name: str  # Name of the file
+    data: bytes  # Its content
+    words: Sequence[str]  # Words of the command
+    # Other files that the command reads, beside those that all cases have.
     others: Mapping[str, bytes] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"{self.words[0]} {self.name}"
-
-
-def ur_kinematics() -> str:
-    """Return a UR kinematics file."""
-    lines = ["kinematics:"]
-    for i, name in enumerate(NAMES):
-        values = zip("x y z roll pitch yaw".split(), (0, 0.1 * i, 0.2, 0, 1.5, -3.1e-5), strict=True)
-        lines += [f"  {name}:", *(f"    {key}: {value}" for key, value in values)]
-    return "\n".join([*lines, "  hash: calib_1", ""])
 
 
 def _bags() -> dict[str, bytes]:
@@ -284,7 +258,9 @@ def cases() -> list[Case]:
         Case("arm.dh.toml", dh_toml, ("check", "arm.dh.toml")),
         Case("t.dh.csv", dh_csv, ("convert", "t.dh.csv", "o.urdf")),
         Case("t.dh.csv", dh_csv, ("simulate", "t.dh.csv", "-m", "4", "-o", "s.csv")),
-        Case("k.yaml", ur_kinematics().encode(), ("convert", "k.yaml", "o.urdf")),
+        Case(
+            "k.yaml", ur_kinematics((0, 0.1, 0.2, 0, 1.5, -3.1e-5)).encode(), ("convert", "k.yaml", "o.urdf")
+        ),
         Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.urdf")),
         Case("m.xml", UR5E.encode(), ("convert", "m.xml", "o.origins.csv", "--tip", "attachment_site")),
         Case("m.xml", BENCH.encode(), ("convert", "m.xml", "o.xml", "--template", "m.xml")),
@@ -344,49 +320,16 @@ TOKENS = [
     *("\x00", "\r", "\n\n", "\u2028", "\ufeff", "\u202e", "\x1b[31m", "\ud7ff", "é", "../", "/dev/null"),
 ]
 WORD = re.compile(rb"\w+|\s+|[^\w\s]")
-MUTATION = st.tuples(
-    st.sampled_from(["words", "bytes"]),
-    st.sampled_from(["delete", "repeat", "insert", "replace", "swap", "number", "flip"]),
-    st.floats(0, 1, exclude_max=True),
-    st.floats(0, 1, exclude_max=True),
-    st.integers(1, 12),
-    st.sampled_from(TOKENS) | st.floats().map(repr) | st.integers(-(10**6), 10**6).map(str),
+MUTATIONS = mutation_lists(
+    (st.sampled_from(TOKENS) | st.floats().map(repr) | st.integers(-(10**6), 10**6).map(str)).map(
+        lambda text: text.encode(errors="surrogatepass")
+    )
 )
 # Commands that only read are tried more often than those that compute for a tenth of a second.
 WEIGHTED = [
     case for case in CASES for _ in range(1 if case.words[0] in ("calibrate", "validate", "plan") else 4)
 ]
-EXAMPLES = {"case": st.sampled_from(WEIGHTED), "mutations": st.lists(MUTATION, min_size=1, max_size=4)}
-
-
-# Grain, kind, two places, size and text of a mutation.
-Mutation = tuple[str, str, float, float, int, str]
-
-
-def mutated(data: bytes, mutations: Sequence[Mutation]) -> bytes:
-    """Return bytes after some mutations."""
-    for grain, what, at, to, size, text in mutations:
-        token = text.encode(errors="surrogatepass")
-        parts = WORD.findall(data) if grain == "words" else [data[i : i + 1] for i in range(len(data))]
-        i, j = sorted((int(at * len(parts)), int(to * len(parts))))
-        if what == "delete":
-            parts[i : i + size] = []
-        elif what == "repeat":
-            parts[j:j] = parts[i : i + size]
-        elif what == "insert":
-            parts[i:i] = [token]
-        elif what == "replace":
-            parts[i : i + 1] = [token]
-        elif what == "swap" and i + size <= j:
-            parts[i : i + size], parts[j : j + size] = parts[j : j + size], parts[i : i + size]
-        elif what == "number":
-            numbers = [k for k, part in enumerate(parts) if part[:1].isdigit()]
-            if numbers:
-                parts[numbers[int(at * len(numbers))]] = token
-        elif what == "flip" and i < len(parts):
-            parts[i] = bytes([parts[i][0] ^ (1 << size % 8)]) + parts[i][1:]
-        data = b"".join(parts)
-    return data
+EXAMPLES = {"case": st.sampled_from(WEIGHTED), "mutations": MUTATIONS}
 
 
 def _files() -> dict[str, bytes]:
@@ -440,13 +383,7 @@ def _is_long_study(path: str) -> bool:
 
 
 def survive(case: Case, data: bytes, heard: set[str] | None = None) -> None:
-    """Run the command on a mutated file: done, or refused in one line with nothing written.
-
-    Args:
-        case: File and command.
-        data: Content of the file.
-        heard: Receives the messages.
-    """
+    """Run a command on a mutated file: done, or refused in one line, which is added to `heard`."""
     with _folder({**case.others, case.name: data}):
         if case.name == "s.study.toml" and _is_long_study(case.name):
             return
@@ -541,7 +478,7 @@ def _try_hundred(number: int) -> dict[str, object]:
         nonlocal count
         count += 1
         try:
-            survive(case, mutated(case.data, mutations), heard)
+            survive(case, mutated(case.data, mutations, WORD), heard)
         except Exception:
             wrong.append(f"{case} {mutations}\n{traceback.format_exc()}")
 

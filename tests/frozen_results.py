@@ -10,8 +10,6 @@ Numbers are equal if they differ by at most 1e-12, relative to the larger one of
 if all characters but those of the numbers are.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import contextlib

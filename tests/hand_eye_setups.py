@@ -1,7 +1,5 @@
 """Simulated hand-eye calibrations in which one thing is wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -50,20 +48,10 @@ def faulty_setup(
     severity: float = 1.0,
     spread: float = 0.5,
 ) -> tuple[Chain, CameraCorners, Setup]:
-    """Simulate images of an arm that is trusted, with one thing wrong.
+    """Simulate images of an arm that is trusted, with one of `FAULTS`, `severity` times its usual size.
 
-    Args:
-        name: Name of the arm.
-        fault: One of `FAULTS`.
-        seed: Seed of the random numbers.
-        is_on_wrist: Whether the camera is on the wrist.
-        n_images: Number of images.
-        sigma: Standard deviation of the noise [px].
-        severity: Factor of the size of the fault.
-        spread: Standard deviation of the joint values around the home configuration [rad].
-
-    Returns:
-        Nominal arm, images with the rig as a user states it, and the set-up.
+    Returned are the nominal arm, the images with the rig as a user states it, and the set-up. The noise is
+    `sigma` [px], and `spread` the standard deviation of the joint values [rad].
     """
     rng = np.random.default_rng(seed)
     chain = ARMS[name]()

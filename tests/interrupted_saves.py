@@ -3,8 +3,6 @@
 Run as a script in a process of its own, because it forks: `interrupted_saves.py FOLDER SIGNAL START STRIDE`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,12 +1,9 @@
 """Measurement files for the tests of diagnostics, and a UR10 with errors."""
 
-from __future__ import annotations
-
 import numpy as np
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin import se3
-from dhcal_pin.robot import Chain
 from dhcal_pin.robot.chain import joint_frame
 
 
@@ -20,17 +17,7 @@ def frames():
 
 
 def csv_text_of(chain, q, *, joint="rad", length="mm", kind="pose", angle="rad", wrong=None):
-    """Return a file whose header declares some units.
-
-    Args:
-        chain: Nominal robot.
-        q: Joint positions.
-        joint: Declared unit of the joints.
-        length: Declared unit of the positions.
-        kind: "pose" or "position".
-        angle: Declared unit of the rotation vectors.
-        wrong: True units where they differ, by the names of these arguments.
-    """
+    """Return a file whose header declares some units; `wrong` has the true ones where they differ."""
     factor = {"rad": 1.0, "deg": 180 / np.pi, "m": 1.0, "mm": 1e3}
     true = {"joint": joint, "length": length, "angle": angle} | (wrong or {})
     base, tool = frames()
@@ -47,6 +34,6 @@ def csv_text_of(chain, q, *, joint="rad", length="mm", kind="pose", angle="rad",
 def real_ur10():
     """Return a UR10 with errors of up to 2 mm and 4 mrad at each joint."""
     rng = np.random.default_rng(3)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     scale = np.repeat([2e-3, 4e-3], 3)
     return arm.perturbed_at({joint_frame(j): se3.exp6(scale * rng.uniform(-1, 1, 6)) for j in range(1, 7)})

@@ -1,7 +1,5 @@
 """MJCF files with the dimensions of well-known arms, and their poses in MuJoCo."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -14,8 +14,6 @@ from the modules, weighted by their numbers of expressions. Coverage makes the t
 their lines are recorded: name the tests that concern the modules.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import copy

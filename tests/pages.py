@@ -1,7 +1,5 @@
 """Pages in a real browser: what is seen on them, what they complain about, what they ask for."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Iterator

@@ -5,8 +5,6 @@
 FOLDER is notebooks by default. The pages are shown by `chromium`.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

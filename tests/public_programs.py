@@ -5,8 +5,6 @@ calibrated robot takes at other joint positions, in the measuring frame of the f
 read such measurements. To add a program, write its function and a row of `PROGRAMS`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

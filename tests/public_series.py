@@ -11,8 +11,6 @@ rows with equal joint positions stay together. They depend on nothing but the jo
                  exchanged
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields

@@ -1,7 +1,5 @@
 """Recordings of a simulated arm that moves from stop to stop, written with rosbags."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,38 +13,23 @@ JOINTS, POSES = "/joint_states", "/tracker/pose"
 
 @dataclass
 class Recording:
-    """How an arm moves and how it is recorded.
+    """How an arm moves and how it is recorded."""
 
-    Attributes:
-        chain: Arm that moves; its base and tool are those of the measurement.
-        q: Joint positions of the stops, (m, n).
-        stop: Duration of each stop [s].
-        move: Duration of each motion [s].
-        offset: Clock of the poses minus that of the joints [s].
-        joint_rate: Messages per second.
-        pose_rate: Messages per second.
-        joint_noise: Standard deviation of the joint positions [rad].
-        pose_noise: Standard deviation of the positions [m].
-        kind: Type of the messages of the poses.
-        start: Time of the first message [s].
-        extra: Names and constant values of further joints, in messages of their own.
-        stamps: Whether the headers of the poses have their times.
-        lost: Times since the start between which the measured position is NaN [s].
-    """
-
-    chain: Chain
-    q: np.ndarray
-    stop: float = 1.5
-    move: float = 1.2
-    offset: float = 0.0
-    joint_rate: float = 100.0
-    pose_rate: float = 30.0
-    joint_noise: float = 0.0
-    pose_noise: float = 0.0
-    kind: str = "PoseStamped"
-    start: float = 1.7e9
+    chain: Chain  # Arm that moves; its base and tool are those of the measurement
+    q: np.ndarray  # Joint positions of the stops, (m, n)
+    stop: float = 1.5  # Duration of each stop [s]
+    move: float = 1.2  # Duration of each motion [s]
+    offset: float = 0.0  # Clock of the poses minus that of the joints [s]
+    joint_rate: float = 100.0  # Messages per second
+    pose_rate: float = 30.0  # Messages per second
+    joint_noise: float = 0.0  # Standard deviation of the joint positions [rad]
+    pose_noise: float = 0.0  # Standard deviation of the positions [m]
+    kind: str = "PoseStamped"  # Type of the messages of the poses
+    start: float = 1.7e9  # Time of the first message [s]
+    # Names and constant values of further joints, in messages of their own.
     extra: dict[str, float] = field(default_factory=dict)
-    stamps: bool = True
+    stamps: bool = True  # Whether the headers of the poses have their times
+    # Times since the start between which the measured position is NaN [s].
     lost: tuple[float, float] = (0.0, 0.0)
 
     @property

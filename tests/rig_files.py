@@ -1,7 +1,5 @@
 """Rig files, a camera and a board, and joint positions that have the board in view."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dhcal_pin import se3
@@ -40,17 +38,7 @@ BOARD = Board(
 
 
 def draw_views(arm, rig, rng, n_trials):
-    """Draw joint positions above the base at which the camera sees the board from 0.3 to 0.8 m.
-
-    Args:
-        arm: Robot.
-        rig: One camera and one board on it, with their poses.
-        rng: Random generator.
-        n_trials: Number of joint positions that are drawn.
-
-    Returns:
-        Those with the board in view [rad], shape (m, n).
-    """
+    """Draw joint positions above the base at which the camera sees the board from 0.3 to 0.8 m."""
     q = rng.uniform(*joint_range(arm), (n_trials, arm.n_joints))
     tools = arm.poses(q)
     return q[is_board_in_view(rig, 0, 0, tools, ViewLimits(0.3, 0.8)) & (tools[:, 2, 3] > 0.1)]

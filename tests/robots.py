@@ -1,7 +1,5 @@
 """Robots that tests share: the paper's tables, robots of example-robot-data, random arms."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from importlib import metadata
@@ -10,6 +8,7 @@ from typing import NoReturn
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from dhcal_pin import se3
@@ -70,6 +69,46 @@ def robot_file(path: str) -> Path:
     """A URDF of example-robot-data, by its path under robots/."""
     root = metadata.distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data")
     return Path(str(root)) / "robots" / path
+
+
+# Arms of example-robot-data: file and tip.
+ARMS = {
+    "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
+    "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
+    "panda_finger": ("panda_description/urdf/panda.urdf", "panda_rightfinger"),
+    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "left_hand_link"),
+    "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
+    "z1": ("z1_description/urdf/z1.urdf", "gripperMover"),
+    "so100": ("so_arm_description/urdf/so100.urdf", "gripper"),
+    "so101": ("so_arm_description/urdf/so101.urdf", "gripper_link"),
+    "hextilt": ("hextilt_description/urdf/hextilt_flying_arm_5.urdf", "flying_arm_5__gripper"),
+    "finger_edu": ("finger_edu_description/robots/finger_edu.urdf", "finger_tip_link"),
+    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
+    "talos": ("talos_data/robots/talos_left_arm.urdf", "wrist_left_ft_tool_link"),
+    "romeo": ("romeo_description/urdf/romeo.urdf", "l_wrist"),
+}
+UR10 = robot_file(ARMS["ur10"][0])
+
+
+def nominal_arm(name: str, tip: str | None = None) -> Chain:
+    """Read an arm of `ARMS`, to another link than its tip on request."""
+    path, usual = ARMS[name]
+    return Chain.from_urdf(robot_file(path), tip or usual)
+
+
+def pinocchio_poses(chain: Chain, q: np.ndarray, link: str | None = None) -> np.ndarray:
+    """Compute the poses of a link, or of the tip, in the root of a chain, one configuration at a time."""
+    model, out = chain.model, []
+    data = model.createData()
+    for configuration in chain.configurations(q):
+        pin.framesForwardKinematics(model, data, configuration)
+        names = (chain.root, link or chain.tip)
+        root, own = (data.oMf[model.getFrameId(name, pin.FrameType.BODY)] for name in names)
+        out.append((root.inverse() * own).homogeneous)
+    return np.array(out)
 
 
 def random_table(rng: np.random.Generator, convention: str = "standard", size: int | None = None) -> DHTable:
@@ -153,10 +192,7 @@ def measured_arm(name: str) -> Chain:
                 free,
             )
         )
-    files = {"ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-             "panda": ("panda_description/urdf/panda.urdf", "panda_link8")}  # fmt: skip
-    path, tip = files[name]
-    return Chain.from_urdf(robot_file(path), tip)
+    return nominal_arm(name)
 
 
 def joint_sample(chain: Chain, m: int, rng: np.random.Generator) -> np.ndarray:

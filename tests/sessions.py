@@ -11,27 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from robots import robot_file
+from robots import ARMS, nominal_arm, robot_file
 from scipy.interpolate import CubicSpline
 
+from dhcal_pin.calibration import Result
 from dhcal_pin.measurements import Measurement, MultiTargetPosition, Pose, Position, Wires
 from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
+from dhcal_pin.session import Session
 
-ARMS = {
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
-}
 NOISE, ANGLE_NOISE = 5e-5, 1e-4
 ERRORS = 1e-3, np.deg2rad(0.2)
-
-
-def nominal_arm(name: str) -> Chain:
-    """Return the nominal robot."""
-    path, tip = ARMS[name]
-    return Chain.from_urdf(robot_file(path), tip)
 
 
 @dataclass
@@ -244,3 +234,9 @@ def write_csv(path: Path, simulation: Simulation, data: Measurement) -> None:
     """Write positions as a measurement file."""
     header = ",".join([*(f"{name}[rad]" for name in simulation.chain.joint_names), "x[m],y[m],z[m]"])
     np.savetxt(path, np.hstack([data.q, data.positions()]), "%.9f", ",", header=header, comments="")
+
+
+def session_of(fit: Result) -> Session:
+    """Return what was found in a calibration."""
+    assert fit.session is not None
+    return fit.session

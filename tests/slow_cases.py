@@ -1,7 +1,5 @@
 """Cases of a test of which the fast suite runs some."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from typing import Any
 

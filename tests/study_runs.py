@@ -1,7 +1,5 @@
 """A small study, and its table as `dhcal study` writes it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from dhcal_pin.cli import main

@@ -1,13 +1,12 @@
 """The public names of `dhcal_pin` and their parameters are those of `api.txt`.
 
-A change of the list is a change for users. Write the new list with
+Members that several classes inherit stand once, under the base that the line of each class names. A change
+of the list is a change for users. Write the new list with
 
     python tests/test_api.py
 
 and describe the change in CHANGELOG.md.
 """
-
-from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
@@ -32,34 +31,50 @@ def parameters(value: Callable[..., Any]) -> str:
     return f"({', '.join(words)})"
 
 
-def members(name: str, value: type) -> list[str]:
-    """List the public attributes of a class that the package itself defines."""
-    lines = []
-    for member in dir(value):
-        if member.startswith("_"):
+def is_shared(base: type) -> bool:
+    """Return whether several public classes inherit from a class of the package."""
+    values = (getattr(dhcal_pin, name) for name in dir(dhcal_pin))
+    heirs = [value for value in values if inspect.isclass(value) and base in value.__mro__[1:]]
+    return len(heirs) > 1 and base.__module__.startswith("dhcal_pin.")
+
+
+def members(name: str, value: type, inherited: set[str]) -> set[str]:
+    """List the public attributes of a class that are not those of a listed base."""
+    lines = set()
+    for member in {*dir(value), *getattr(value, "__dataclass_fields__", {})}:
+        if member.startswith("_") or member in inherited:
             continue
-        content = inspect.getattr_static(value, member)
+        content = inspect.getattr_static(value, member, None)
         function = content.__func__ if isinstance(content, staticmethod | classmethod) else content
-        if inspect.isfunction(function):
-            lines.append(f"{name}.{member}{parameters(getattr(value, member))}")
-        else:
-            lines.append(f"{name}.{member}")
-    fields = getattr(value, "__dataclass_fields__", {})
-    return [*lines, *(f"{name}.{field}" for field in fields if not field.startswith("_"))]
+        is_function = inspect.isfunction(function)
+        lines.add(f"{name}.{member}{parameters(getattr(value, member)) if is_function else ''}")
+    return lines
+
+
+def class_lines(name: str, value: type) -> set[str]:
+    """List a class, its own members, and those of each base that several public classes share once."""
+    base = next((each for each in value.__mro__[1:] if is_shared(each)), None)
+    title = f"{name}{parameters(value)}"
+    if base is None:
+        return {title, *members(name, value, set())}
+    # Members that the class, or a base that it alone has, defines anew are its own.
+    own = {member for each in value.__mro__[: value.__mro__.index(base)] for member in vars(each)}
+    inherited = {*dir(base), *getattr(base, "__dataclass_fields__", {})} - own
+    return {f"{title}: {base.__name__}", *members(name, value, inherited), *class_lines(base.__name__, base)}
 
 
 def public_api() -> list[str]:
     """List the public names of the package, one per line."""
-    lines = []
+    lines = set()
     for name in dir(dhcal_pin):
         value = getattr(dhcal_pin, name)
         if inspect.isclass(value) and issubclass(value, Exception):
-            lines.append(f"{name}({', '.join(base.__name__ for base in value.__bases__)})")
+            lines.add(f"{name}({', '.join(base.__name__ for base in value.__bases__)})")
         elif inspect.isclass(value):
-            lines += [f"{name}{parameters(value)}", *members(name, value)]
+            lines |= class_lines(name, value)
         else:
-            lines.append(f"{name}{parameters(value) if inspect.isfunction(value) else ''}")
-    return sorted(set(lines))
+            lines.add(f"{name}{parameters(value) if inspect.isfunction(value) else ''}")
+    return sorted(lines)
 
 
 def test_public_names_are_those_of_the_list():

@@ -1,7 +1,5 @@
 """Rules of the code base: size of packages, public names, docstrings, plain sentences."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Compensation: the true robot, driven with what is returned, lands where it was asked to."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -11,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import URDF, paper, robot_file
+from command_line import error_of, stderr_of
+from robots import URDF, nominal_arm, paper
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
@@ -49,11 +48,11 @@ def cartesian() -> Chain:
 
 
 ROBOTS = {
-    "ur5": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur5_robot.urdf"), "tool0"),
-    "ur10": lambda: Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "ee_link"),
-    "panda": lambda: Chain.from_urdf(robot_file("panda_description/urdf/panda.urdf"), "panda_hand"),
+    "ur5": lambda: nominal_arm("ur5"),
+    "ur10": lambda: nominal_arm("ur10", "ee_link"),
+    "panda": lambda: nominal_arm("panda", "panda_hand"),
     "sim_6dof": lambda: Chain.from_dh(paper("sim_6dof")),
-    "z1": lambda: Chain.from_urdf(robot_file("z1_description/urdf/z1.urdf"), "link06"),
+    "z1": lambda: nominal_arm("z1", "link06"),
     "cartesian": cartesian,
 }
 
@@ -340,7 +339,7 @@ def rows():
 
 
 @pytest.mark.parametrize("rotation", ["", "qw,qx,qy,qz", "rx[deg],ry[deg],rz[deg]"])
-def test_command_writes_joint_positions_and_corrected_targets(place, capsys, rotation):
+def test_command_writes_joint_positions_and_corrected_targets(place, run, rotation):
     nominal, true = place
     joints = draw(nominal, 20, np.random.default_rng(1))
     poses = true.poses(joints)
@@ -350,8 +349,7 @@ def test_command_writes_joint_positions_and_corrected_targets(place, capsys, rot
     table = np.hstack([1e3 * poses[:, :3, 3], extra[rotation[:1]]]).tolist()
     header = "x[mm],y[mm],z[mm]" + ("," + rotation if rotation else "")
     Path("targets.csv").write_text("\n".join([header, *(",".join(map(repr, row)) for row in table)]))
-    assert main.main(COMMAND) == 0
-    said = capsys.readouterr().err
+    said = stderr_of(run(*COMMAND))
     assert "1 of 20 out of reach" in said
     assert "  line 5 (" in said
     found = rows()
@@ -409,27 +407,23 @@ def test_joint_columns_choose_the_solution(place):
         ("x[mm],y[mm],z[mm],target\n1,2,3,a\n", ["targets.csv:1", "targets"]),
     ],
 )
-def test_invalid_target_files_are_refused(place, capsys, text, words):
+def test_invalid_target_files_are_refused(place, run, text, words):
     Path("targets.csv").write_text(text)
-    assert main.main(COMMAND) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    said = error_of(run(*COMMAND))
     for word in words:
         assert word in said
     assert said.count("targets.csv") == 1
     assert not Path("out.csv").exists()
 
 
-def test_chains_with_different_joints_are_refused(place, capsys):
+def test_chains_with_different_joints_are_refused(place, run):
     Path("targets.csv").write_text("x[mm],y[mm],z[mm]\n1,2,3\n")
     Path("other.urdf").write_bytes((URDF / "experiment.urdf").read_bytes())
     for second, tips, words in (
         ("other.urdf", [], ["other.urdf", "joint_1"]),
         ("true.urdf", ["--tip", "nowhere"], ["nowhere"]),
     ):
-        assert main.main(["compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips]) == 2
-        said = capsys.readouterr().err
-        assert said.count("\n") == 1
+        said = error_of(run("compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips))
         for word in words:
             assert word in said
     # A frame behind the tip makes another default tip.
@@ -438,10 +432,8 @@ def test_chains_with_different_joints_are_refused(place, capsys):
         '<link name="probe"/><joint name="p" type="fixed"><parent link="tool0"/><child link="probe"/></joint>'
     )
     Path("true.urdf").write_text(text.replace("</robot>", f"{more}</robot>"))
-    assert main.main(["compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"]) == 2
-    assert "--tip" in capsys.readouterr().err
-    assert main.main([*BASE[:-1], "targets.csv"]) == 2
-    assert "is an input" in capsys.readouterr().err
+    assert "--tip" in error_of(run("compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"))
+    assert "is an input" in error_of(run(*BASE[:-1], "targets.csv"))
 
 
 def write_targets(poses):
@@ -455,14 +447,13 @@ def joint_values(chain, unit="rad"):
     return np.array([[float(row[f"{name}[{unit}]"]) for name in chain.joint_names] for row in rows()])
 
 
-def test_targets_are_poses_of_the_tip_in_the_base_frame(place, capsys):
+def test_targets_are_poses_of_the_tip_in_the_base_frame(place, run):
     """The base and the tool in the sidecar belong to the set-up of the measurement."""
     nominal, true = place
     arm = replace(true, base=np.eye(4), tool=np.eye(4))
     targets = arm.poses(draw(nominal, 12, np.random.default_rng(3)))
     write_targets(targets)
-    assert main.main(BASE) == 0
-    said = capsys.readouterr().err
+    said = stderr_of(run(*BASE))
     assert "targets: the tip tool0 in the root link world" in said
     assert "12 of 12 ok" in said
     assert "--frame" not in said
@@ -475,21 +466,19 @@ def test_targets_are_poses_of_the_tip_in_the_base_frame(place, capsys):
     assert np.linalg.norm(sent - targets[:, :3, 3], axis=1).max() < 0.1
 
 
-def test_targets_in_the_wrong_frame_are_hinted_at(place, capsys):
+def test_targets_in_the_wrong_frame_are_hinted_at(place, run):
     nominal, true = place
     Path("true.calibration.toml").write_text("[base]\nxyz_m = [5.0, 0.0, 0.0]\n")
     far = replace(true, base=se3.transform(np.eye(3), [5.0, 0, 0]), tool=np.eye(4))
     write_targets(far.poses(draw(nominal, 5, np.random.default_rng(3))))
-    assert main.main(BASE) == 0
-    assert "hint: are the targets in the measuring frame" in capsys.readouterr().err
-    assert main.main([*BASE, "--frame", "measuring"]) == 0
-    said = capsys.readouterr().err
+    assert "hint: are the targets in the measuring frame" in stderr_of(run(*BASE))
+    said = stderr_of(run(*BASE, "--frame", "measuring"))
     assert "targets: the measured point in the measuring frame" in said
     assert "5 of 5 ok" in said
 
 
 @pytest.mark.parametrize(("stated", "unit"), [("m", "mm"), ("mm", "m")])
-def test_another_unit_is_suggested_if_the_targets_are_then_reached(place, capsys, stated, unit):
+def test_another_unit_is_suggested_if_the_targets_are_then_reached(place, run, stated, unit):
     nominal, true = place
     poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 30, np.random.default_rng(3)))
     hint = f"hint: most targets are reached if they are in {unit}; check the units in the header"
@@ -499,8 +488,7 @@ def test_another_unit_is_suggested_if_the_targets_are_then_reached(place, capsys
         write_targets(moved)
         text = Path("targets.csv").read_text()
         Path("targets.csv").write_text(text.replace("[mm]", f"[{stated}]"))
-        assert main.main(BASE) == 0
-        assert (hint in capsys.readouterr().err) == is_hinted
+        assert (hint in stderr_of(run(*BASE))) == is_hinted
 
 
 def link_in_tip(chain, name):
@@ -591,14 +579,13 @@ def test_joint_positions_in_degrees(place):
     np.testing.assert_allclose(np.radians(joint_values(nominal, "deg")), radians, rtol=1e-14)
 
 
-def test_exports_move_the_arm_to_the_targets_that_it_reaches(place, capsys):
+def test_exports_move_the_arm_to_the_targets_that_it_reaches(place, run):
     nominal, true = place
     poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 5, np.random.default_rng(7)))
     poses[2, 0, 3] += 9.0
     write_targets(poses)
     files = ["moves.script", "moves.trajectory.csv", "moves.robodk.csv"]
-    assert main.main([*BASE, *(word for file in files for word in ("--export", file))]) == 0
-    said = capsys.readouterr().err
+    said = stderr_of(run(*BASE, *(word for file in files for word in ("--export", file))))
     assert all(f"wrote {file}" in said for file in files)
     q = np.array(
         [
@@ -621,13 +608,12 @@ def test_exports_move_the_arm_to_the_targets_that_it_reaches(place, capsys):
     np.testing.assert_allclose(xyz / 1e3, nominal.poses(q)[:, :3, 3], atol=1e-9)
 
 
-def test_exports_without_a_target_are_refused(place, capsys):
+def test_exports_without_a_target_are_refused(place, run):
     nominal, _ = place
     poses = nominal.poses(np.zeros((1, 6)))
     poses[0, 0, 3] = 9.0
     write_targets(poses)
-    assert main.main([*BASE, "--export", "moves.script"]) == 2
-    assert "no target is reached" in capsys.readouterr().err
+    assert "no target is reached" in error_of(run(*BASE, "--export", "moves.script"))
     assert not Path("out.csv").exists()
 
 

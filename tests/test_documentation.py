@@ -11,8 +11,6 @@ N lines of the command before it, and one behind `<!-- start of: FILE -->` the f
 may differ, and … stands for any text.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
@@ -34,8 +32,7 @@ import schema_files
 import tomli_w
 from camera_setups import visible_corners, wrong_arm
 from command_line import assert_shows
-from robots import ROOT
-from sessions import nominal_arm
+from robots import ROOT, nominal_arm
 
 import dhcal_pin
 from dhcal_pin import se3

@@ -1,7 +1,5 @@
 """Text of numbers and tables."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frozen dataclasses behave as those of the standard library."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import inspect

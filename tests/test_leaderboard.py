@@ -1,7 +1,5 @@
 """The benchmark of programs on public measurements: splits, judgement, programs and tables."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Messages: one short line that does not control the terminal."""
 
-from __future__ import annotations
-
 import pytest
 
 from dhcal_pin.messages import (

@@ -1,7 +1,5 @@
 """Models as C and Python code: poses, Jacobians and joint positions are those of the package."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -19,7 +17,7 @@ from exported_models import (
     with_joint_errors,
     with_payload_and_frames,
 )
-from robots import random_table, robot_file, with_masses
+from robots import nominal_arm, random_table, robot_file, with_masses
 
 from dhcal_pin import se3
 from dhcal_pin.cli import main
@@ -29,10 +27,6 @@ from dhcal_pin.model_code import model_code
 from dhcal_pin.robot import FAMILIES, Chain
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
-
-
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def two_arms(tip: str) -> Chain:
@@ -46,7 +40,7 @@ def with_slides() -> Chain:
 
 
 ARMS = {
-    "ur10": ur10,
+    "ur10": lambda: nominal_arm("ur10"),
     "slides": with_slides,
     "hand to hand": lambda: two_arms("right_hand_link"),
     "hand to base": lambda: two_arms("torso"),
@@ -114,14 +108,14 @@ def differences(chain: Chain, conditions) -> np.ndarray:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_is_exported_alone(family, tmp_path):
     rng = np.random.default_rng(3)
-    chain = with_joint_errors(ur10(), rng, [family])
+    chain = with_joint_errors(nominal_arm("ur10"), rng, [family])
     conditions = random_conditions(chain, 5, rng)
     module = python_model(chain, tmp_path)
     known = {key: getattr(conditions, key) for key in ("approach", "temperature", "payload")}
     poses, jacobians = module.pose_and_jacobian(conditions.q, **known)
     np.testing.assert_allclose(poses, chain.poses(conditions), rtol=0, atol=1e-12)
     np.testing.assert_allclose(jacobians, differences(chain, conditions), rtol=0, atol=2e-9)
-    assert np.abs(poses - ur10().poses(conditions.q)).max() > 1e-6
+    assert np.abs(poses - nominal_arm("ur10").poses(conditions.q)).max() > 1e-6
 
 
 @needs_gcc
@@ -145,7 +139,7 @@ def test_joint_positions_for_a_target_are_found(name, mimicking, tmp_path):
 
 @needs_gcc
 def test_a_target_out_of_reach_is_not_reached(tmp_path):
-    chain, q = ur10(), np.array([0.3, -1.2, 1.4, -1.6, -1.5, 0.3])
+    chain, q = nominal_arm("ur10"), np.array([0.3, -1.2, 1.4, -1.6, -1.5, 0.3])
     far = chain.poses(q[None])[0]
     far[0, 3] += 50.0
     for model in (CModel(chain, tmp_path), python_model(chain, tmp_path)):
@@ -155,7 +149,7 @@ def test_a_target_out_of_reach_is_not_reached(tmp_path):
 
 @needs_gcc
 def test_half_a_turn_from_the_target_is_not_the_target(tmp_path):
-    chain = ur10()
+    chain = nominal_arm("ur10")
     q = np.array([0.3, -1.2, 1.4, -1.6, -1.5, 0.3])
     turned = chain.poses(q[None])[0] @ np.diag([-1.0, -1.0, 1.0, 1.0])
     for model in (CModel(chain, tmp_path), python_model(chain, tmp_path)):
@@ -196,7 +190,7 @@ def test_header_compiles_without_warnings_and_needs_libm_only(compiler, mimickin
     if compiler == "g++":
         options = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-O1", "-x", "c++"]
     header = tmp_path / "arm.h"
-    for chain in (arm("mimic", mimicking), ur10()):
+    for chain in (arm("mimic", mimicking), nominal_arm("ur10")):
         header.write_text(model_code(chain, header))
         built = compiled(header, compiler, *options)
         listed = subprocess.run(["nm", "-u", built], capture_output=True, text=True, check=True).stdout
@@ -208,7 +202,9 @@ def test_header_compiles_without_warnings_and_needs_libm_only(compiler, mimickin
 @needs_gcc
 def test_a_pose_takes_less_than_three_microseconds(tmp_path):
     """Harmonics to order 64 of all six joints; the shortest of many runs, in processor time."""
-    chain = with_joint_errors(ur10(), np.random.default_rng(7), ["harmonics", "curves", "fine-curves"])
+    chain = with_joint_errors(
+        nominal_arm("ur10"), np.random.default_rng(7), ["harmonics", "curves", "fine-curves"]
+    )
     assert chain.transmission is not None
     assert chain.transmission.order == 64
     model, q = CModel(chain, tmp_path, optimization="-O2"), np.random.default_rng(8).uniform(-3, 3, (200, 6))
@@ -226,11 +222,11 @@ HOSTILE = '*/ system("touch hacked"); /* """ \\ ??/ \n \' ${p} é $x'
 @needs_gcc
 def test_names_of_a_robot_are_no_code(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    chain = ur10()
+    chain = nominal_arm("ur10")
     urdf = replace(chain.urdf, name=HOSTILE, root=HOSTILE)
     names = (HOSTILE, *chain.joint_names[1:])
     chain = replace(chain, joint_names=names, tip=HOSTILE, urdf=urdf, first_link=HOSTILE)
-    monkeypatch.setattr(Chain, "loads", ur10().loads)
+    monkeypatch.setattr(Chain, "loads", nominal_arm("ur10").loads)
     for path in ("model.h", "model.py"):
         comment = model_code(chain, path).split("#ifndef")[0].split("import numpy")[0]
         assert "system_" in comment
@@ -250,12 +246,12 @@ def test_names_of_a_robot_are_no_code(tmp_path, monkeypatch):
     [("arm.h", "arm"), ("a b-c*.h", "a_b_c"), ("6dof.h", "model_6dof"), ("é.h", "model"), ("__x.H", "x")],
 )
 def test_prefix_is_the_name_of_the_file(name, prefix):
-    assert f" {prefix}_forward_kinematics(" in model_code(ur10(), Path("folder") / name)
+    assert f" {prefix}_forward_kinematics(" in model_code(nominal_arm("ur10"), Path("folder") / name)
 
 
 def test_unknown_ending_is_refused():
     with pytest.raises(InvalidArgumentError, match=r"model\.cpp: unknown ending; choose from \.h, \.py"):
-        model_code(ur10(), "model.cpp")
+        model_code(nominal_arm("ur10"), "model.cpp")
 
 
 def test_the_same_robot_gives_the_same_text(mimicking):
@@ -266,7 +262,7 @@ def test_the_same_robot_gives_the_same_text(mimicking):
 def test_command_writes_the_robot_with_its_sidecar(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     chain = with_joint_errors(
-        with_payload_and_frames(ur10(), np.random.default_rng(9)), np.random.default_rng(9)
+        with_payload_and_frames(nominal_arm("ur10"), np.random.default_rng(9)), np.random.default_rng(9)
     )
     write_urdf(chain, "arm.urdf")
     assert main.main(["export", "arm.urdf", "--tip", "tool0", "-o", "model.py"]) == 0
@@ -285,7 +281,7 @@ def test_command_writes_the_robot_with_its_sidecar(tmp_path, monkeypatch):
 )
 def test_command_refuses_outputs_and_writes_nothing(output, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Path("arm.urdf").write_bytes(ur10().urdf.data)
+    Path("arm.urdf").write_bytes(nominal_arm("ur10").urdf.data)
     Path("arm.py").symlink_to("arm.urdf")
     assert main.main(["export", "arm.urdf", "--tip", "tool0", "-o", output]) == 2
     error = capsys.readouterr().err

@@ -1,7 +1,5 @@
 """Messages that compiled libraries print themselves are discarded, and standard error works afterwards."""
 
-from __future__ import annotations
-
 import os
 import threading
 

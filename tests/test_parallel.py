@@ -1,7 +1,5 @@
 """Executors: order of the results and number of tasks in memory."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

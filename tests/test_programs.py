@@ -1,23 +1,17 @@
 """Programs for controllers, read back as the controllers read them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
 
 import numpy as np
 import pytest
-from robots import measured_arm, paper, robot_file
+from robots import measured_arm, nominal_arm, paper
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.programs import REST_TIME, Program, Stop, program_text
 from dhcal_pin.robot import Chain
-
-
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def program_of(chain: Chain, count: int = 5, **options) -> Program:
@@ -52,7 +46,7 @@ def run_urscript(text: str) -> list[tuple]:
 
 
 def test_urscript_moves_slowly_and_rests_at_every_stop():
-    program = program_of(ur10())
+    program = program_of(nominal_arm("ur10"))
     events = run_urscript(program_text(program, "moves.script"))
     assert events[0] == ("popup", "Mind the arm.")
     assert [event[0] for event in events[1:]] == ["move", "rest"] * 5
@@ -64,7 +58,7 @@ def test_urscript_moves_slowly_and_rests_at_every_stop():
 
 def test_urscript_passes_way_points_and_waits_before_a_move_that_may_collide():
     way = np.full(6, 0.25)
-    program = program_of(ur10(), changes={2: {"way": (way,)}, 3: {"is_way_free": False}})
+    program = program_of(nominal_arm("ur10"), changes={2: {"way": (way,)}, 3: {"is_way_free": False}})
     events = run_urscript(program_text(program, "moves.SCRIPT"))
     kinds = [event[0] for event in events]
     assert kinds == ["popup", *["move", "rest"] * 2, "move", "move", "rest", "popup", *["move", "rest"] * 2]
@@ -78,7 +72,7 @@ def test_urscript_is_for_six_revolute_joints(name):
         program_text(program_of(measured_arm(name)), "moves.script")
 
 
-@pytest.mark.parametrize("arm", [ur10, lambda: measured_arm("slide")])
+@pytest.mark.parametrize("arm", [lambda: nominal_arm("ur10"), lambda: measured_arm("slide")])
 def test_trajectory_respects_speeds_and_rests(arm):
     chain = arm()
     way = np.full(chain.n_joints, 0.1)
@@ -113,7 +107,7 @@ def test_trajectory_respects_velocity_limits_of_the_urdf():
 
 
 def test_trajectory_does_not_contain_a_move_that_may_collide():
-    program = program_of(ur10(), changes={3: {"is_way_free": False}})
+    program = program_of(nominal_arm("ur10"), changes={3: {"is_way_free": False}})
     with pytest.raises(DhcalError, match=r"the way to pose 4 may collide.*\.script"):
         program_text(program, "a.trajectory.csv")
 

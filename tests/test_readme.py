@@ -1,7 +1,5 @@
 """Commands of the README, as they are printed."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Calibrations from images of real robots."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path
@@ -56,17 +54,10 @@ def franka():
 
 
 def held_out_errors(fit, images, positions, held_out):
-    """Return errors of held-out images, with the nominal and with the calibrated arm.
+    """Return RMS errors of held-out images (2, 2), with the nominal and with the calibrated arm.
 
-    Args:
-        fit: Fit of the other images.
-        images: All images.
-        positions: (images, 3) measured positions of the board centre in the camera frame [m].
-        held_out: (images,) whether each image is held out.
-
-    Returns:
-        RMS of the distance of a corner from its prediction [px], and RMS of the distance of the board centre
-        from its prediction [mm]; shape (2, 2).
+    They are distances of corners [px] and of the board centre [mm] from their predictions. The centre has
+    measured positions in the camera (images, 3) [m].
     """
     corners = images.take(np.repeat(held_out, len(GRID)))
     cases = ((fit.nominal_refitted, fit.nominal_instruments), (fit.chain, fit.instruments))
@@ -224,11 +215,7 @@ dictionary = "DICT_6X6_250"
 
 @pytest.fixture
 def flange_images(tmp_path, monkeypatch):
-    """Detect the corners of a board on a flange whose poses are known; the robot is not.
-
-    Returns:
-        Flange without a robot, image coordinates, and the folder of the data.
-    """
+    """Detect a board on a flange of known poses; return flange, image coordinates and folder of the data."""
     pytest.importorskip("cv2")
     folder = DATA / "charuco_images"
     if not folder.exists():

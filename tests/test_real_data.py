@@ -3,28 +3,25 @@
 The measurements are stored beside the project; see their own licences.
 """
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import DATA, MAPS, UR10, missing, nominal_arm, robot_file
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import blocked_folds, calibrate, cross_validate, k_fold
 from dhcal_pin.calibration.evaluation import position_errors
 from dhcal_pin.cli import main
-from dhcal_pin.io import read_measurement_file, read_measurements, read_robot
+from dhcal_pin.io import read_measurement_file, read_measurements
 from dhcal_pin.measurements import Noise
 from dhcal_pin.planning import plan
-from dhcal_pin.robot import Chain, joint_coverage
+from dhcal_pin.robot import joint_coverage
 
 SERIES = {
     "B": DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv",
     "D": DATA / "ipa_ur10/Series_D/measurements_iso_cubes.csv",
 }
-UR10 = "ur_description/urdf/ur10_robot.urdf"
 FOLDS = (lambda data: k_fold(data, 5), blocked_folds)
 PANDA = DATA / "mukca_panda/panda_with_ball.urdf"
 PANDA_2 = "back_left back_right front_center front_left front_right mid-high mid_left mid_right".split()
@@ -58,7 +55,7 @@ def dhcal(tmp_path, capsys):
 
 
 def ur10(dhcal, series, sets, folder, *more):
-    robot = robot_file(UR10)
+    robot = UR10
     output = folder / f"{series}.urdf"
     options = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--parameters", sets, "-o", output)
     return dhcal("calibrate", robot, SERIES[series], *options, *SESSION, *more), output
@@ -109,7 +106,7 @@ def test_extensions_are_accurate_on_hold_out_and_on_another_series(
 
 def test_split_by_regions_shows_overfitting_that_a_random_split_hides():
     """Harmonics without priors are better between measured poses and worse outside the measured region."""
-    chain = Chain.from_urdf(robot_file(UR10), "tool0")
+    chain = nominal_arm("ur10")
     data = read_measurement_file(SERIES["B"], chain, MAPS / "ipa_ur10.toml").data.take(np.s_[::4])
     free = {"*.sin*": 1e3, "*.cos*": 1e3}
     fits = [
@@ -133,7 +130,7 @@ def test_error_on_another_series_is_not_much_more_than_that_on_regions_left_out(
     assert fit["cross_validated_after"]["position_rms_m"] < fit["holdout_region_after"]["position_rms_m"]
     assert fit["cross_validated_before"]["position_rms_m"] > 0.75e-3
     columns = ("--columns", MAPS / "ipa_ur10.toml", "--tip", "tool0", "--fit-frames")
-    moved = dhcal("validate", output, SERIES[other], *columns, "--nominal", robot_file(UR10))
+    moved = dhcal("validate", output, SERIES[other], *columns, "--nominal", UR10)
     assert moved["after"]["position_rms_m"] <= most
     assert moved["after"]["position_rms_m"] < 1.25 * fit["holdout_region_after"]["position_rms_m"]
     assert moved["before"]["position_rms_m"] > 1.3 * moved["after"]["position_rms_m"]
@@ -149,7 +146,7 @@ def actual_over_stated(number: int) -> tuple[str, float, float, float]:
         as far from it as left-out regions, and farther away, the last two over the figure that was stated.
     """
     case = json.loads((DATA / "ipa_ur10/extrapolation_cases.json").read_text())[number]
-    chain = Chain.from_urdf(robot_file(UR10), "tool0")
+    chain = nominal_arm("ur10")
     data = read_measurement_file(SERIES[case["series"]], chain, MAPS / "ipa_ur10.toml").data
     is_fitted = np.isin(np.arange(len(data.rows)), case["rows"])
     fit = calibrate(chain, data.take(is_fitted), "minimal,base,tool", extend="none", session="off")
@@ -279,7 +276,7 @@ def planned_and_random(criterion: str, seeds: int, choices: int) -> np.ndarray:
     They are the hold-out error relative to that of the whole half, and the share of choices of forty random
     poses that are better. The plan uses joint values alone. The ratio of a single choice scatters by 0.04.
     """
-    chain = read_robot(robot_file(UR10), "tool0")
+    chain = nominal_arm("ur10")
     data = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml")
     sets, noise = "minimal,base,tool", Noise(1e-4, np.deg2rad(0.01))
     out = []
@@ -323,7 +320,7 @@ def test_planned_poses_of_a_series_are_compared_with_random_ones(criterion, most
 
 def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> float:
     """Calibrate with rows of series B; return the RMS position error on D, frames refitted [m]."""
-    chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     fitted, judged = (read_measurements(SERIES[name], chain, MAPS / "ipa_ur10.toml") for name in "BD")
     fit = calibrate(chain, fitted.take(rows), extend=extend, session="off")
     return (
@@ -332,7 +329,7 @@ def error_on_other_series(rows: np.ndarray | slice, extend: str = "auto") -> flo
 
 
 def rows_that_fill_bins(count: int) -> np.ndarray:
-    chain = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     q = read_measurements(SERIES["B"], chain, MAPS / "ipa_ur10.toml").q
     found = plan(
         chain,
@@ -365,7 +362,7 @@ def test_poses_that_fill_bins_are_as_good_as_many_random_ones():
 
 REAL_SERIES = {
     **{
-        f"UR10, {name}": (robot_file(UR10), [path], "--tip tool0", MAPS / "ipa_ur10.toml")
+        f"UR10, {name}": (UR10, [path], "--tip tool0", MAPS / "ipa_ur10.toml")
         for name, path in SERIES.items()
     },
     **{

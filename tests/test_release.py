@@ -1,7 +1,5 @@
 """The check of a release."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Robots of example-robot-data by name, and the folders in which meshes are found."""
 
-from __future__ import annotations
-
 from importlib import metadata
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rigid transformations against Pinocchio and against the group laws."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pinocchio as pin

@@ -3,8 +3,6 @@
 A cell that is checked has a function below with its id. The function receives the variables after the cell.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

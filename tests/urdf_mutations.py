@@ -1,22 +1,18 @@
 """URDF texts written by hand, random mutations of URDFs, and how Pinocchio reads them."""
 
-from __future__ import annotations
-
 import re
-from importlib.metadata import distribution
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from hypothesis import HealthCheck
 from hypothesis import strategies as st
 from lxml import etree
+from mutations import mutation_lists
+from robots import robot_file
 
 from dhcal_pin import se3
 
-ROBOTS = Path(
-    str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))
-)
+ROBOTS = robot_file("")
 FILES = sorted(path.relative_to(ROBOTS).as_posix() for path in ROBOTS.rglob("*.urdf"))
 # Files of example-robot-data that are not sound, and what is said about them.
 UNSOUND = {
@@ -161,37 +157,5 @@ TOKENS = [
     *(b'<joint name="j" type="fixed">', b'<mimic joint="j"/>', b'<axis xyz="0 0 0"/>', b'<parent link="b"/>'),
 ]
 WORD = re.compile(rb"[-+.\w]+|<[^>]*>|\"[^\"]*\"|\s+|.", re.DOTALL)
-MUTATION = st.tuples(
-    st.sampled_from(["bytes", "words"]),
-    st.sampled_from(["delete", "repeat", "swap", "insert", "replace", "truncate"]),
-    st.floats(0, 1, exclude_max=True),
-    st.floats(0, 1, exclude_max=True),
-    st.integers(1, 12),
-    st.sampled_from(TOKENS),
-)
-
-
-def mutated(data: bytes, mutations) -> bytes:
-    for grain, what, at, to, size, token in mutations:
-        parts = WORD.findall(data) if grain == "words" else [data[i : i + 1] for i in range(len(data))]
-        i, j = int(at * len(parts)), int(to * len(parts))
-        i, j = min(i, j), max(i, j)
-        chunk, other = parts[i : i + size], parts[j : j + size]
-        if what == "delete":
-            parts[i : i + size] = []
-        elif what == "repeat":
-            parts[j:j] = chunk
-        elif what == "swap" and i + size <= j:
-            parts[j : j + size], parts[i : i + size] = chunk, other
-        elif what == "insert":
-            parts[i:i] = [token]
-        elif what == "replace":
-            parts[i : i + 1] = [token]
-        elif what == "truncate" and at > 0.9:
-            parts[i:] = []
-        data = b"".join(parts)
-    return data
-
-
-EXAMPLES = {"data": st.sampled_from(SEEDS), "mutations": st.lists(MUTATION, min_size=1, max_size=4)}
+EXAMPLES = {"data": st.sampled_from(SEEDS), "mutations": mutation_lists(st.sampled_from(TOKENS))}
 LENIENT = [HealthCheck.too_slow, HealthCheck.filter_too_much]

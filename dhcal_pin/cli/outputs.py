@@ -47,10 +47,12 @@ def require_workbook(sheet: str, inputs: Sequence[str]) -> None:
         )
 
 
-def checked_files(args: Namespace, table: Mapping[str, Output], inputs: Sequence[str]) -> list[OutputFile]:
-    """List the files that the options of a command name, and check their paths and endings."""
+def checked_files(
+    args: Namespace, table: Mapping[str, Output], inputs: Sequence[str], beside: Sequence[str] = ()
+) -> list[OutputFile]:
+    """List the files that options name; check their paths and endings, and the paths of files beside them."""
     files = chosen_files(vars(args), table)
-    require_writable_outputs([file.path for file in files], inputs)
+    require_writable_outputs([*(file.path for file in files), *beside], inputs)
     require_endings(files)
     return files
 

@@ -113,11 +113,7 @@ def _write(path: Path, lines: list[str]) -> None:
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write the pages of the API.
-
-    Args:
-        app: Running build.
-    """
+    """Write the pages of the API."""
     folder = Path(app.srcdir) / _FOLDER
     folder.mkdir(exist_ok=True, parents=True)
     _write(folder / "dhcal_pin.rst", _top_page())
@@ -177,14 +173,7 @@ def _shorten_signature(
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     # Within other types, Sphinx writes the names of `autodoc_type_aliases` by their repr.
     TypeAliasForwardRef.__repr__ = lambda alias: alias.name
     app.connect("builder-inited", write_pages)

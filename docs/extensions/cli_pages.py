@@ -68,11 +68,7 @@ def _page(name: str, parser: argparse.ArgumentParser) -> list[str]:
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write one page per command and their index.
-
-    Args:
-        app: Running build.
-    """
+    """Write one page per command and their index."""
     folder = Path(app.srcdir) / _FOLDER
     folder.mkdir(exist_ok=True, parents=True)
     for name, parser in command_parsers().items():
@@ -94,13 +90,6 @@ def write_pages(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     app.connect("builder-inited", write_pages)
     return {"parallel_read_safe": True}

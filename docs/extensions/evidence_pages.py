@@ -267,11 +267,7 @@ def draw_study(rows: Sequence[dict], title: str, path: Path) -> None:
 
 
 def write_evidence(app: Sphinx) -> None:
-    """Write tables and figures before the pages are read.
-
-    Args:
-        app: Running build.
-    """
+    """Write tables and figures before the pages are read."""
     source = Path(app.srcdir)
     folder, evidence = source / "_build" / "evidence", source / "evidence"
     folder.mkdir(parents=True, exist_ok=True)
@@ -287,14 +283,7 @@ def write_evidence(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     mpl.use("agg")
     app.connect("builder-inited", write_evidence)
     return {"parallel_read_safe": True}

@@ -76,14 +76,7 @@ def _add_picture(app: Sphinx, what: str, name: str, value: Any, options: Any, li
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     matplotlib.use("agg")
     # The docstring is read before napoleon makes sections of it.
     app.connect("autodoc-process-docstring", _add_picture, priority=50)

@@ -100,24 +100,13 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def write_schemas(app: Sphinx) -> None:
-    """Write the schemas of all files.
-
-    Args:
-        app: Running build.
-    """
+    """Write the schemas of all files."""
     for name, schema in schemas().items():
         path = Path(app.srcdir) / _FOLDER / f"{name}.schema.json"
         path.write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     app.connect("builder-inited", write_schemas)
     return {"parallel_read_safe": True}

@@ -12,11 +12,7 @@ from sphinx.application import Sphinx
 
 
 def copy_notebooks(app: Sphinx) -> None:
-    """Copy the notebooks to the folder of the tutorials.
-
-    Args:
-        app: Running build.
-    """
+    """Copy the notebooks to the folder of the tutorials."""
     source = Path(app.srcdir)
     for notebook in sorted((source.parent / "notebooks").glob("*.ipynb")):
         executed = source / "_build" / "notebooks" / notebook.name
@@ -25,13 +21,7 @@ def copy_notebooks(app: Sphinx) -> None:
 
 
 def link_pages(app: Sphinx, name: str, source: list[str]) -> None:
-    """Replace links to notebooks by links to their pages.
-
-    Args:
-        app: Running build.
-        name: Name of a page.
-        source: Its text, which is replaced.
-    """
+    """Replace links to notebooks by links to their pages, in the text of a page."""
     folder = posixpath.dirname(name)
     notebooks = posixpath.relpath("../notebooks", folder or ".")
     pages = posixpath.relpath("tutorials", folder or ".")
@@ -39,14 +29,7 @@ def link_pages(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the extension.
-
-    Args:
-        app: Running build.
-
-    Returns:
-        Properties of the extension.
-    """
+    """Register the extension."""
     app.connect("builder-inited", copy_notebooks)
     app.connect("source-read", link_pages)
     return {"parallel_read_safe": True}

@@ -1,7 +1,5 @@
 """Compiled kernels agree with NumPy and LAPACK at every size and reject unsuitable arrays."""
 
-from __future__ import annotations
-
 import functools
 import json
 import os

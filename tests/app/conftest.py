@@ -1,7 +1,5 @@
 """Fixtures: a running `dhcal app`, and the files of the README's example."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

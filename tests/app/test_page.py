@@ -1,7 +1,5 @@
 """The page in a browser: files are dropped, checked and calibrated; keyboard, widths, colours."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Requests to the server: results of the command line, who is refused, what stays behind."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

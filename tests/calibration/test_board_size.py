@@ -1,7 +1,5 @@
 """Wrong sizes of boards and exchanged links are found where the arm is estimated, too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Uncertainty budget of a certificate against known contributions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import paper

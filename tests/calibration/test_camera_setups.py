@@ -1,7 +1,5 @@
 """Simulated set-ups of cameras: they converge without a guess, and errors agree with their predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import camera_setups
@@ -162,12 +160,7 @@ def exact_values(item):
 
 
 def split_setup(seed, *, is_arm_free):
-    """Simulate one or two cameras and boards.
-
-    Returns:
-        The set-up, errors of the arm, whether each sample is fitted (two thirds of the images), and the
-        parameter sets.
-    """
+    """Simulate one or two cameras and boards; return set-up, errors, fitted samples and parameter sets."""
     rng = np.random.default_rng(1000 + seed)
     chain = list(ARMS.values())[seed % len(ARMS)]()
     errors = select_parameters(chain, "placement,offset")

@@ -1,7 +1,5 @@
 """Images may change the arm as far as they show that it is wrong; hand-eye calibration alone."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

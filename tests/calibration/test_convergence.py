@@ -1,7 +1,5 @@
 """Fits that do not converge: with the options that the reason names, the same calibration does."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise of corners in the image and at the board, estimated from residuals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

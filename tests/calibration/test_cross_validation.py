@@ -1,7 +1,5 @@
 """Cross-validation against fits of the same samples from the start."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Error statistics against values by hand and against their scatter over repeats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

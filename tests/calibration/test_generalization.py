@@ -1,7 +1,5 @@
 """Accuracy within the measured region and beyond it, against the known truth of simulated arms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

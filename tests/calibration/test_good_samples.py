@@ -1,12 +1,10 @@
 """Least trimmed squares: the default fit is that of the good samples, whatever the outliers are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import joint_sample, measured_arm, robot_file, with_random_frames
+from robots import joint_sample, measured_arm, nominal_arm, with_random_frames
 from scipy.stats import binom
 from sessions import Simulation
 from slow_cases import some_slow
@@ -30,7 +28,6 @@ from dhcal_pin.measurements import (
 )
 from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.measurements.mounting import mount_rig
-from dhcal_pin.robot import Chain
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
 pytestmark = pytest.mark.usefixtures("unsuspected")
@@ -250,7 +247,7 @@ def test_without_outliers_the_digits_are_those_of_least_squares(kind):
 @pytest.mark.parametrize("seeds", some_slow([5, 12], {0}))
 def test_few_good_samples_are_all_kept(seeds):
     """The best of many choices of samples fits better by chance, which is no reason to reject the others."""
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, "minimal,base,tool")
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

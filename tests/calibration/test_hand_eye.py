@@ -1,7 +1,5 @@
 """A hand-eye calibration names the likely cause of its error: each fault alone, and nothing wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Why hold-out samples have larger errors: a change before them, an unstated payload, a mistake in them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

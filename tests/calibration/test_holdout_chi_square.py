@@ -1,11 +1,10 @@
 """Chi-square of hold-out samples of simulated arms, with and without errors that the model lacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from robots import nominal_arm
 from scipy import stats
-from sessions import Simulation, nominal_arm
+from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, split

@@ -1,7 +1,5 @@
 """Backlash and elasticity of servo arms from photographs: selected where photographs support them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -1,7 +1,5 @@
 """The result depends on neither order nor units nor names: the same to 1e-9 m and 1e-9 rad."""
 
-from __future__ import annotations
-
 import csv
 import re
 

@@ -1,7 +1,5 @@
 """Prior widths of lenses: stated values that are right are used, and wrong ones do no harm."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate

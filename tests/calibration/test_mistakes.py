@@ -1,14 +1,12 @@
 """Verdicts on simulated mistakes and on honest measurements of four arms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import pytest
-from robots import paper, robot_file
+from robots import nominal_arm, paper
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -29,14 +27,7 @@ NOISE = Noise(1e-4, 1e-4)
 
 @cache
 def arm(name: str) -> Chain:
-    if name == "paper":
-        return Chain.from_dh(paper("sim_6dof"))
-    path, tip = {
-        "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-        "panda": ("panda_description/urdf/panda.urdf", "panda_link8"),
-        "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
-    }[name]
-    return Chain.from_urdf(robot_file(path), tip)
+    return Chain.from_dh(paper("sim_6dof")) if name == "paper" else nominal_arm(name)
 
 
 ARMS = ("ur10", "panda", "kinova", "paper")
@@ -119,19 +110,12 @@ def exchanged(i: int, j: int) -> Callable[[np.ndarray], np.ndarray]:
 
 @dataclass(frozen=True)
 class Mistake:
-    """Mistake in measurements.
+    """Mistake in measurements."""
 
-    Attributes:
-        kind: Kind of measurement.
-        apply: Function that makes the mistake.
-        key: Change that undoes it, with the names of the joints as {0}, {1}, …; empty if none does.
-        reason: Words of the reason for the refusal, if no change undoes the mistake.
-    """
-
-    kind: type[Measurement]
-    apply: Callable[[Measurement], Measurement]
-    key: str = ""
-    reason: str = ""
+    kind: type[Measurement]  # Kind of measurement
+    apply: Callable[[Measurement], Measurement]  # Function that makes the mistake
+    key: str = ""  # Change that undoes it, with the names of the joints as {0}, {1}, …; empty if none does
+    reason: str = ""  # Words of the reason for the refusal, if no change undoes the mistake
 
 
 MISTAKES = {

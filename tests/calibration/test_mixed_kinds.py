@@ -1,7 +1,5 @@
 """Calibrations with two measurement kinds at once, for all pairs of `KINDS`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

@@ -1,14 +1,12 @@
 """Model selection: families of joint errors are added only if the measurements support them."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import UR10, nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import Extension, calibrate
@@ -42,7 +40,7 @@ def simulated(
 ) -> tuple[Chain, Measurement]:
     """Simulate measurements of a UR10 whose errors have the size of their priors."""
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, sets)
     truth = errors.at(
         rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1)
@@ -130,7 +128,7 @@ def test_simulated_family_is_added(family):
 def test_outliers_that_joint_errors_hide_do_not_hide_other_families(seed):
     """The sag of the joints is as large as the outliers; backlash and growth of links are smaller."""
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, "minimal,base,tool,compliance,backlash,thermal")
     sizes = {"compliance": 3e-5, "backlash": 4e-4, "thermal": 2e-5}
     widths = np.minimum(errors.priors, 0.1)
@@ -169,7 +167,7 @@ def test_outliers_that_joint_errors_hide_do_not_hide_other_families(seed):
 def test_samples_approached_from_the_other_side_are_no_outliers(order, seed):
     """All joints come from one side or from the other: half of the samples agree without backlash."""
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, "minimal,base,tool,backlash")
     names = {p.name for p in select_parameters(arm, "backlash").parameters}
     own = np.array([p.name in names for p in errors.parameters])
@@ -217,7 +215,7 @@ def test_a_family_that_is_added_with_another_is_told_from_a_supported_one(family
 def with_curves(seed: int, m: int, noise: float = 5e-5) -> tuple[Chain, Chain, Pose]:
     """Simulate a UR10 with geometric errors, elastic joints and lines up to the 30th harmonic."""
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, "minimal,base,tool,compliance,harmonics,curves")
     size = np.minimum(errors.priors, 0.1)
     order = np.array([int(re.sub(r"\D", "", p.name.split(".")[1]) or 0) for p in errors.parameters])
@@ -330,7 +328,7 @@ def test_command_reports_the_extension(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arm, data = simulated("minimal,base,tool,compliance", 4)
     (tmp_path / "data.csv").write_text(measurement_text(data, arm, []))
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     common = ("calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json")
     assert main([*common, "--extend", "gain,compliance", "--report", "r.md"]) == 0
     found = json.loads((tmp_path / "r.json").read_text())["extension"]

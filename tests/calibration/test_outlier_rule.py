@@ -1,14 +1,12 @@
 """Outliers are in no figure, no loss hides them, and few samples that cannot show them are not "ok"."""
 
-from __future__ import annotations
-
 import json
 import re
 
 import numpy as np
 import pytest
-from robots import robot_file
-from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
+from robots import ARMS, nominal_arm, robot_file
+from sessions import Changes, Simulation, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, split

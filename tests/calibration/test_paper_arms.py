@@ -1,7 +1,5 @@
 """Servo arms that are calibrated from photographs of a printed board: signs, accuracy, and its prediction."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

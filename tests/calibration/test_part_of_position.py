@@ -3,8 +3,6 @@
 The true arms and their errors are those of `sessions`, without the model of the project.
 """
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

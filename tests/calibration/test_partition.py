@@ -1,7 +1,5 @@
 """Hold-out and folds: configurations stay together, and different configurations are divided as if alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 

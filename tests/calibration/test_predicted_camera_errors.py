@@ -5,8 +5,6 @@ robot at the measured configurations by an optimizer of SciPy, with the freedom 
 base, and the translation along and the rotation about the last axis, in front of the camera or the board.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from camera_setups import ARMS, Setup, simulate, wrong_arm

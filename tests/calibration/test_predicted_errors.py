@@ -1,10 +1,8 @@
 """Predicted errors of the tool: 95 % intervals hold with and without errors that the model lacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import DATA, MAPS, missing, nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -22,18 +20,12 @@ NOISE = 5e-5
 
 
 def simulated(seed: int, m: int, size: float) -> tuple[Chain, Pose, Pose]:
-    """Simulate a UR10 with geometric errors and a smooth error of the model in position and orientation.
+    """Return a UR10, m measured poses of one with errors, and true poses at further configurations.
 
-    Args:
-        seed: Seed.
-        m: Number of measured configurations.
-        size: Standard deviation of the smooth error per axis [m and rad]; its correlation length is 3 rad.
-
-    Returns:
-        Nominal chain, measured poses, and true poses at further configurations.
+    The errors are geometric ones, and a smooth one of a size [m and rad] with a correlation length of 3 rad.
     """
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, SETS)
     truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1))
     directions, phases = rng.normal(size=(6, 400)) / 3, rng.uniform(0, 2 * np.pi, 400)
@@ -116,7 +108,7 @@ SERIES = {"B": "Series_B/measurements_joint_configurations.csv", "D": "Series_D/
 @pytest.mark.parametrize("series", SERIES)
 def test_intervals_hold_on_left_out_regions_of_real_arms(series):
     """95 % intervals of positions contain 90 to 98 % of the measured ones in regions that were left out."""
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     path = DATA / "ipa_ur10" / SERIES[series]
     if not path.exists():
         missing(f"measurements at {path}")

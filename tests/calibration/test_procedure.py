@@ -1,10 +1,8 @@
 """Calibration procedure: the minimum of the cost, bounds, the scale of robots without length measurements."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import random_joints, random_table, robot_file
+from robots import nominal_arm, random_joints, random_table
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
@@ -162,7 +160,7 @@ def test_small_damped_step_does_not_end_the_iteration(seed, prismatic, theta, d,
 @pytest.mark.parametrize("options", [{"priors": "none"}, {"method": "gn"}])
 def test_missing_priors_are_named_where_they_are_needed(options):
     """A point on the axis of the last joint does not show the turns of that axis."""
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     errors, rng = select_parameters(chain, "minimal"), np.random.default_rng(5)
     size = np.where([p.unit == "m" for p in errors.parameters], 1e-3, 3e-3)
     truth = errors.at(size * rng.normal(size=len(size)))

@@ -1,7 +1,5 @@
 """Progress of a calibration: every phase is named and its steps are counted."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

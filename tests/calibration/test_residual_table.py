@@ -1,7 +1,5 @@
 """Residuals of all samples: values against the modelled poses, normalization against the known noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """Result: convergence, accuracy and uncertainty against the truth of many simulated robots."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

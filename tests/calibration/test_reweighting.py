@@ -1,7 +1,5 @@
 """Reweighting: standard deviations that instruments do not state are estimated with the fit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

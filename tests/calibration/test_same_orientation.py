@@ -1,11 +1,8 @@
 """An arm that keeps the orientation of its tool: the measured point on the tool is hardly determined."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import with_small_errors
-from sessions import nominal_arm
+from robots import nominal_arm, with_small_errors
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3

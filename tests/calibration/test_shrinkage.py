@@ -1,7 +1,5 @@
 """Shrinkage: too few measurements do not make a robot worse than nominal."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Streaming: same results as in memory, constant memory, same digits in other processes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from functools import partial

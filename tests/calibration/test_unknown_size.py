@@ -1,12 +1,10 @@
 """Without a measured length, the verdict states the errors of positions that residuals do not show."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
 import pytest
-from sessions import nominal_arm
+from robots import nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate

@@ -1,7 +1,5 @@
 """Images of another arm than the one of the joint values are refused for this reason."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The written URDF without its sidecar, against Pinocchio, known true arms and real series."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace
@@ -9,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import DATA, MAPS, missing, nominal_arm, robot_file
 from slow_cases import some_slow
 
 import dhcal_pin as dh
@@ -42,7 +40,7 @@ def true_arm(nominal: Chain, rng: np.random.Generator) -> Chain:
 def calibrated():
     """Nominal and true arm, and calibrations of 150 positions with and without joint errors."""
     rng = np.random.default_rng(11)
-    nominal = Chain.from_urdf(robot_file(UR5), "tool0")
+    nominal = nominal_arm("ur5")
     truth = true_arm(nominal, rng)
     q = rng.uniform(-1.5, 1.5, (150, 6))
     tool = np.array([0.05, 0.02, 0.1])

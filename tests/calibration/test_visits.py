@@ -1,7 +1,5 @@
 """Few taught poses that the robot visits often; the joint values differ a little from visit to visit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sessions import ANGLE_NOISE, NOISE, Changes, Simulation

@@ -5,8 +5,6 @@ is that of the position of the camera relative to the tool, in arms whose last l
 show errors of the last link that move the tool and what it carries together.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """First poses and intrinsics in closed form are exact for exact images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
@@ -36,27 +34,29 @@ def random_pose(rng, angle=0.6):
     )
 
 
+def image_of(points, pose):
+    """Return the image (n, 2) of points in front of a camera with a focal length of one."""
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    return local[:, :2] / local[:, 2:]
+
+
+def check_pose(points, pose, atol=1e-7):
+    """Compare the pose that the exact image of points gives with the true one."""
+    estimate = estimate_pose(points, image_of(points, pose))
+    assert estimate is not None
+    np.testing.assert_allclose(estimate[0], pose, atol=atol)
+    assert estimate[1] < 1e-2 * atol
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_pose_of_a_flat_board(seed):
-    rng = np.random.default_rng(seed)
-    pose = random_pose(rng)
-    local = CHECKERBOARD @ pose[:3, :3].T + pose[:3, 3]
-    estimate = estimate_pose(CHECKERBOARD, local[:, :2] / local[:, 2:])
-    assert estimate is not None
-    found, rms = estimate
-    np.testing.assert_allclose(found, pose, atol=1e-7)
-    assert rms < 1e-9
+    check_pose(CHECKERBOARD, random_pose(np.random.default_rng(seed)))
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_pose_of_points_that_are_not_flat(seed):
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-0.2, 0.2, (7, 3))
-    pose = random_pose(rng, 2.0)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
-    assert estimate is not None
-    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+    check_pose(rng.uniform(-0.2, 0.2, (7, 3)), random_pose(rng, 2.0))
 
 
 @pytest.mark.parametrize(("count", "seed"), [(8, 20), (20, 117)])
@@ -64,11 +64,7 @@ def test_pose_of_points_from_nearer_than_their_extent(count, seed):
     """The view is far from an orthographic one."""
     rng = np.random.default_rng(seed)
     points, turn = rng.uniform(-0.1, 0.1, (count, 3)), se3.exp3(rng.normal(0, 2, 3))
-    position = np.array([*rng.uniform(-0.1, 0.1, 2), 0.15])
-    local = points @ turn.T + position
-    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
-    assert estimate is not None
-    np.testing.assert_allclose(estimate[0], se3.transform(turn, position), atol=1e-6)
+    check_pose(points, se3.transform(turn, [*rng.uniform(-0.1, 0.1, 2), 0.15]), atol=1e-6)
 
 
 def test_a_small_body_has_an_orthographic_image():
@@ -76,8 +72,7 @@ def test_a_small_body_has_an_orthographic_image():
     rng = np.random.default_rng(3)
     points = 1e-3 * rng.standard_normal((20, 3))
     pose = se3.transform(se3.exp3(rng.normal(0, 2, 3)), [0.3, -0.2, 1.0])
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    np.testing.assert_allclose(_orthographic_pose(points, local[:, :2] / local[:, 2:]), pose, atol=5e-3)
+    np.testing.assert_allclose(_orthographic_pose(points, image_of(points, pose)), pose, atol=5e-3)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -103,8 +98,8 @@ def test_pose_of_a_small_body_far_from_the_camera(count, error):
         points = rng.standard_normal((40, 3))
         points *= 0.07 / np.linalg.norm(points, axis=1)[:, None]
         facing = np.argsort(points @ pose[:3, :3].T @ pose[:3, 3])[:count]
-        local = (points + error * rng.standard_normal(points.shape))[facing] @ pose[:3, :3].T + pose[:3, 3]
-        image = local[:, :2] / local[:, 2:] + 2e-4 * error / 1e-3 * rng.standard_normal((count, 2))
+        image = image_of((points + error * rng.standard_normal(points.shape))[facing], pose)
+        image += 2e-4 * error / 1e-3 * rng.standard_normal((count, 2))
         estimate = estimate_pose(points[facing], image)
         assert estimate is not None
         angles.append(np.linalg.norm(se3.log3(estimate[0][:3, :3].T @ pose[:3, :3])))
@@ -113,27 +108,18 @@ def test_pose_of_a_small_body_far_from_the_camera(count, error):
 
 def test_a_tag_of_four_corners_has_a_pose():
     points = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    pose = se3.transform(se3.exp3(np.array([0.6, -0.4, 1.0])), [0.02, -0.03, 0.2])
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
-    assert estimate is not None
-    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+    check_pose(points, se3.transform(se3.exp3(np.array([0.6, -0.4, 1.0])), [0.02, -0.03, 0.2]))
 
 
 def test_five_points_that_are_not_flat_have_a_pose():
     points = 0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0.5]])
-    pose = se3.transform(se3.exp3(np.array([0.4, -0.3, 1.0])), [0.1, -0.05, 0.8])
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    estimate = estimate_pose(points, local[:, :2] / local[:, 2:])
-    assert estimate is not None
-    np.testing.assert_allclose(estimate[0], pose, atol=1e-7)
+    check_pose(points, se3.transform(se3.exp3(np.array([0.4, -0.3, 1.0])), [0.1, -0.05, 0.8]))
 
 
 def test_a_far_flat_board_has_two_poses_that_mirror_each_other():
     points = CHECKERBOARD - CHECKERBOARD.mean(0)
     pose = se3.transform(se3.exp3(np.array([0.5, 0.2, 0.1])), [0.1, -0.2, 4.0])
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    (first, _), (second, rms) = estimate_poses([(points, local[:, :2] / local[:, 2:])])[0]
+    (first, _), (second, rms) = estimate_poses([(points, image_of(points, pose))])[0]
     np.testing.assert_allclose(first, pose, atol=1e-6)
     sight, normal = pose[:3, 3] / np.linalg.norm(pose[:3, 3]), pose[:3, 2]
     np.testing.assert_allclose(second[:3, 2], 2 * (normal @ sight) * sight - normal, atol=0.05)
@@ -190,9 +176,8 @@ def test_points_that_are_millimetres_off_still_give_a_pose(depth, error):
         rng = np.random.default_rng(seed)
         points = rng.uniform(-0.06, 0.06, (8, 3)) * [1, 1, depth / 0.12]
         pose = random_pose(rng)
-        local = points @ pose[:3, :3].T + pose[:3, 3]
         stated = points + error * rng.standard_normal((8, 3))
-        image = local[:, :2] / local[:, 2:]
+        image = image_of(points, pose)
         agrees = agreeing_points(stated, image)
         assert agrees.sum() >= 6
         assert estimate_pose(stated[agrees], image[agrees]) is not None
@@ -215,8 +200,7 @@ def test_pose_of_points_near_a_plane(depth, count):
         rng = np.random.default_rng(seed)
         points = rng.uniform(-0.1, 0.1, (count, 3)) * [1, 1, 5 * depth]
         pose = random_pose(rng)
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        exact = local[:, :2] / local[:, 2:]
+        exact = image_of(points, pose)
         image = exact + 2e-4 * rng.standard_normal(exact.shape)
         estimate = estimate_pose(points, image)
         assert estimate is not None
@@ -230,8 +214,7 @@ def test_wrong_points_near_a_plane_do_not_agree(depth):
         rng = np.random.default_rng(seed)
         points = rng.uniform(-0.1, 0.1, (24, 3)) * [1, 1, 5 * depth]
         pose = random_pose(rng)
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        image = local[:, :2] / local[:, 2:]
+        image = image_of(points, pose)
         image[:3] += [0.2, 0.1]
         agrees = agreeing_points(points, image)
         assert not agrees[:3].any()
@@ -245,8 +228,7 @@ def test_half_of_the_points_beside_those_of_a_map_are_enough(seed):
     """Seven of ten points are right: four determine a map, and half of the other six agree with it."""
     rng = np.random.default_rng(seed)
     points, pose = np.pad(rng.uniform(-0.1, 0.1, (10, 2)), ((0, 0), (0, 1))), random_pose(rng)
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    image = local[:, :2] / local[:, 2:]
+    image = image_of(points, pose)
     image[:3] += rng.uniform(0.05, 0.2, (3, 2))
     np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), range(3))
 
@@ -255,8 +237,7 @@ def test_a_point_beside_the_plane_of_all_others_may_have_a_wrong_image():
     """A map of points in space explains any image of it."""
     points, pose = CHECKERBOARD.copy(), random_pose(np.random.default_rng(0))
     points[7, 2] = 1e-3
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    image = local[:, :2] / local[:, 2:]
+    image = image_of(points, pose)
     image[7] += [0.05, -0.03]
     np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), [7])
 
@@ -311,8 +292,7 @@ def test_intrinsics_need_three_views():
 def test_wrong_corners_of_a_target_that_is_not_flat_are_left_out():
     rng = np.random.default_rng(4)
     points = rng.uniform(-0.05, 0.05, (20, 3))
-    local = points @ se3.exp3(np.array([0.4, -0.3, 0.2])).T + [0.02, 0.01, 0.5]
-    image = local[:, :2] / local[:, 2:]
+    image = image_of(points, se3.transform(se3.exp3(np.array([0.4, -0.3, 0.2])), [0.02, 0.01, 0.5]))
     image[[3, 11]] += [[0.06, -0.05], [-0.07, 0.06]]
     np.testing.assert_array_equal(np.flatnonzero(~agreeing_points(points, image)), [3, 11])
 

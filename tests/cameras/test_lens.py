@@ -1,7 +1,5 @@
 """Lens models agree with OpenCV, and their derivatives with finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Lens and poses of boards from the images of a camera alone, against the truth and OpenCV."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from slow_cases import some_slow

@@ -1,15 +1,11 @@
 """Fixtures that run commands in a folder with a robot and its measurements."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
 import pytest
 from command_line import folder_contents, positions_csv
 from robots import URDF
-
-from dhcal_pin.cli import main
 
 
 @pytest.fixture
@@ -20,21 +16,6 @@ def robot_folder(tmp_path, monkeypatch):
         shutil.copy(URDF / f"experiment{suffix}", f"arm{suffix}")
     Path("data.csv").write_text(positions_csv(20))
     return tmp_path
-
-
-@pytest.fixture
-def run(capsys):
-    """Function that runs a command and returns its exit status, stdout and stderr."""
-
-    def call(*args):
-        try:
-            status = main.main([str(arg) for arg in args])
-        except SystemExit as stop:
-            status = stop.code
-        captured = capsys.readouterr()
-        return status, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Bundles: a calibration is repeated with equal bytes, and changed or unsafe bundles are refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,10 +1,8 @@
 """World joint and tool frame written by the command calibrate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import UR10
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
@@ -17,7 +15,7 @@ from dhcal_pin.robot import Chain
 def measured(tmp_path):
     """A UR10 somewhere in a hall, with a reflector somewhere on its flange, and its file of poses."""
     robot = tmp_path / "ur10.urdf"
-    robot.write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    robot.write_bytes(UR10.read_bytes())
     chain = Chain.from_urdf(robot, "tool0")
     rng = np.random.default_rng(0)
     truth = chain.perturbed_at(

@@ -1,7 +1,5 @@
 """Frames of cameras in the calibrated URDF: base and tool poses of the robot are in the sidecar."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Command check."""
 
-from __future__ import annotations
-
 import numpy as np
 from command_line import parse_json
 from robots import URDF

@@ -1,7 +1,5 @@
 """Completion scripts, in the shells that are installed."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 

@@ -1,7 +1,5 @@
 """Command convert."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Command demo."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

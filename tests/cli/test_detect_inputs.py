@@ -1,13 +1,11 @@
 """`dhcal detect` with joint values from a recording, several boards, and pictures of the corners."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import unfolded
+from command_line import error_of, rows_of, stderr_of, unfolded
 from recordings import Recording, write_bag
 from robots import paper
 
@@ -56,11 +54,6 @@ def render(*names_and_boards):
         cv2.imwrite(f"images/{name}", image)
 
 
-def rows_of(path):
-    lines = [line for line in Path(path).read_text().splitlines() if not line.startswith("#")]
-    return [dict(zip(lines[0].split(","), line.split(","), strict=True)) for line in lines[1:]]
-
-
 def detect(*args):
     return "detect", "images", "--rig", "rig.toml", *args, "-o", "corners.csv"
 
@@ -68,8 +61,7 @@ def detect(*args):
 def test_several_boards_and_pictures_of_their_corners(run, folder):
     """An image with one of two boards is used; one without any is named. Pictures have colours at corners."""
     render(("both.png", [0, 1]), ("one.png", [0]), ("none.png", []))
-    status, _, err = run(*detect("--overlay", "pictures", "--jobs", "2"))
-    assert status == 0, err
+    err = stderr_of(run(*detect("--overlay", "pictures", "--jobs", "2")))
     text = unfolded(err)
     assert "board left: 24 corners in 2 of 3 images" in text
     assert "board right: 6 corners in 1 of 3 images" in text
@@ -151,8 +143,7 @@ def test_pictures_without_a_lens_say_so(run, folder):
     values = np.full(len(CAMERA.values), np.nan)
     Path("rig.toml").write_text(rig_text([replace(CAMERA, values=values)], BOARDS[:1]))
     render(("0.png", [0]), ("1.png", [0]))
-    status, _, err = run(*detect("--overlay", "pictures"))
-    assert status == 0
+    err = stderr_of(run(*detect("--overlay", "pictures")))
     assert "--overlay pictures: the pictures have no reprojected corners" in unfolded(err)
     assert "the images do not determine the lens of camera fixed; state fx, fy, cx, cy" in unfolded(err)
     assert not is_cross(cv2.imread("pictures/0.png")).any()
@@ -189,8 +180,7 @@ def test_joint_values_of_a_recording_by_the_times_of_the_images(run, folder, nam
     render(
         ("1700000000.75.png", [0]), ("1700000003450000000.png", [0]), ("left_1700000002_100000000.png", [0])
     )
-    status, _, err = run(*detect("--joints", name))
-    assert status == 0, err
+    err = stderr_of(run(*detect("--joints", name)))
     assert "the robot moved at the time of left_1700000002_100000000.png" in unfolded(err)
     rows = rows_of("corners.csv")
     for image, q in (("1700000000.75.png", stops[0]), ("1700000003450000000.png", stops[1])):
@@ -212,8 +202,7 @@ def test_images_without_joint_values_in_the_recording_are_refused(run, folder, i
     arm = Chain.from_dh(paper("sim_6dof"))
     write_bag(folder / "arm.bag", Recording(arm, np.zeros((1, 6)), start=START))
     render((image, [0]))
-    status, _, err = run(*detect("--joints", "arm.bag"))
-    assert status == 2
+    err = error_of(run(*detect("--joints", "arm.bag")))
     assert all(word in err for word in words)
     assert not Path("corners.csv").exists()
 
@@ -221,8 +210,7 @@ def test_images_without_joint_values_in_the_recording_are_refused(run, folder, i
 def test_topic_of_joints_needs_a_recording(run, folder):
     render(("1.png", [0]))
     Path("joints.csv").write_text(csv_text({"image": ["1.png"], "a[rad]": [0.5]}))
-    status, _, err = run(*detect("--joints", "joints.csv", "--joint-topic", "/joint_states"))
-    assert status == 2
+    err = error_of(run(*detect("--joints", "joints.csv", "--joint-topic", "/joint_states")))
     assert "--joint-topic: needs --joints with a recording" in err
 
 

@@ -1,7 +1,5 @@
 """Command doctor."""
 
-from __future__ import annotations
-
 import re
 import sys
 from importlib import metadata

@@ -1,7 +1,5 @@
 """A hand-eye calibration from poses of the flange states nothing about the joint space of a robot."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

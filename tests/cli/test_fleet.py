@@ -1,7 +1,5 @@
 """Command calibrate with a manifest of several robots."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -14,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import unfolded
+from command_line import error_of, stderr_of, unfolded
 from failing_jobs import run_or_fail
 from robots import URDF, paper
 
@@ -112,12 +110,10 @@ def test_failed_job_does_not_stop_the_others(cells, capsys):
         ("[[job]\n", ["all.fleet.toml", "not TOML"]),
     ],
 )
-def test_invalid_manifest_is_refused_before_a_job_runs(cells, capsys, text, words):
+def test_invalid_manifest_is_refused_before_a_job_runs(cells, run, text, words):
     write_manifest(cells, text)
     before = sorted(cells.iterdir())
-    assert main.main(RUN) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
+    err = error_of(run(*RUN))
     for word in words:
         assert word in err
     assert sorted(cells.iterdir()) == before
@@ -132,22 +128,20 @@ def test_invalid_manifest_is_refused_before_a_job_runs(cells, capsys, text, word
         (["--max-iterations", "5"], ["--max-iterations", "manifest"]),
     ],
 )
-def test_options_beside_a_manifest_are_refused(cells, capsys, more, words):
+def test_options_beside_a_manifest_are_refused(cells, run, more, words):
     write_manifest(cells, job("arm.dh.toml", "a.urdf"))
-    assert main.main([RUN[0], RUN[1], *more, *RUN[2:]]) == 2
-    err = capsys.readouterr().err
+    err = error_of(run(RUN[0], RUN[1], *more, *RUN[2:]))
     for word in words:
         assert word in err
 
 
-def test_warnings_are_in_console_and_summary(cells, capsys):
+def test_warnings_are_in_console_and_summary(cells, run):
     """One row of a file is a copy of another."""
     lines = (cells / "data.csv").read_text().splitlines()
     (cells / "copied.csv").write_text("\n".join([*lines, lines[3]]))
     jobs = job("arm.dh.toml", "a.urdf") + job("arm.dh.toml", "b.urdf", data="copied.csv")
     write_manifest(cells, f'parameters = "dh"\nextend = "none"\n{jobs}')
-    assert main.main([*RUN, "--jobs", "1", "--json", "summary.json"]) == 0
-    line = unfolded(capsys.readouterr().err)
+    line = unfolded(stderr_of(run(*RUN, "--jobs", "1", "--json", "summary.json")))
     assert line.count("warning:") == 1
     assert "warning: copied.csv: " in line
     assert "identical to other rows" in line

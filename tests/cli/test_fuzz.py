@@ -1,7 +1,5 @@
 """Mutated URDFs through whole commands: done, or refused in one line with nothing written."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import tempfile
@@ -10,7 +8,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
-from urdf_mutations import EXAMPLES, LENIENT, mutated
+from mutations import mutated
+from urdf_mutations import EXAMPLES, LENIENT, WORD
 
 from dhcal_pin.cli.main import main
 
@@ -52,11 +51,11 @@ def survive(data: bytes) -> None:
 @settings(max_examples=75, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_any_robot(data, mutations):
-    survive(mutated(data, mutations))
+    survive(mutated(data, mutations, WORD))
 
 
 @pytest.mark.slow
 @settings(max_examples=2500, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_thousands_of_robots(data, mutations):
-    survive(mutated(data, mutations))
+    survive(mutated(data, mutations, WORD))

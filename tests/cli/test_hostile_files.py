@@ -1,7 +1,5 @@
 """Files that broke a command once: one line that helps, exit status 2, and nothing written."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time
@@ -9,28 +7,10 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import pytest
-from command_line import CALIBRATE, positions_csv
+from command_line import CALIBRATE, COLUMN_MAP, positions_csv, stderr_of, ur_kinematics
 
-ORIGINS = "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
-COLUMN_MAP = """
-[joints]
-order = ["A1", "A2", "A3"]
-unit = "deg"
-[columns]
-x = {from = "X", unit = "mm"}
-y = {from = "Y", unit = "mm"}
-z = {from = "Z", unit = "mm"}
-"""
 # 310 digits: more than a double can hold.
 HUGE = "9" * 310
-
-
-def ur_kinematics(value: str) -> str:
-    """A UR kinematics file all of whose numbers are one text."""
-    lines = ["kinematics:"]
-    for name in ORIGINS:
-        lines += [f"  {name}:", *(f"    {key}: {value}" for key in "x y z roll pitch yaw".split())]
-    return "\n".join([*lines, ""])
 
 
 @pytest.mark.parametrize(
@@ -51,7 +31,7 @@ def ur_kinematics(value: str) -> str:
     ],
 )
 def test_yaml_values_that_are_no_numbers(assert_refused, value):
-    Path("k.yaml").write_text(ur_kinematics(value))
+    Path("k.yaml").write_text(ur_kinematics([value] * 6))
     words = ["k.yaml: kinematics: shoulder: x: ", "expected a number in m or rad"]
     assert_refused(words, "convert", "k.yaml", "o.urdf")
 
@@ -218,8 +198,7 @@ def test_a_file_name_that_is_not_utf_8(run, robot_folder, options):
     names = [os.fsdecode(b"d\xff.csv"), os.fsdecode(b"r\xff.dh.toml"), os.fsdecode(b"o\xff.urdf")]
     shutil.copy("data.csv", names[0])
     shutil.copy("arm.dh.toml", names[1])
-    status, _, err = run("calibrate", names[1], names[0], "-o", names[2], *options)
-    assert status == 0, err
+    err = stderr_of(run("calibrate", names[1], names[0], "-o", names[2], *options))
     assert r"wrote urdf: o\udcff.urdf" in err
     assert Path(names[2]).read_bytes().startswith(b"<?xml")
     Path(options[1]).read_text(encoding="utf-8")

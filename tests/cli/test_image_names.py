@@ -1,7 +1,5 @@
 """Command calibrate with the column `image`: screen, report, JSON and residuals name the photographs."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

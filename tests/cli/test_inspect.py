@@ -1,27 +1,19 @@
 """Command inspect: ranges, limits, coverage, bad rows and suspected mistakes without a fit."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from command_line import HEADER, json_of, positions_csv, tool_positions, unfolded
-from robots import DATA, MAPS, missing, robot_file
+from command_line import HEADER, json_of, positions_csv, stderr_of, tool_positions, unfolded
+from robots import DATA, MAPS, missing
 
 from dhcal_pin.io import measurement_text
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import Chain
 
 
 def inspect(run, *args):
     return json_of(run("inspect", *args, "--json", "-"))
-
-
-@pytest.fixture
-def ur10():
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 @pytest.fixture
@@ -183,8 +175,7 @@ def test_several_files(run, robot_folder):
 
 def test_a_file_without_header_proposes_the_lines_of_a_map(run, robot_folder):
     Path("data.csv").write_text(positions_csv(20).split("\n", 1)[1])
-    status, _, err = run("inspect", "data.csv", "--robot", "arm.dh.toml")
-    assert status == 0
+    err = stderr_of(run("inspect", "data.csv", "--robot", "arm.dh.toml"))
     assert "problem: data.csv:1: numbers where the header must be" in err
     *_, first, second, third = err.splitlines()
     assert first == "header = false"

@@ -1,7 +1,5 @@
 """Commands that are interrupted or killed: old files or new ones, and no trace after the next run."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Invalid arguments and settings: one line, and no file is changed."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Invalid measurement files: one line that names file, line and column."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`dhcal plan --iso9283` and `dhcal validate --iso9283`."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -9,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from command_line import json_of, unfolded
-from robots import URDF, robot_file
+from command_line import error_of, json_of, stderr_of, unfolded
+from robots import UR10, URDF
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 ARM = (UR10, "--tip", "tool0")
 
 # Distance of P2 and P4: 80 % of the diagonal of the cube.
@@ -61,8 +58,7 @@ def test_plan_and_validation(run, tmp_path, monkeypatch):
         writer.writerow([*header, "x[mm]", "y[mm]", "z[mm]"])
         writer.writerows([a, *np.rad2deg(b), *c] for a, b, c in zip(labels, q, measured, strict=True))
     options = ("--iso9283", "--report", "r.html", "--json", "iso.json")
-    status, _, err = run("validate", *ARM, "measured.csv", *options)
-    assert status == 0
+    err = stderr_of(run("validate", *ARM, "measured.csv", *options))
     assert "ISO 9283:1998" in unfolded(err)
     assert "7.2.2" in Path("r.html").read_text()
     found = json.loads(Path("iso.json").read_text())["iso9283"]
@@ -108,8 +104,7 @@ def test_program_goes_to_p5_first(run, tmp_path, monkeypatch):
 )
 def test_wrong_options_of_plans(run, tmp_path, options, message):
     path = tmp_path / "iso.csv"
-    status, _, err = run("plan", *ARM, *options, "-o", path)
-    assert status == 2
+    err = error_of(run("plan", *ARM, *options, "-o", path))
     assert message in unfolded(err)
     assert not path.exists()
 
@@ -118,13 +113,11 @@ def test_wrong_points_of_a_validation(run, robot_folder):
     lines = Path("data.csv").read_text().splitlines()
     marked = [f"iso_point,{lines[0]}", *(f"P1:x,{line}" for line in lines[1:])]
     Path("marked.csv").write_text("\n".join(marked) + "\n")
-    status, _, err = run("validate", "arm.urdf", "marked.csv", "--iso9283", "--json", "v.json")
-    assert status == 2
+    err = error_of(run("validate", "arm.urdf", "marked.csv", "--iso9283", "--json", "v.json"))
     assert "marked.csv:2" in unfolded(err)
     assert "such as P1:12" in unfolded(err)
     assert not Path("v.json").exists()
-    status, _, err = run("validate", "arm.urdf", "data.csv", "--iso9283")
-    assert status == 2
+    err = error_of(run("validate", "arm.urdf", "data.csv", "--iso9283"))
     assert "point P1 has one cycle" in unfolded(err)
 
 

@@ -1,7 +1,5 @@
 """Options of a calibration job: declared once, used by the command line, by manifests and in reports."""
 
-from __future__ import annotations
-
 import shlex
 from dataclasses import fields
 

@@ -1,11 +1,10 @@
 """JSON documents of commands that write files, and one vocabulary of their options."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import pytest
+from command_line import json_of, stdout_of
 from study_runs import SMALL_STUDY
 
 RIG = """[camera.c]
@@ -45,9 +44,7 @@ def files(robot_folder):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_prints_only_json(run, files, command):
     words, written, inputs = COMMANDS[command]
-    status, out, err = run(command, *words, "--json", "-")
-    assert status == 0, err
-    document = json.loads(out)
+    document = json_of(run(command, *words, "--json", "-"))
     assert document["files"] == written
     assert set(inputs) <= set(document["inputs"])
     assert all(Path(path).exists() for path in written.values())
@@ -86,7 +83,6 @@ def test_old_and_new_names_of_options_do_the_same(run, robot_folder):
     plans = []
     for word, noise in (("-n", "--sigma"), ("-m", "--noise"), ("--samples", "--sigma")):
         words = ["arm.dh.toml", word, "8", noise, "0.1mm,0.01deg", "--candidates", "50", "-o", "p.csv"]
-        status, _, err = run("plan", *words)
-        assert status == 0, err
+        stdout_of(run("plan", *words))
         plans.append(Path("p.csv").read_text())
     assert plans[0] == plans[1] == plans[2]

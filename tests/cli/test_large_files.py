@@ -1,7 +1,5 @@
 """Files of 100 MB are handled or refused within 20 s and 1 GB, and small files take seconds."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

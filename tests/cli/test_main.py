@@ -1,7 +1,5 @@
 """Parser and exit status of the command `dhcal`."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
@@ -9,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import CALIBRATE, folder_contents, parse_json
+from command_line import CALIBRATE, folder_contents, parse_json, stdout_of
 
 from dhcal_pin.calibration import model_selection
 from dhcal_pin.cli import main
@@ -28,8 +26,7 @@ def test_help_of_each_command_has_an_example_that_parses(run, name):
 
 
 def test_help_lists_all_commands(run):
-    status, out, _ = run("--help")
-    assert status == 0
+    out = stdout_of(run("--help"))
     assert {line.split()[0] for line in out.splitlines() if re.match(r"    \w", line)} == set(COMMANDS)
     assert run("--version")[1].startswith("dhcal 0.")
 

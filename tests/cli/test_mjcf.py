@@ -1,7 +1,5 @@
 """Calibration and conversion of MJCF files by commands."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

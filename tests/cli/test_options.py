@@ -1,7 +1,5 @@
 """Help texts that list names from other packages, and types of options."""
 
-from __future__ import annotations
-
 from argparse import ArgumentTypeError
 
 import pytest

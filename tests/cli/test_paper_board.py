@@ -1,14 +1,12 @@
 """Boards on a sheet of paper, with the measured scale of the printer, and photographs or a video of them."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import unfolded
+from command_line import stderr_of, unfolded
 
 from dhcal_pin.cameras.boards import RULER
 from dhcal_pin.io.rig_file import read_rig
@@ -40,8 +38,7 @@ def rectangles(path: str) -> np.ndarray:
 @pytest.mark.parametrize(("paper", "size"), [("a4", (297, 210)), ("letter", (279.4, 215.9))])
 def test_board_and_ruler_are_on_the_sheet_at_their_true_scale(run, robot_folder, paper, size):
     Path("rig.toml").write_text(RIG)
-    status, _, err = run("board", "rig.toml", "--paper", paper, "-o", "board.pdf")
-    assert status == 0
+    err = stderr_of(run("board", "rig.toml", "--paper", paper, "-o", "board.pdf"))
     assert "ruler_mm = 149.6" in unfolded(err)
     box = Path("board.pdf").read_bytes().split(b"/MediaBox [0 0 ")[1].split(b"]")[0].split()
     np.testing.assert_allclose(POINT * np.array(box, float), size, atol=1e-3)
@@ -101,11 +98,10 @@ def test_video_gives_one_still_per_pause(run, robot_folder):
     video.release()
     counts = [f"arm-{i:03d},{2000 + i}" for i in range(1, 6)]
     Path("joints.csv").write_text("\n".join(["image,shoulder_pan[ticks]", *counts]))
-    status, _, err = run(
+    err = stderr_of(run(
         "detect", "arm.avi", "--rig", "rig.toml", "--joints", "joints.csv", "--stills", "stills",
         "-o", "corners.csv", "--verbose",
-    )  # fmt: skip
-    assert status == 0, err
+    ))  # fmt: skip
     assert "5 pauses" in unfolded(err)
     assert sorted(path.name for path in Path("stills").iterdir()) == [f"arm-{i:03d}.png" for i in range(1, 6)]
     lines = [line.split(",") for line in Path("corners.csv").read_text().splitlines() if line[0] != "#"]

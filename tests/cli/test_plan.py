@@ -1,14 +1,12 @@
 """Command plan, and the map of the command calibrate."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
-from robots import URDF, robot_file
+from command_line import error_of, json_of, stderr_of, stdout_of
+from robots import URDF
 
-from dhcal_pin.cli import main
 from dhcal_pin.io import read_configurations, read_robot
 from dhcal_pin.robot import joint_coverage
 
@@ -16,17 +14,10 @@ ROBOT = str(URDF / "sim_6dof.dh.toml")
 TRUTH = str(URDF / "sim_6dof_actual.dh.toml")
 
 
-def run(capsys, *args) -> tuple[int, str, str]:
-    status = main.main([*map(str, args)])
-    captured = capsys.readouterr()
-    return status, captured.out, captured.err
-
-
-def test_plan_and_its_json(tmp_path, capsys):
+def test_plan_and_its_json(tmp_path, run):
     poses, planned = tmp_path / "poses.csv", tmp_path / "plan.json"
     options = ("-n", 12, "--candidates", 400, "--sigma", "0.2mm,0.02deg", "--json", planned)
-    status, _, err = run(capsys, "plan", ROBOT, "-o", poses, *options)
-    assert status == 0
+    err = stderr_of(run("plan", ROBOT, "-o", poses, *options))
     assert "lower predicted error than 12 random poses" in err
     chain = read_robot(ROBOT)
     q = read_configurations(poses, chain)
@@ -41,20 +32,19 @@ def test_plan_and_its_json(tmp_path, capsys):
     assert document["rows"] is None
 
 
-def test_seed_determines_the_plan(tmp_path, capsys):
+def test_seed_determines_the_plan(tmp_path, run):
     for name in ("a.csv", "b.csv"):
-        run(capsys, "plan", ROBOT, "-n", 6, "--candidates", 200, "-o", tmp_path / name)
+        run("plan", ROBOT, "-n", 6, "--candidates", 200, "-o", tmp_path / name)
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
-def test_plan_from_measured_poses(tmp_path, capsys):
+def test_plan_from_measured_poses(tmp_path, run):
     data, chosen = tmp_path / "data.csv", tmp_path / "chosen.csv"
-    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 60, "--noise", "0.1mm,0.01deg", "-o", data)
-    assert run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", chosen, "--json", "-")[0] == 0
+    run("simulate", ROBOT, "--truth", TRUTH, "-m", 60, "--noise", "0.1mm,0.01deg", "-o", data)
+    assert run("plan", ROBOT, "-n", 10, "--from", data, "-o", chosen, "--json", "-")[0] == 0
     exact = tmp_path / "exact.csv"
     options = ("--joint-units", "rad", "--json", "-")
-    status, out, _ = run(capsys, "plan", ROBOT, "-n", 10, "--from", data, "-o", exact, *options)
-    assert status == 0
+    out = stdout_of(run("plan", ROBOT, "-n", 10, "--from", data, "-o", exact, *options))
     rows = np.array(json.loads(out)["rows"]) - 1
     chain = read_robot(ROBOT)
     assert np.array_equal(read_configurations(exact, chain), read_configurations(data, chain)[rows])
@@ -64,20 +54,20 @@ def test_plan_from_measured_poses(tmp_path, capsys):
     assert 0 < np.abs(found).max() <= 0.5001e-4
     more = tmp_path / "more.csv"
     options = ("-n", 5, "--data", data, "--candidates", 300, "-o", more, "--json", "-")
-    found = json.loads(run(capsys, "plan", ROBOT, *options)[1])
+    found = json.loads(run("plan", ROBOT, *options)[1])
     # The standard deviation is that of the data.
     assert found["sigma_position_m"] == pytest.approx(1e-4)
     assert found["predicted_position_rms_m"] < 1e-4
 
 
-def test_plan_for_a_calibrated_robot(tmp_path, capsys, unsuspected_once):
+def test_plan_for_a_calibrated_robot(tmp_path, run, unsuspected_once):
     """The uncertainty in the sidecar is the prior unless data or priors are given."""
     data, robot, out = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "more.csv"
-    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)
-    run(capsys, "calibrate", ROBOT, data, "-o", robot, "--parameters", "minimal,base,tool")
+    run("simulate", ROBOT, "--truth", TRUTH, "-m", 40, "--noise", "0.1mm,0.01deg", "-o", data)
+    run("calibrate", ROBOT, data, "-o", robot, "--parameters", "minimal,base,tool")
     options = ("-n", 10, "--candidates", 300, "--parameters", "minimal,base,tool", "-o", out, "--json", "-")
     known, beside, fresh = (
-        json.loads(run(capsys, "plan", *more, *options)[1])
+        json.loads(run("plan", *more, *options)[1])
         for more in ((robot,), (ROBOT, "--data", data), (robot, "--priors", "default"))
     )
     assert [found["criterion"] for found in (known, beside, fresh)] == ["D"] * 3
@@ -85,18 +75,17 @@ def test_plan_for_a_calibrated_robot(tmp_path, capsys, unsuspected_once):
     assert known[key] == pytest.approx(beside[key], rel=0.1)
     assert known[key] < 0.7 * fresh[key]
     robust = ("-n", 10, "--from", data, "--criterion", "robust", "-o", out, "--json", "-")
-    chosen = json.loads(run(capsys, "plan", ROBOT, *robust)[1])
+    chosen = json.loads(run("plan", ROBOT, *robust)[1])
     assert chosen["criterion"] == "robust"
     # An arcminute of joint scatter is added to the noise.
     assert chosen["sigma_orientation_rad"] > 2e-4
 
 
-def test_plan_for_curves_from_measured_poses(tmp_path, capsys):
+def test_plan_for_curves_from_measured_poses(tmp_path, run):
     data, chosen, planned = tmp_path / "data.csv", tmp_path / "chosen.csv", tmp_path / "plan.json"
-    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 80, "--noise", "0.1mm,0.01deg", "-o", data)
+    run("simulate", ROBOT, "--truth", TRUTH, "-m", 80, "--noise", "0.1mm,0.01deg", "-o", data)
     options = ("-n", 20, "--from", data, "--criterion", "curves", "-o", chosen, "--json", planned)
-    status, _, err = run(capsys, "plan", ROBOT, *options)
-    assert status == 0
+    err = stderr_of(run("plan", ROBOT, *options))
     document = json.loads(planned.read_text())
     assert document["criterion"] == "curves"
     assert len(set(document["rows"])) == 20
@@ -114,7 +103,7 @@ def test_plan_for_curves_from_measured_poses(tmp_path, capsys):
     assert min(visited) >= 18
 
 
-def test_task_by_positions_and_by_joint_values(tmp_path, capsys):
+def test_task_by_positions_and_by_joint_values(tmp_path, run):
     targets = tmp_path / "targets.csv"
     chain = read_robot(ROBOT)
     points = 1e3 * chain.poses(np.random.default_rng(0).uniform(-1, 1, (5, 6)))[:, :3, 3]
@@ -122,21 +111,20 @@ def test_task_by_positions_and_by_joint_values(tmp_path, capsys):
     targets.write_text("\n".join(["x[mm],y[mm],z[mm]", *rows]) + "\n")
     poses = tmp_path / "poses.csv"
     base = ("plan", ROBOT, "-n", 10, "--candidates", 300, "--criterion", "task", "--task")
-    assert run(capsys, *base, targets, "-o", poses)[0] == 0
-    assert run(capsys, *base, poses, "-o", tmp_path / "again.csv")[0] == 0
+    assert run(*base, targets, "-o", poses)[0] == 0
+    assert run(*base, poses, "-o", tmp_path / "again.csv")[0] == 0
     targets.write_text("x[mm],y[mm],z[mm]\n9000,0,0\n")
-    status, _, err = run(capsys, *base, targets, "-o", tmp_path / "none.csv")
-    assert status == 2
+    err = error_of(run(*base, targets, "-o", tmp_path / "none.csv"))
     assert "targets.csv: target 1 is out of reach" in err
     assert not (tmp_path / "none.csv").exists()
 
 
-def test_box_and_visibility(tmp_path, capsys):
-    robot = robot_file("ur_description/urdf/ur10_robot.urdf")
+def test_box_and_visibility(tmp_path, run):
+    robot = "example:ur10"
     poses = tmp_path / "poses.csv"
     space = ("--box", "0,-800,100:1200,800,1000mm", "--visible-from", "2.5,0,1m", "--cone", "40deg")
     options = ("-n", 8, "--tip", "tool0", "--kind", "position", "--candidates", 400)
-    assert run(capsys, "plan", robot, *options, *space, "-o", poses)[0] == 0
+    assert run("plan", robot, *options, *space, "-o", poses)[0] == 0
     chain = read_robot(robot, "tool0")
     found = chain.poses(read_configurations(poses, chain))
     place = found[:, :3, 3]
@@ -173,19 +161,18 @@ def test_box_and_visibility(tmp_path, capsys):
         (("--export", "moves.gcode"), "unknown ending; write a program as .script or .trajectory.csv"),
     ],
 )
-def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, capsys, options, words):
+def test_invalid_arguments_are_one_line_and_write_nothing(tmp_path, run, options, words):
     out = tmp_path / "poses.csv"
-    status, _, err = run(capsys, "plan", ROBOT, "-n", 5, "--candidates", 50, "-o", out, *options)
-    assert status == 2
+    err = error_of(run("plan", ROBOT, "-n", 5, "--candidates", 50, "-o", out, *options))
     assert words in err
     assert len(err.strip().splitlines()) == 1
     assert not out.exists()
 
 
-def test_map_of_a_calibration(tmp_path, capsys, unsuspected_once):
+def test_map_of_a_calibration(tmp_path, run, unsuspected_once):
     data, robot, cells = tmp_path / "data.csv", tmp_path / "arm.urdf", tmp_path / "map.csv"
-    run(capsys, "simulate", ROBOT, "--truth", TRUTH, "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
-    assert run(capsys, "calibrate", ROBOT, data, "-o", robot, "--map", cells)[0] == 0
+    run("simulate", ROBOT, "--truth", TRUTH, "-m", 30, "--noise", "0.1mm,0.01deg", "-o", data)
+    assert run("calibrate", ROBOT, data, "-o", robot, "--map", cells)[0] == 0
     table = np.loadtxt(cells, delimiter=",", comments="#", skiprows=2)
     assert table.shape[1] == 6
     assert (table[:, 4] >= table[:, 3]).all()
@@ -207,29 +194,26 @@ def lowest_tool(path, tip="tool0"):
     return chain.poses(read_configurations(path, chain))[:, 2, 3].min()
 
 
-def test_robot_stays_above_the_floor_by_default(tmp_path, capsys):
+def test_robot_stays_above_the_floor_by_default(tmp_path, run):
     poses = tmp_path / "poses.csv"
-    status, _, err = run(capsys, *UR10, "-o", poses)
-    assert status == 0
+    err = stderr_of(run(*UR10, "-o", poses))
     assert lowest_tool(poses) > 0
     assert "free of collisions" in err
-    assert run(capsys, *UR10, "-o", poses, "--floor", "-300mm")[0] == 0
+    assert run(*UR10, "-o", poses, "--floor", "-300mm")[0] == 0
     assert -0.3 < lowest_tool(poses) < 0
-    assert run(capsys, *UR10, "-o", poses, "--floor", "none")[0] == 0
+    assert run(*UR10, "-o", poses, "--floor", "none")[0] == 0
     assert lowest_tool(poses) < -0.3
 
 
-def test_obstacles_of_a_scene_and_boxes(tmp_path, capsys):
+def test_obstacles_of_a_scene_and_boxes(tmp_path, run):
     """A scene and the equal box give the same plan, whose tools are not in the table."""
     scene, pages = tmp_path / "cell.urdf", {}
     scene.write_text(TABLE)
     for name, obstacle in (("scene", scene), ("box", TABLE_BOX)):
         poses, pages[name] = tmp_path / f"{name}.csv", tmp_path / f"{name}.html"
-        status, out, _ = run(
-            capsys, *UR10, "-o", poses, "--obstacle", obstacle, "--html", pages[name], "--json", "-"
+        document = json_of(
+            run(*UR10, "-o", poses, "--obstacle", obstacle, "--html", pages[name], "--json", "-")
         )
-        assert status == 0
-        document = json.loads(out)
         assert document["blocked_moves"] == []
         assert document["files"]["html"] == str(pages[name])
         assert (str(scene) in document["inputs"]) == (name == "scene")
@@ -247,10 +231,10 @@ def test_obstacles_of_a_scene_and_boxes(tmp_path, capsys):
     np.testing.assert_allclose(np.array(preview["configurations"])[preview["stops"]], q, atol=1e-6)
 
 
-def test_exports_visit_the_poses_in_their_order(tmp_path, capsys):
+def test_exports_visit_the_poses_in_their_order(tmp_path, run):
     poses, names = tmp_path / "poses.csv", ("p.script", "p.trajectory.csv", "p.robodk.csv")
     exports = [word for name in names for word in ("--export", tmp_path / name)]
-    assert run(capsys, *UR10, "-o", poses, *exports)[0] == 0
+    assert run(*UR10, "-o", poses, *exports)[0] == 0
     q = read_configurations(poses, read_robot("example:ur10", "tool0"))
     degrees = np.loadtxt(tmp_path / "p.robodk.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(np.radians(degrees[:, :6]), q, atol=1e-6)
@@ -262,12 +246,9 @@ def test_exports_visit_the_poses_in_their_order(tmp_path, capsys):
         assert np.abs(trajectory[:, 1:] - pose).max(1).min() < 1e-6
 
 
-def test_a_robot_without_geometry_is_checked_as_lines(tmp_path, capsys):
+def test_a_robot_without_geometry_is_checked_as_lines(tmp_path, run):
     poses = tmp_path / "poses.csv"
-    status, _, err = run(
-        capsys, "plan", ROBOT, "-n", 8, "--candidates", 200, "-o", poses, "--floor", "-500mm"
-    )
-    assert status == 0
+    err = stderr_of(run("plan", ROBOT, "-n", 8, "--candidates", 200, "-o", poses, "--floor", "-500mm"))
     assert "checked against straight lines between the joints" in err
     chain = read_robot(ROBOT)
     frames = chain.forward_kinematics(read_configurations(poses, chain))

@@ -1,13 +1,11 @@
 """Command plan with --rig: poses that are read back and looked at, existing images, and wrong input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import unfolded
+from command_line import error_of, json_of, stderr_of, stdout_of, unfolded
 from rig_files import BOARD_TABLE, CAMERA_TABLE
 
 from dhcal_pin.io import read_configurations, read_robot
@@ -33,8 +31,7 @@ def rig_folder(tmp_path, monkeypatch):
 def test_planned_poses_have_the_board_in_view(run):
     options = ("-n", 12, "--candidates", 60, "--distance", "250:500mm", "--angle", "40deg")
     pages = ("--html", "scene.html", "--report", "report.html", "--json", "plan.json")
-    status, _, err = run(*PLAN, *options, *pages)
-    assert status == 0, err
+    err = stderr_of(run(*PLAN, *options, *pages))
     assert "lower predicted error than 12 random poses" in err
     document = json.loads(Path("plan.json").read_text())
     (views,) = document["views"]
@@ -59,20 +56,16 @@ def test_missing_poses_are_estimated_from_images(run):
     arm, sizes = ("example:ur10", "--tip", "tool0"), ("-n", 6, "--candidates", 100)
     run("simulate", *arm, "--kind", "camera", "-m", 12, "--noise", "0.3mm", "-o", "images.csv")
     plan = ("plan", *arm, "--rig", "images.rig.toml", *sizes, "--json", "-")
-    status, out, err = run(*plan, "-o", "more.csv", "--data", "images.csv")
-    assert status == 0, err
-    more = json.loads(out)
+    more = json_of(run(*plan, "-o", "more.csv", "--data", "images.csv"))
     assert [one["camera"] for one in more["views"]] == ["left", "right"]
     assert sum(one["images"] for one in more["views"]) >= 6
     assert any("hides points of 'target' is not checked" in note for note in more["notes"])
-    status, out, err = run(*plan, "-o", "chosen.csv", "--data", "images.csv", "--from", "images.csv")
-    assert status == 0, err
+    out = stdout_of(run(*plan, "-o", "chosen.csv", "--data", "images.csv", "--from", "images.csv"))
     rows = np.array(json.loads(out)["rows"]) - 1
     # A configuration has one row for each of the six corners.
     assert len(set(rows // 6)) == 6
     assert np.all(rows % 6 == 0)
-    status, _, err = run(*plan, "-o", "none.csv")
-    assert status == 2
+    err = error_of(run(*plan, "-o", "none.csv"))
     assert unfolded(err).startswith("dhcal: images.rig.toml: [camera.left] has no pose; expected")
     assert not Path("none.csv").exists()
 
@@ -115,8 +108,7 @@ def test_wrong_input_is_one_line(run, change, options, message):
             "-o",
             "positions.csv",
         )
-    status, _, err = run(*PLAN, "-n", 5, "--candidates", 50, *options)
-    assert status == 2
+    err = error_of(run(*PLAN, "-n", 5, "--candidates", 50, *options))
     assert err.startswith("dhcal: ")
     assert message in unfolded(err)
     assert not Path("poses.csv").exists()
@@ -124,8 +116,7 @@ def test_wrong_input_is_one_line(run, change, options, message):
 
 @pytest.mark.parametrize("option", [("--distance", "300:900mm"), ("--angle", "50deg"), ("--corners", "0.5")])
 def test_options_of_views_need_a_rig(run, option):
-    status, _, err = run("plan", "example:ur10", "-n", 5, "-o", "poses.csv", *option)
-    assert status == 2
+    err = error_of(run("plan", "example:ur10", "-n", 5, "-o", "poses.csv", *option))
     assert f"{option[0]}: needs --rig" in unfolded(err)
-    status, _, err = run("plan", "example:ur10", "-n", 5, "-o", "poses.csv", "--kind", "camera")
+    err = error_of(run("plan", "example:ur10", "-n", 5, "-o", "poses.csv", "--kind", "camera"))
     assert "--kind camera: needs --rig" in unfolded(err)

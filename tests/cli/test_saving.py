@@ -1,7 +1,5 @@
 """Outputs of commands: streams, interrupts, and files that do not belong together."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

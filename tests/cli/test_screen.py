@@ -1,14 +1,12 @@
 """Default output: one screen of 80 x 24, whatever the robot, the kind, the names and the result."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import CALIBRATE, positions_csv, stdout_of, unfolded
+from command_line import CALIBRATE, positions_csv, stderr_of, stdout_of, unfolded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import URDF
@@ -42,8 +40,7 @@ def test_calibrations_of_all_kinds(run, robot_folder, kind):
     stdout_of(run("simulate", arm, "--errors", "1mm,0.3deg", "-m", 40, "--kind", kind, "-o", "k.csv"))
     rig = ["--rig", "k.rig.toml"] if Path("k.rig.toml").exists() else []
     command = ("calibrate", arm, "k.csv", *rig, "-o", "o.urdf", "--extend", "none", "--force")
-    status, _, err = run(*command)
-    assert status == 0, err
+    err = stderr_of(run(*command))
     assert_fits(err)
     lines = err.splitlines()
     assert any(line.startswith("verdict: ") for line in lines)
@@ -58,8 +55,7 @@ def test_calibrations_of_all_kinds(run, robot_folder, kind):
 def test_calibrations_of_several_robots(run, robot_folder, arm):
     stdout_of(run("simulate", URDF / arm, "--errors", "1mm,0.3deg", "-m", 40, "-o", "d.csv"))
     command = ("calibrate", URDF / arm, "d.csv", "-o", "o.urdf", "--holdout", "0.3", "--force")
-    status, _, err = run(*command)
-    assert status == 0, err
+    err = stderr_of(run(*command))
     assert_fits(err)
 
 
@@ -72,16 +68,14 @@ def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspec
         # One row of each file is far off.
         Path(name).write_text(positions_csv(20, seed=i, wrong=(3,)))
     outputs = ("-o", folder / "out.urdf", "--report", folder / "r.html", "--json", folder / "r.json")
-    status, _, err = run("calibrate", "arm.dh.toml", *names, *outputs)
-    assert status == 0, err
+    err = stderr_of(run("calibrate", "arm.dh.toml", *names, *outputs))
     assert_fits(err)
     assert "verdict: " in err
     if n_files > 1:
         assert re.search(r"\d+ more files?; see --verbose", err)
         assert re.search(r"\d+ (more )?notes? on rows; see --verbose", err)
     for command in (("inspect", *names, "--robot", "arm.dh.toml"), ("validate", "arm.dh.toml", *names)):
-        status, _, err = run(*command)
-        assert status == 0
+        err = stderr_of(run(*command))
         assert_fits(err)
 
 
@@ -143,8 +137,7 @@ def test_corrections_are_ordered_by_their_size(run, robot_folder):
 def test_other_commands(run, robot_folder, undrawn, monkeypatch, command):
     rows = simulations.simulation_rows
     monkeypatch.setattr(simulations, "simulation_rows", lambda: rows(seeds=2))
-    status, _, err = run(*command)
-    assert status == 0, err
+    err = stderr_of(run(*command))
     assert_fits(err)
     # Nothing but the verdict, if there is one.
     assert len(run(*command, "--quiet")[2].splitlines()) <= 1
@@ -153,8 +146,7 @@ def test_other_commands(run, robot_folder, undrawn, monkeypatch, command):
 def test_targets_out_of_reach(run, robot_folder):
     far = "\n".join(f"{1000 + i},{i},9000" for i in range(50))
     Path("targets.csv").write_text(f"x[mm],y[mm],z[mm]\n{far}\n")
-    status, _, err = run("compensate", "arm.urdf", "arm.urdf", "targets.csv", "-o", "c.csv")
-    assert status == 0, err
+    err = stderr_of(run("compensate", "arm.urdf", "arm.urdf", "targets.csv", "-o", "c.csv"))
     assert_fits(err)
     assert "more targets out of reach; see --verbose" in err
 
@@ -211,8 +203,7 @@ def test_images_of_a_right_and_of_a_wrong_arm(run, robot_folder, uneventful, err
     simulated = ("--kind", "camera", "--noise", "0.2mm", "-o", "k.csv")
     stdout_of(run("simulate", arm, "--errors", errors, "-m", 30, *simulated))
     command = ("calibrate", arm, "k.csv", "--rig", "k.rig.toml", "-o", "o.urdf", "--force")
-    status, _, err = run(*command, "--json", "r.json")
-    assert status == 0, err
+    err = stderr_of(run(*command, "--json", "r.json"))
     assert_fits(err)
     document = json.loads(Path("r.json").read_text())
     assert document["camera_stages"][-1]["kept"] != is_kept

@@ -1,7 +1,5 @@
 """Command validate."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -12,14 +10,16 @@ from command_line import (
     CALIBRATE,
     HEADER,
     KEYS,
+    error_of,
     json_of,
     parse_json,
     positions_csv,
+    stderr_of,
     stdout_of,
     tool_positions,
     unfolded,
 )
-from robots import URDF, robot_file
+from robots import UR10, URDF
 
 
 def test_sidecar_is_an_input(run, robot_folder):
@@ -45,7 +45,7 @@ def test_json_of_a_validation(run, robot_folder):
 
 def test_another_tip_than_that_of_the_calibration_is_named(run, robot_folder):
     """The tool of a UR10 is calibrated; with the link before the tip, the tool does not count."""
-    Path("ur10.urdf").write_text(robot_file("ur_description/urdf/ur10_robot.urdf").read_text())
+    Path("ur10.urdf").write_text(UR10.read_text())
     simulate = [
         "simulate",
         "ur10.urdf",
@@ -132,8 +132,7 @@ def test_nominal_and_calibrated_robot_side_by_side(run, robot_folder):
     assert "the frames (base, tool) differ: run again with --fit-frames" in err
     assert any("--fit-frames" in text for text in document["warnings"])
     assert "exchange them" not in err
-    status, _, err = run("validate", "arm.dh.toml", "new.csv", "--nominal", "out.urdf", "--fit-frames")
-    assert status == 0
+    err = stderr_of(run("validate", "arm.dh.toml", "new.csv", "--nominal", "out.urdf", "--fit-frames"))
     assert (
         "out.calibration.toml is that of a calibrated robot, and arm.dh.toml has none: exchange"
         in unfolded(err)
@@ -166,8 +165,7 @@ def test_equal_frames_are_not_reported(run, robot_folder):
 def test_nominal_robot_with_other_joints_is_refused(run, robot_folder):
     calibrated_and_new_data(run, np.zeros((4, 3)))
     other = URDF / "sim_6dof.dh.toml"
-    status, _, err = run("validate", "out.urdf", "new.csv", "--nominal", other)
-    assert status == 2
+    err = error_of(run("validate", "out.urdf", "new.csv", "--nominal", other))
     assert "expected the joints of out.urdf" in err
 
 
@@ -247,8 +245,7 @@ def test_digests_that_are_not_base64_are_refused(run, robot_folder):
     sidecar.write_text(
         re.sub(r"(?s)fitted_rows = (\W{3}).*?\1\n", 'fitted_rows = "?"\n', sidecar.read_text())
     )
-    status, _, err = run("validate", "out.urdf", "data.csv")
-    assert status == 2
+    err = error_of(run("validate", "out.urdf", "data.csv"))
     assert "[manifest] fitted_rows is not base64 text" in unfolded(err)
 
 
@@ -278,8 +275,7 @@ def test_all_columns_count_the_same_samples_and_outliers_are_named(run, robot_fo
     listed = ", ".join(str(i + 1) for i in wrong)
     validate = ["validate", "arm.urdf", "wrong.csv", "--tip", "tool0", "--json", "v.json"]
     for options in ([], ["--nominal", "example:ur5"], ["--fit-frames"]):
-        status, _, err = run(*validate, *options)
-        assert status == 0
+        err = stderr_of(run(*validate, *options))
         text = " ".join(err.split())
         assert f"Samples far from the others: 6 (lines in wrong.csv: {listed})" in text
         (rest,) = re.findall(r"RMS position error without them: ([\d.]+) mm", text)
@@ -305,6 +301,5 @@ def test_tip_of_a_urdf_does_not_concern_a_nominal_dh_table(run, robot_folder):
     """The nominal robot may be a DH table, which has no option --tip."""
     Path("data.csv").write_text(positions_csv(20))
     words = ("validate", "arm.urdf", "data.csv", "--tip", "tool0", "--nominal", "arm.dh.toml")
-    status, _, err = run(*words)
-    assert status == 0, err
+    stdout_of(run(*words))
     assert run("diff", "arm.urdf", "arm.dh.toml", "--tip", "tool0")[0] == 0

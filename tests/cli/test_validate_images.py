@@ -1,7 +1,5 @@
 """Command validate with images: the estimates of the calibration count, not the values of an old rig file."""
 
-from __future__ import annotations
-
 import shutil
 import tomllib
 from dataclasses import replace
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from command_line import json_of, unfolded
+from command_line import error_of, json_of, unfolded
 from rig_files import BOARD, CAMERA, draw_views
 
 import dhcal_pin as dh
@@ -124,8 +122,7 @@ def test_a_sidecar_without_lens_or_pose_needs_the_rig_file(run, calibrated):
     for kind, name, keys in (("camera", "wrist", lens), ("camera", "wrist", pose), ("board", "table", pose)):
         entry = {key: value for key, value in content[kind][name].items() if key not in keys}
         Path("arm.calibration.toml").write_text(tomli_w.dumps({**content, kind: {name: entry}}))
-        status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0")
-        assert status == 2
+        err = error_of(run("validate", "arm.urdf", "other.csv", "--tip", "tool0"))
         assert "other.csv: image coordinates need the cameras and boards of a rig; give --rig" in unfolded(
             err
         )
@@ -143,8 +140,7 @@ def test_other_measurements_need_no_camera_of_the_sidecar(run, calibrated):
     document = json_of(run("validate", "arm.urdf", "laser.csv", "--tip", "tool0", "--json", "-"))
     assert document["estimated_entries"] == []
     assert document["after"]["position_rms_m"] < 1e-9
-    status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0")
-    assert status == 2
+    err = error_of(run("validate", "arm.urdf", "other.csv", "--tip", "tool0"))
     assert 'arm.calibration.toml: [camera.wrist]: link = "other_hand" is not a link of' in unfolded(err)
 
 
@@ -166,8 +162,7 @@ def test_another_board_of_the_same_name_is_refused(run, calibrated):
         (small, {}, "[camera.wrist]: images 640 x 480 px, but 800 x 600 px in"),
     ):
         write_rig("rig.toml", camera, **changes)
-        status, _, err = run("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", "rig.toml")
-        assert status == 2
+        err = error_of(run("validate", "arm.urdf", "other.csv", "--tip", "tool0", "--rig", "rig.toml"))
         assert f"rig.toml: {message}" in unfolded(err)
 
 
@@ -205,8 +200,7 @@ def test_counts_of_servos_need_no_rig(run, calibrated):
     ]
     assert len(figures[0]) > 2
     assert figures[0] == pytest.approx(figures[1], rel=1e-9)
-    status, _, err = run("validate", "arm.urdf", "counts.csv", *images[:2])
-    assert status == 2
+    err = error_of(run("validate", "arm.urdf", "counts.csv", *images[:2]))
     assert "--servos" in err
 
 
@@ -216,12 +210,10 @@ def test_joint_names_with_a_suffix_are_explained(run, calibrated):
     joints = dh.read_robot("arm.urdf", tip="tool0").joint_names
     arguments = ("example:ur10", "theirs.csv", "--rig", "rig.toml", "--tip", "tool0", "-o", "out.urdf")
     Path("theirs.csv").write_text(text.replace("[rad]", ".pos"))
-    status, _, err = run("calibrate", *arguments)
-    assert status == 2
+    err = error_of(run("calibrate", *arguments))
     assert f"expected '{joints[0]}[ticks]'" in unfolded(err)
     assert "from =" not in err
     Path("theirs.csv").write_text(text.replace("[rad]", "_measured"))
-    status, _, err = run("calibrate", *arguments)
-    assert status == 2
+    err = error_of(run("calibrate", *arguments))
     assert f'order = ["{joints[0]}_measured"' in unfolded(err)
     assert "from =" not in err

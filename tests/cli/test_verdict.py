@@ -1,16 +1,14 @@
 """Verdict of dhcal calibrate: exit status, files that are written, and reasons."""
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import CALIBRATE, parse_json, positions_csv, unfolded
+from command_line import CALIBRATE, error_of, json_of, parse_json, positions_csv, stderr_of, unfolded
 from measurement_files import frames, joint_positions, real_ur10
-from robots import robot_file
+from robots import UR10, nominal_arm
 from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
@@ -43,8 +41,7 @@ def test_refused_robot_is_not_written(run, robot_folder, undrawn):
 
 def test_a_copy_of_the_fitted_file_is_no_holdout(run, robot_folder):
     Path("copy.csv").write_bytes(Path("data.csv").read_bytes())
-    status, _, err = run(*CALIBRATE, "--holdout", "copy.csv")
-    assert status == 0
+    err = stderr_of(run(*CALIBRATE, "--holdout", "copy.csv"))
     assert "verdict: caution" in err
     assert "hold-out samples are fitted, too" in unfolded(err)
 
@@ -59,8 +56,7 @@ def test_force_writes_a_refused_robot(run, robot_folder, undrawn, words, expecte
 
 
 def test_accepted_robot_is_written(run, robot_folder):
-    status, _, err = run(*CALIBRATE, *OUTPUTS)
-    assert status == 0
+    err = stderr_of(run(*CALIBRATE, *OUTPUTS))
     assert parse_json(Path("r.json").read_text())["verdict"] == {"status": "ok", "reasons": []}
     assert err.splitlines()[-1] == "verdict: ok"
     assert Path("out.urdf").exists()
@@ -98,7 +94,6 @@ def test_python_refuses_to_write(robot_folder):
 
 # --- results that must not be written --------------------------------------------------------------
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 JOINTS = [f"{name}_joint" for name in "shoulder_pan shoulder_lift elbow wrist_1 wrist_2 wrist_3".split()]
 
 
@@ -220,9 +215,7 @@ def test_mistakes_are_refused_with_the_remedy(run, robot_folder, mistake, column
     # The diagnosis is the last thing on the screen.
     assert unfolded(err).endswith(unfolded(text))
     # The remedy mends the measurements.
-    status, out, err = run(*command, "--mend", key, "--json", "-")
-    assert status == 0, err
-    document = parse_json(out)
+    document = json_of(run(*command, "--mend", key, "--json", "-"))
     assert document["verdict"]["status"] == "ok"
     assert document["after"]["position_rms_m"] < 0.25e-3
 
@@ -335,9 +328,7 @@ def test_many_outliers_advise_caution(run, robot_folder):
 
 def test_validate_is_never_refused(run, robot_folder):
     write_columns(flipped(positions_only(tracker_columns())))
-    status, out, _ = run("validate", UR10, "data.csv", "--tip", "tool0", "--fit-frames", "--json", "-")
-    assert status == 0
-    document = parse_json(out)
+    document = json_of(run("validate", UR10, "data.csv", "--tip", "tool0", "--fit-frames", "--json", "-"))
     assert "the sign of joint elbow_joint is wrong" in document["warnings"][0].lower()
     assert document["verdict"]["status"] == "refused"
 
@@ -346,9 +337,7 @@ def test_validate_is_never_refused(run, robot_folder):
 def test_changes_that_do_not_apply_are_wrong_input(run, robot_folder, keys):
     write_columns(positions_only(tracker_columns(12)))
     mend = [word for key in keys for word in ("--mend", key)]
-    status, out, err = run("calibrate", UR10, "data.csv", "--tip", "tool0", "-o", "out.urdf", *mend)
-    assert (status, out) == (2, "")
-    assert err.count("\n") == 1
+    err = error_of(run("calibrate", UR10, "data.csv", "--tip", "tool0", "-o", "out.urdf", *mend))
     assert "--mend" in err
 
 
@@ -386,7 +375,7 @@ def test_too_small_sigmas_are_named_as_the_cause_of_a_large_correction(seed, con
 
     More iterations do not help, so they are not advised.
     """
-    chain = dh.Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     rng, errors = np.random.default_rng(seed), select_parameters(chain, "placement")
     sizes = np.array([1e-3 if p.unit == "m" else 5e-3 for p in errors.parameters])
     truth = errors.at(rng.normal(size=len(sizes)) * sizes)

@@ -1,7 +1,5 @@
 """Worker processes end with the command that started them, even if it is killed."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import subprocess

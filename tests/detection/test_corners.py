@@ -1,7 +1,5 @@
 """Boards in photographs and in drawings of known geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import DATA, missing

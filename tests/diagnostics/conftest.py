@@ -1,22 +1,14 @@
 """Fixtures for the tests of diagnostics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from robots import robot_file
 
 from dhcal_pin.diagnostics import find_input_warnings
 from dhcal_pin.io import read_measurement_file
 from dhcal_pin.measurements import MountedRig
 from dhcal_pin.robot import Chain
-
-
-@pytest.fixture(scope="module")
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 @pytest.fixture

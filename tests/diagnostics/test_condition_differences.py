@@ -1,13 +1,12 @@
 """Differences of calibrations at other conditions, against what was changed in simulated arms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import nominal_arm
 from scipy import stats
-from sessions import NOISE, Simulation, nominal_arm
+from sessions import NOISE, Simulation
 
 from dhcal_pin import Chain, calibrate, select_parameters
 from dhcal_pin.diagnostics import Calibrated, Difference, compare

@@ -1,7 +1,5 @@
 """Joint correction curves against the robot that they belong to, and their bands against known truths."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

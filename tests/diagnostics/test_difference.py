@@ -1,7 +1,5 @@
 """Differences of two calibrations of simulated arms, against what was changed between them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

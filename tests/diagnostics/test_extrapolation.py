@@ -1,7 +1,5 @@
 """Samples outside a measured region, their errors and the sentences about them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

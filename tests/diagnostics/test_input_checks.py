@@ -1,7 +1,5 @@
 """Warnings about measurement files: what causes each of them, and what must not."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows that a robot cannot reach."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dhcal_pin.diagnostics import find_unreachable_rows

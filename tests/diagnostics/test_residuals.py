@@ -1,7 +1,5 @@
 """Residual errors of joints against a known error."""
 
-from __future__ import annotations
-
 import numpy as np
 from robots import robot_file
 

@@ -1,7 +1,5 @@
 """Workspace maps: predicted uncertainty against the errors of simulated robots."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

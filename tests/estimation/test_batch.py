@@ -1,10 +1,8 @@
 """Batches against the solver for single problems, and against the scatter over repetitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import paper, random_joints, random_table, robot_file
+from robots import nominal_arm, paper, random_joints, random_table
 
 from dhcal_pin._kernels import kinematics
 from dhcal_pin.calibration import calibrate
@@ -99,7 +97,7 @@ def test_problems_with_curved_rows_converge_as_alone():
     The lockstep iteration alone leaves most of them unconverged after 100 iterations.
     """
     rng = np.random.default_rng(71)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, "placement")
     models, data = [], []
     for number in range(8):

@@ -1,7 +1,5 @@
 """Definitions of the parameters: the frame and the direction that are stated, against the written URDF."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Uncertainties in sidecars, which follow from samples and priors, against those that they stand for."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

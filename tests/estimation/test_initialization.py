@@ -1,7 +1,5 @@
 """Initialization: base and tool frames anywhere are found without a guess."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import with_random_frames

@@ -1,7 +1,5 @@
 """Standardized residuals of samples that alone determine a parameter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from dhcal_pin.estimation.robust import OUTLIER_THRESHOLD, standardized_residuals

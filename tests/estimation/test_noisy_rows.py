@@ -1,7 +1,5 @@
 """Rows of which a part of the noise is known: evidence and its best noise, compared with dense matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar

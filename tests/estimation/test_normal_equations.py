@@ -1,7 +1,5 @@
 """Normal equations of correction curves: against the plain rows, and against the R factor of the rows."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

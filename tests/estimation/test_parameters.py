@@ -1,7 +1,5 @@
 """Parameter sets: derivatives by finite differences, ranks by theory, exact DH changes, names, messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Priors: limits, and their scale from the errors that the data show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Triangular systems against the QR of all rows at once, and against arithmetic of fifty digits."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Robust losses: outliers are reported and have no influence on the result."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

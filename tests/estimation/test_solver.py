@@ -1,7 +1,5 @@
 """Solvers: loose and continued iterations, dispatch by method, and the step rules for floats and arrays."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_setups import tracked_setup
-from robots import joint_sample, measured_arm, robot_file
+from robots import joint_sample, measured_arm, nominal_arm
 from scipy.optimize import least_squares
 
 from dhcal_pin.calibration.cross_validation import refit
@@ -26,7 +24,6 @@ from dhcal_pin.estimation.initialization import initialize_frames, make_problem
 from dhcal_pin.estimation.solver import next_iterate, remaining_change
 from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
 from dhcal_pin.measurements import Noise, Position, SphereContact
-from dhcal_pin.robot import Chain
 
 
 def case(sim_6dof, sim_6dof_actual, sets="dh", m=20):
@@ -113,7 +110,7 @@ def test_steps_with_curved_rows_converge():
 
     Undamped steps grow or hardly shrink there. The trust region method of SciPy ends at the same cost.
     """
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     placement, errors = select_parameters(chain, "placement"), select_parameters(chain, "minimal")
     n_iterations = []
     for seed in range(6):

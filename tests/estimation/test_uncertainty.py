@@ -1,13 +1,11 @@
 """Predictions from a sidecar file, against those of the fit and of the parameter covariance."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import URDF, robot_file
+from robots import URDF
 
 from dhcal_pin import se3
 from dhcal_pin.calibration.procedure import calibrate
@@ -30,11 +28,6 @@ from dhcal_pin.robot.chain import Chain
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
 AWAY = se3.exp6(np.array([2.0, -1.0, 0.5, 0.3, -0.2, 2.0]))
-
-
-@pytest.fixture(scope="module")
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def covariance_by_differences(fit: Result, q: np.ndarray) -> np.ndarray:

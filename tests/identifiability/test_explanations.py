@@ -1,14 +1,12 @@
 """Explanations are compared with theory, exact poses and Pinocchio's axes, and their advice is followed."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import paper, robot_file
+from robots import nominal_arm, paper
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -44,18 +42,14 @@ TABLES = {
                           [-RIGHT, 0, -RIGHT, RIGHT, -RIGHT, 0]),
     "antiparallel": table([0.1, 0.2, 0.3], [0.4, 0.1, 0.1], [0.2, 0.3, 0.2], [np.pi, RIGHT, 0.2]),
 }  # fmt: skip
-URDFS = {
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
-    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
-}
+# Tips of arms of example-robot-data.
+TIPS = {"ur5": "tool0", "ur10": "tool0", "panda": "panda_hand", "tiago": "arm_tool_link"}
 PAPER = ("sim_6dof", "sim_6dof_actual", "sim_3dof", "sim_3dof_actual", "experiment")
 
 
 def load(arm: str) -> Chain:
-    if arm in URDFS:
-        return Chain.from_urdf(robot_file(URDFS[arm][0]), URDFS[arm][1])
+    if arm in TIPS:
+        return nominal_arm(arm, TIPS[arm])
     return Chain.from_dh(TABLES[arm] if arm in TABLES else paper(arm))
 
 
@@ -136,7 +130,7 @@ def test_number_of_missing_poses_is_stated(poses, more):
 
 # --- every direction has one group, and all claims are true --------------------------------------
 
-ARMS = (*PAPER, *TABLES, *URDFS)
+ARMS = (*PAPER, *TABLES, *TIPS)
 CASES = [
     *((arm, sets) for arm in ARMS for sets in ("dh", "minimal,base,tool")),
     *((arm, "placement,base,tool") for arm in ("scara", "ur10", "panda")),

@@ -1,7 +1,5 @@
 """Images do not show where base and tool are: cameras and boards take their place, and nobody has to act."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from camera_setups import ARMS, random_setup, wrong_arm

@@ -1,7 +1,5 @@
 """Observability indices by hand, correlations against repetitions, standard deviations against the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,8 @@
 """Correlation of residuals between configurations, and the design effect."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.estimation import select_parameters
@@ -21,22 +19,14 @@ from dhcal_pin.identifiability.residual_correlation import (
     find_residual_correlation,
 )
 from dhcal_pin.measurements import Measurement, Noise, Pose, Position
-from dhcal_pin.robot import Chain
 
 SETS = "minimal,base,tool"
 
 
 def fitted(seed: int, m: int, kind: type[Measurement] = Pose, size: float = 0.0) -> Result:
-    """Calibrate a UR10 with geometric errors, noise of 0.1 mm, and a smooth error of the model.
-
-    Args:
-        seed: Seed.
-        m: Number of configurations.
-        kind: Kind of measurement.
-        size: Standard deviation of the smooth error of positions [m].
-    """
+    """Calibrate a UR10 with geometric errors, noise of 0.1 mm, and a smooth error of a size [m]."""
     rng = np.random.default_rng(seed)
-    arm = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arm = nominal_arm("ur10")
     errors = select_parameters(arm, SETS)
     truth = errors.at(rng.normal(size=len(errors.parameters)) * np.minimum(errors.priors, 0.1))
     q = rng.uniform(-2.5, 2.5, (m, 6))

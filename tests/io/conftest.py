@@ -1,7 +1,5 @@
 """Fixtures of the tests of files."""
 
-from __future__ import annotations
-
 import pytest
 from robots import SCARA, write
 

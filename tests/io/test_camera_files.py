@@ -1,7 +1,5 @@
 """A calibrated camera in the files of other programs, and in the URDF and the sidecar."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """DH files: units, digits, and errors that name the problem."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Table of joint origins."""
 
-from __future__ import annotations
-
 import csv
 import re
 from dataclasses import replace
@@ -10,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import robot_file
+from robots import UR10
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
@@ -30,7 +28,7 @@ def test_origins_are_those_that_pinocchio_reads(sim_6dof_actual):
 
 def test_convert_writes_a_table_of_origins(tmp_path):
     out = tmp_path / "ur10.origins.csv"
-    source = robot_file("ur_description/urdf/ur10_robot.urdf")
+    source = UR10
     assert main(["convert", str(source), str(out), "--tip", "tool0"]) == 0
     rows = {row["joint"]: row for row in csv.DictReader(out.read_text().splitlines())}
     assert float(rows["shoulder_pan_joint"]["z[m]"]) == 0.1273

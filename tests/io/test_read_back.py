@@ -1,13 +1,11 @@
 """Robots that other programs read back before they are written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mjcf_robots import ROBOTS
-from robots import URDF, robot_file, write
+from robots import URDF, nominal_arm, robot_file, write
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
@@ -22,7 +20,7 @@ def robots() -> dict[str, Chain]:
         name: Chain.from_urdf(parse_mjcf(text.encode(), f"{name}.xml"), tip)
         for name, (text, tip) in ROBOTS.items()
     }
-    arms["ur10"] = read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    arms["ur10"] = nominal_arm("ur10")
     arms["talos, from the left hand"] = read_robot(
         robot_file("talos_data/robots/talos_reduced.urdf"), "gripper_right_base_link", root="arm_left_7_link"
     )

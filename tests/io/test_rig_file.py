@@ -1,7 +1,5 @@
 """Rig files: round trip, and messages about mistakes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from rig_files import BOARD_TABLE, CAMERA_TABLE

@@ -1,7 +1,5 @@
 """Robot files: formats by ending, reading and converting."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import URDF, write

@@ -1,7 +1,5 @@
 """Servo files: LeRobot's calibration against its formula, TOML, corrected zeros, and errors."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

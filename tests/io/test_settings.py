@@ -1,7 +1,5 @@
 """Settings: priors, bounds and payloads."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

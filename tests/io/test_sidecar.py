@@ -1,7 +1,5 @@
 """Sidecars: written, read back, replaced, and refused if invalid."""
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from dataclasses import replace

@@ -1,16 +1,13 @@
 """Joint offsets of Stäubli arms, applied to a nominal robot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import robot_file, write
+from robots import UR10, write
 
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import convert_robot, read_robot
 from dhcal_pin.io.makers.staubli_arm import read_joint_offsets
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 OFFSETS = (0.012, -0.034, 0.2, 0.0, -0.05, 1e-3)
 
 

@@ -1,7 +1,5 @@
 """Kinematics in another file of the same robot, between URDF and MJCF, against MuJoCo and Pinocchio."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace
@@ -10,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from mjcf_robots import SCARA, UR5E, XARM, mujoco_poses
-from robots import robot_file, write
+from robots import UR10, write
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
@@ -19,7 +17,6 @@ from dhcal_pin.io.read_back import _pinocchio_poses
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.formats.mjcf import parse_mjcf
 
-UR10 = robot_file("ur_description/urdf/ur10_robot.urdf")
 POSES = re.compile(r' (pos|quat|xyz|rpy)="[^"]*"')
 
 

@@ -1,7 +1,5 @@
 """Tables of TOML files: types, ranges, and errors that name file, table, key and expected value."""
 
-from __future__ import annotations
-
 import pytest
 from robots import write
 

@@ -1,7 +1,5 @@
 """Kinematics files of Universal Robots, and DH tables with the factory deltas of a UR arm."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from robots import DATA, paper, robot_file
+from robots import DATA, nominal_arm, paper
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
@@ -154,7 +152,7 @@ def test_numbers_of_yaml_1_2_are_read(tmp_path):
 
 def test_the_flange_of_a_ros_urdf_stays():
     """Axes along y in the old description; the flange is where its tool0 is."""
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     pose = np.eye(4)
     q = np.random.default_rng(0).uniform(-3, 3, 6)
     for values, angle in zip(ur_kinematics(chain).values(), q, strict=True):

@@ -1,7 +1,5 @@
 """Characteristics of ISO 9283 against an example that is calculated by hand."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np

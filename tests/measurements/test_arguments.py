@@ -1,7 +1,5 @@
 """Wrong arguments of the public functions: the message names the argument and what is expected."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

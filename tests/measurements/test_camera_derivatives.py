@@ -1,7 +1,5 @@
 """Derivatives of image coordinates by every unknown agree with differences of sixth order to 1e-7."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A measurement kind of a user with an angle as residual: all results state it in radians or milliradians."""
 
-from __future__ import annotations
-
 import json
 from typing import ClassVar
 

@@ -3,12 +3,9 @@
 Measurements are simulated with the link poses of Pinocchio, which has kinematics of its own.
 """
 
-from __future__ import annotations
-
 import numpy as np
-import pinocchio as pin
 import pytest
-from robots import URDF, with_masses, write
+from robots import URDF, pinocchio_poses, with_masses, write
 
 import dhcal_pin as dh
 from dhcal_pin import se3
@@ -36,25 +33,9 @@ UR10_LINKS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def ur10():
-    return dh.Chain.from_urdf("example:ur10", tip="tool0")
-
-
-def link_poses(chain, q, link):
-    """Return the poses of a link in the root of the chain, (m, 4, 4), by Pinocchio."""
-    model, out = chain.model, []
-    data = model.createData()
-    for configuration in chain.configurations(q):
-        pin.framesForwardKinematics(model, data, configuration)
-        root, own = (data.oMf[model.getFrameId(name, pin.FrameType.BODY)] for name in (chain.root, link))
-        out.append((root.inverse() * own).homogeneous)
-    return np.array(out)
-
-
 def accelerations(chain, q, link, up, rng=None):
     """Return what an accelerometer on a link sees, in g; `up` is a direction in the measuring frame."""
-    rotations = chain.base[:3, :3] @ link_poses(chain, q, link or chain.tip)[:, :3, :3] @ SENSOR
+    rotations = chain.base[:3, :3] @ pinocchio_poses(chain, q, link or chain.tip)[:, :3, :3] @ SENSOR
     return np.asarray(up) @ rotations + (NOISE * rng.standard_normal((len(q), 3)) if rng else 0.0)
 
 
@@ -81,7 +62,7 @@ def test_links_lie_where_pinocchio_has_them(robot, tip, root):
         found.add(body)
         frames = np.zeros((5, 4, 4))
         frames[:, :3], frames[:, 3, 3] = bodies[body].transpose(2, 1, 0), 1.0
-        np.testing.assert_allclose(frames @ pose, link_poses(chain, q, link), atol=1e-12)
+        np.testing.assert_allclose(frames @ pose, pinocchio_poses(chain, q, link), atol=1e-12)
     assert found == set(range(1, len(chain.moving_joints) + 1))
 
 

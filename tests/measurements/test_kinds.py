@@ -1,7 +1,5 @@
 """Conformance of all measurement kinds: it walks `KINDS`, so a new kind is tested without an edit here."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

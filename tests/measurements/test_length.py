@@ -1,14 +1,12 @@
 """Wires with known and unknown anchors, also by files of instrument parameters and sidecars."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import URDF, robot_file
+from robots import URDF, nominal_arm
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
@@ -18,12 +16,9 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text
 from dhcal_pin.io.sidecar import read_instrument
 from dhcal_pin.measurements import Noise, Wires
-from dhcal_pin.robot import Chain
 from dhcal_pin.robot.sampling import joint_range
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
-
-UR10 = "ur_description/urdf/ur10_robot.urdf"
 
 
 def wires(chain, m, seed=0):
@@ -75,7 +70,7 @@ def test_known_anchors_make_the_base_observable(sim_6dof, sim_6dof_actual):
 
 def test_unknown_zero_offsets_cost_hardly_any_accuracy():
     """Offsets of 4, -10 and 30 mm: the same lengths with known offsets have the same errors."""
-    chain, errors, offsets = Chain.from_urdf(robot_file(UR10), "tool0"), [], np.array([4e-3, -1e-2, 3e-2])
+    chain, errors, offsets = nominal_arm("ur10"), [], np.array([4e-3, -1e-2, 3e-2])
     for seed in range(6):
         rng = np.random.default_rng(seed)
         model = select_parameters(chain, "minimal,base,tool")
@@ -177,7 +172,7 @@ def test_simulated_wires_have_three_numbered_columns(sim_6dof):
 
 def test_a_point_on_the_last_axis_does_not_tilt_that_axis():
     """Lengths hardly determine the direction of the axis: with priors of any width it turns by 40°."""
-    chain = Chain.from_urdf(robot_file(UR10), "tool0")
+    chain = nominal_arm("ur10")
     errors = select_parameters(chain, "minimal,base,tool,harmonics,compliance")
     names = [parameter.name for parameter in errors.parameters]
     sizes = {"m": 5e-4, "rad": 1e-3, "rad/Nm": 1e-5}

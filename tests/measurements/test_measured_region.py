@@ -1,7 +1,5 @@
 """Measured regions against known distributions of configurations and a brute-force distance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import measured_arm

@@ -1,7 +1,5 @@
 """A kind of a user that observes the position of a point on any link."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

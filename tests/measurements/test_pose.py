@@ -1,7 +1,5 @@
 """Pose measurements: the paper's small-angle rows, and rotation noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import paper

@@ -1,7 +1,5 @@
 """Positions of several targets on the tool."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trilateration: closed form, mirror image, noise amplification, and calibration with unknown anchors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

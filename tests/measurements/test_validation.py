@@ -1,7 +1,5 @@
 """Constructors of measurements: what they accept, and what they say about wrong arguments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Experiment of the paper against verified figures."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

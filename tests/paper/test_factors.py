@@ -1,7 +1,5 @@
 """Error factors of the paper against finite differences, and its errata."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

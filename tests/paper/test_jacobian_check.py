@@ -1,7 +1,5 @@
 """Cross-check of the Jacobian on shipped and random robots."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import URDF, random_table

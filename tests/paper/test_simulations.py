@@ -1,7 +1,5 @@
 """Simulations of the paper against verified figures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,12 +1,10 @@
 """Plans that fill the bins of the joints: evenness, what decides then, and what simulated curves confirm."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
 import pytest
-from robots import SCARA, paper, robot_file, write
+from robots import SCARA, nominal_arm, paper, write
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
@@ -30,10 +28,6 @@ pytestmark = pytest.mark.usefixtures("unsuspected")
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"
-
-
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def evenness(values: np.ndarray) -> float:
@@ -83,7 +77,7 @@ def test_criterion_decides_between_equally_even_designs():
 
 
 def check_drawn_poses(count: int, candidates: int) -> None:
-    chain = ur10()
+    chain = nominal_arm("ur10")
     found = plan(chain, count, noise=NOISE, parameters=SETS, criterion="curves", candidates=candidates)
     other = plan(chain, count, noise=NOISE, parameters=SETS, candidates=candidates)
     visited, others = (
@@ -179,7 +173,7 @@ def curve_values(chain: Chain, coefficients: dict[str, float]) -> np.ndarray:
 
 def check_predicted_std(seeds: int, tolerance: float) -> None:
     """Compare the predicted with the actual error of curves that are drawn from their prior."""
-    chain, sets = ur10(), f"{SETS},curves"
+    chain, sets = nominal_arm("ur10"), f"{SETS},curves"
     candidates = np.random.default_rng(5).uniform(-np.pi, np.pi, (600, 6))
     found = plan(chain, 60, noise=NOISE, parameters=SETS, criterion="curves", candidates=candidates)
     errors = select_parameters(chain, sets)

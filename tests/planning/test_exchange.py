@@ -1,7 +1,5 @@
 """Criteria against explicit determinants and traces, selections against all sets of a small problem."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plans of images: views by OpenCV, rows by the solver, displacements by differences, hidden boards."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -79,11 +77,7 @@ def sampler(arm: Chain, images: PlannedImages, space: WorkspaceConstraints = FLO
 
 
 def opencv_view(arm: Chain, rig: MountedRig, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Project all corners by OpenCV and Pinocchio's own forward kinematics.
-
-    Returns:
-        Pixels (m, c, 2), distances of the middle of the board (m,) [m], angles of view (m,) [rad].
-    """
+    """Return pixels (m, c, 2), distances (m,) [m] and angles (m,) [rad] of a board, computed by OpenCV."""
     import pinocchio as pin
 
     model, (camera,), (board,) = arm.model, rig.cameras, rig.boards

@@ -1,7 +1,5 @@
 """Knowledge before measuring: priors, measurements, or the uncertainty of a calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from robots import joint_sample, measured_arm

@@ -1,7 +1,5 @@
 """Plans of photographs for a low-cost arm: poses that see the board and decide the signs of the joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from paper_arms import photograph_plan

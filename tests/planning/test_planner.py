@@ -1,13 +1,11 @@
 """Plans against random sets, calibrations of simulated robots, and collision checks by Pinocchio."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import paper, robot_file
+from robots import UR10, nominal_arm, paper, robot_file
 from sessions import Simulation
 from slow_cases import some_slow
 
@@ -41,17 +39,11 @@ pytestmark = pytest.mark.usefixtures("unsuspected")
 
 NOISE = Noise(1e-4, np.deg2rad(0.01))
 SETS = "minimal,base,tool"
-ARMS = {
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
-}
+TIPS = {"ur10": "tool0", "panda": "panda_hand"}
 
 
 def arm(name: str) -> Chain:
-    if name == "sim_6dof":
-        return Chain.from_dh(paper(name))
-    file, tip = ARMS[name]
-    return Chain.from_urdf(robot_file(file), tip)
+    return Chain.from_dh(paper(name)) if name == "sim_6dof" else nominal_arm(name, TIPS[name])
 
 
 def log_det(chain: Chain, kind: str, q) -> float:
@@ -69,9 +61,6 @@ def is_collision_free(chain: Chain, q) -> np.ndarray:
     """Check configurations (m,) for self-collisions, with the geometry that Pinocchio reads from the file.
 
     Neighbouring links and pairs that collide at the neutral configuration are ignored.
-
-    Returns:
-        Whether each configuration is free of self-collisions, shape (m,).
     """
     folders = [str(path) for path in robot_file("").parents]
     shapes = pin.buildGeomFromUrdf(chain.model, chain.urdf.source, pin.GeometryType.COLLISION, None, folders)
@@ -198,9 +187,6 @@ def relative_errors(name: str, kind: str, seeds: int) -> np.ndarray:
 
     The poses are selected by the criteria "robust" and "D" and at random. The robots have gains, harmonics
     and compliance of a tenth of their priors, which the fit does not estimate.
-
-    Returns:
-        Errors of the three selections.
     """
     chain = arm(name)
     space = ConfigurationSampler.from_chain(chain, WorkspaceConstraints(), 0.0, 0.0)
@@ -507,7 +493,7 @@ def test_progress_names_each_phase_once(candidates):
 
 def test_poses_are_repeated_at_begin_middle_and_end(tmp_path):
     path = tmp_path / "poses.csv"
-    robot = str(robot_file(ARMS["ur10"][0]))
+    robot = str(UR10)
     command = ["plan", robot, "--tip", "tool0", "--repeat", "--candidates", "200", "-o", str(path)]
     assert main([*command, "-n", "20"]) == 0
     q = read_configurations(path, arm("ur10"))

@@ -1,7 +1,5 @@
 """Order of poses and moves between them, for an arm whose collisions are computed by hand."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,12 +1,10 @@
 """Measurements of different kinds that contradict each other, simulated with a joint zero that differs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import nominal_arm
 
-from dhcal_pin import calibrate, read_robot, select_parameters
+from dhcal_pin import calibrate, select_parameters
 from dhcal_pin.measurements import KINDS, Noise
 from dhcal_pin.plausibility.contradictions import MIN_RATIO, own_fit_ratio
 
@@ -14,13 +12,9 @@ ELBOW = 2
 OTHERS = ("distance", "inclination", "point", "pose")
 
 
-def ur10():
-    return read_robot(robot_file("ur_description/urdf/ur10_robot.urdf"), tip="tool0")
-
-
 def measured(kind: str, rng: np.random.Generator, zero: float):
     """Simulate positions, and 60 measurements of another kind whose joint values have another zero."""
-    chain = ur10()
+    chain = nominal_arm("ur10")
     errors = select_parameters(chain, "minimal,base,tool")
     true = errors.at(np.minimum(errors.priors, 0.3) * rng.standard_normal(len(errors.priors)))
     positions, others = (

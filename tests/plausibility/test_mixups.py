@@ -1,14 +1,12 @@
 """Diagnosis of mixed-up joints, frames, rows and notations."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from measurement_files import frames, joint_positions, real_ur10
-from robots import robot_file
+from robots import nominal_arm
 from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
 
@@ -22,11 +20,6 @@ from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups, trials
 from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.robot import Chain, DHTable
-
-
-@pytest.fixture(scope="module")
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def measured(kind, m=60, seed=0, reach=0.4):
@@ -127,52 +120,45 @@ def test_errors_of_the_robot_do_not_hide_the_angle_of_a_zero(sim_3dof, seed):
 
 
 @pytest.mark.parametrize(
-    ("path", "tip", "joint"),
-    [
-        ("ur_description/urdf/ur3_robot.urdf", "tool0", 1),
-        # The correction makes this arm 1 % longer, which is no scale of the instrument.
-        ("ur_description/urdf/ur10_robot.urdf", "tool0", 1),
-        ("panda_description/urdf/panda.urdf", "panda_link8", 1),
-    ],
+    "name",
+    # The correction makes the UR10 1 % longer, which is no scale of the instrument.
+    ["ur3", "ur10", "panda"],
 )
-def test_a_zero_that_the_calibration_corrects_is_named_if_the_correction_is_large(path, tip, joint):
+def test_a_zero_that_the_calibration_corrects_is_named_if_the_correction_is_large(name):
     """The zero is off by 8.5°, the correction by as much; with the named change it is of ordinary size."""
-    arm = Chain.from_urdf(robot_file(path), tip)
+    arm = nominal_arm(name)
     rng, errors = np.random.default_rng(71), select_parameters(arm, "minimal,base,tool")
     truth = errors.at(0.5 * np.minimum(errors.priors, 0.1) * rng.standard_normal(len(errors.parameters)))
     q = rng.uniform(-2, 2, (50, len(arm.joint_names)))
     data = Position.simulate(truth, q, Noise(5e-5), rng)
-    wrong = data.resample(data.q + np.deg2rad(8.5) * np.eye(q.shape[1])[joint])
+    wrong = data.resample(data.q + np.deg2rad(8.5) * np.eye(q.shape[1])[1])
     found = calibrate(arm, wrong, "minimal,base,tool")
     assert not found.diagnosis.hypotheses
     (reason,) = found.verdict.reasons
     (key,) = re.findall(r"add --mend (\S+)\.$", reason)
-    assert key.startswith(f"zero:{arm.joint_names[joint]}:-")
+    assert key.startswith(f"zero:{arm.joint_names[1]}:-")
     mended = mend(arm, wrong, key)
     np.testing.assert_allclose(np.rad2deg(mended.q - data.q), 0, atol=1.0)
     assert calibrate(arm, mended, "minimal,base,tool").verdict.status == "ok"
 
 
-UR10_FILE, PANDA_FILE = "ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"
-
-
 @pytest.mark.parametrize(
-    ("path", "tip", "joints", "factor", "seed"),
+    ("name", "joints", "factor", "seed"),
     some_slow(
         [
-            (UR10_FILE, "tool0", "elbow_joint", 1.1, 0),
-            (PANDA_FILE, "panda_link8", "all", 1.2, 1),
-            *((PANDA_FILE, "panda_link8", "panda_joint4", 1.1, seed) for seed in range(5)),
-            *((UR10_FILE, "tool0", "shoulder_pan_joint", 0.8, seed) for seed in range(5)),
-            *((UR10_FILE, "tool0", "wrist_2_joint", 1.25, seed) for seed in range(5)),
-            *((UR10_FILE, "tool0", "all", 300 / 360, seed) for seed in range(5)),
+            ("ur10", "elbow_joint", 1.1, 0),
+            ("panda", "all", 1.2, 1),
+            *(("panda", "panda_joint4", 1.1, seed) for seed in range(5)),
+            *(("ur10", "shoulder_pan_joint", 0.8, seed) for seed in range(5)),
+            *(("ur10", "wrist_2_joint", 1.25, seed) for seed in range(5)),
+            *(("ur10", "all", 300 / 360, seed) for seed in range(5)),
         ],
         range(2),
     ),
 )
-def test_a_wrong_gear_ratio_is_named_and_mended(path, tip, joints, factor, seed):
+def test_a_wrong_gear_ratio_is_named_and_mended(name, joints, factor, seed):
     """The Panda, whose fit left 7 mm with a gain far from its true one, was "ok"."""
-    arm = Chain.from_urdf(robot_file(path), tip)
+    arm = nominal_arm(name)
     rng, errors = np.random.default_rng(seed), select_parameters(arm, "minimal,base,tool")
     truth = errors.at(0.5 * np.minimum(errors.priors, 0.1) * rng.standard_normal(len(errors.parameters)))
     data = Position.simulate(truth, rng.uniform(-2, 2, (100, arm.n_joints)), Noise(5e-5), rng)
@@ -552,7 +538,7 @@ def test_wrong_joint_errors_of_the_robot_are_no_mistake_in_the_measurements(ur10
 
 
 def test_another_robot_gives_no_hypothesis(ur10):
-    other = Chain.from_urdf(robot_file("ur_description/urdf/ur3_robot.urdf"), "tool0")
+    other = nominal_arm("ur3")
     data = Position.simulate(other, joint_positions(other, 60), Noise(1e-4), np.random.default_rng(1))
     found = diagnose_mixups(ur10, [data.replace(q=data.q)])
     assert found.is_suspicious

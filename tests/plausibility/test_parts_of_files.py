@@ -1,7 +1,5 @@
 """A mistake that begins or ends within a file is stated for its lines only, with a remedy for these."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Joint values with few digits: named if they explain the errors, and more digits help as promised."""
 
-from __future__ import annotations
-
 import json
 import re
 

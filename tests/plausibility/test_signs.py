@@ -1,7 +1,5 @@
 """Signs of simulated servo arms: decided, or stated as open."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

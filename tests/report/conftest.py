@@ -1,7 +1,5 @@
 """Fixtures for the tests of reports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Certificate: what it states, what it leaves to fill in, and how it is printed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """HTML page of the report: its headline, equal bytes for equal input, and how a browser shows it."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Section of the report on images: stages, errors of each image, and errors over the image plane."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Pages of validations and plans: their figures are those of the JSON, and samples can be selected."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Report in a browser: what its scripts do with a mouse and a keyboard, and what is there without them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -13,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from pages import AXE, listen, wait_for
-from robots import robot_file
+from robots import nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import se3
@@ -21,7 +19,6 @@ from dhcal_pin.calibration import Result, calibrate, split
 from dhcal_pin.io import csv_text
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.report import Provenance, result_to_dict, write_report
-from dhcal_pin.robot import Chain
 
 NAME = "a & <b>.csv"
 # Names of the tables that are wider than the page.
@@ -371,7 +368,7 @@ def test_every_section_is_printed(open_page):
 
 def test_the_report_of_1500_samples_takes_at_most_3_megabytes(browser, tmp_path):
     # The links of this robot have detailed meshes.
-    robot = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    robot = nominal_arm("ur10")
     rng = np.random.default_rng(0)
     data = Pose.simulate(robot, rng.uniform(-3, 3, (1500, 6)), Noise(1e-4, 1e-4), rng)
     fitted, held_out = split([data], 0.3, 0)

@@ -1,7 +1,5 @@
 """Sections of the report: statements about accuracy, outliers and few data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,29 +1,14 @@
 """Chain: kinematics against Pinocchio, the DH product and finite differences; refused arguments."""
 
-from __future__ import annotations
-
 import numpy as np
-import pinocchio as pin
 import pytest
-from robots import paper, random_joints, random_table
+from robots import paper, pinocchio_poses, random_joints, random_table
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
 from dhcal_pin.robot import Chain, Payload, Transmission, parse_urdf
 from dhcal_pin.robot.chain import twists_in_bodies
 from dhcal_pin.robot.dh import CONVENTIONS
-
-
-def pinocchio_poses(chain: Chain, q):
-    """Return poses of the tip in the base link, computed one configuration at a time."""
-    model = chain.model
-    data = model.createData()
-    frame = model.getFrameId(chain.tip, pin.FrameType.BODY)
-    out = []
-    for configuration in chain.configurations(q):
-        pin.framesForwardKinematics(model, data, configuration)
-        out.append(data.oMf[frame].homogeneous)
-    return np.array(out)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

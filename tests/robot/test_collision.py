@@ -1,7 +1,5 @@
 """Collisions with floor and obstacles, against geometry by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,14 +1,12 @@
 """Conditions of samples: from the file to backlash and thermal growth, and back to the sidecar."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from robots import robot_file
+from robots import UR10, nominal_arm
 
 import dhcal_pin as dh
 from dhcal_pin.cli.main import main
@@ -27,10 +25,13 @@ from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.robot import Chain, Conditions
 from dhcal_pin.robot.conditions import directions_in_order
 
+# Arms of the slow tests, and their tips.
+TIPS = {"ur10": "tool0", "panda": "panda_hand", "ur5": "tool0"}
+
 
 @pytest.fixture(scope="module")
 def arm() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    return nominal_arm("ur10")
 
 
 def drawn(arm: Chain, m: int, rng: np.random.Generator) -> Conditions:
@@ -171,11 +172,11 @@ def test_family_is_selected_and_improves_the_arm(arm, family, size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robot", ["ur10", "panda", "ur5"])
+@pytest.mark.parametrize("robot", TIPS)
 @pytest.mark.parametrize(("family", "size"), [("backlash", 3.5e-4), ("backlash", 3.5e-3), ("thermal", 2e-5)])
 def test_families_are_selected_in_95_percent_and_remove_80_percent_of_their_error(robot, family, size):
     """The error that the family causes is what is above that of the same arm without it, in squares."""
-    arm = slow_arm(robot)
+    arm = nominal_arm(robot, TIPS[robot])
     selected, removed = 0, []
     for seed in range(20):
         errors = []
@@ -199,21 +200,12 @@ def test_families_are_selected_in_95_percent_and_remove_80_percent_of_their_erro
 @pytest.mark.slow
 def test_neither_family_is_selected_on_200_arms_without_them():
     for seed in range(200):
-        arm, rng = slow_arm(("ur10", "panda", "ur5")[seed % 3]), np.random.default_rng(seed)
+        robot, rng = [*TIPS][seed % 3], np.random.default_rng(seed)
+        arm = nominal_arm(robot, TIPS[robot])
         truth = with_errors(arm, "backlash", 0.0, rng)
         data = Position.simulate(truth, drawn(arm, 100, rng), Noise(5e-5), rng)
         extension = dh.calibrate(arm, data).extension
         assert extension is None or not {"backlash", "thermal"} & set(extension.families), seed
-
-
-def slow_arm(name: str) -> Chain:
-    files = {
-        "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-        "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-        "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
-    }
-    path, tip = files[name]
-    return Chain.from_urdf(robot_file(path), tip)
 
 
 @pytest.mark.parametrize("family", ["backlash", "thermal"])
@@ -334,7 +326,7 @@ def test_wrong_conditions_are_named_in_one_line(arm, columns, words, tmp_path, m
     with pytest.raises((FileFormatError, UnknownNameError)) as caught:
         read_measurements("data.csv", arm)
     assert words in str(caught.value)
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     assert main(["calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf"]) == 2
     err = capsys.readouterr().err
     assert words in " ".join(err.split())
@@ -364,7 +356,7 @@ def test_conditions_go_through_the_command_line(arm, tmp_path, monkeypatch, caps
     for name, m in (("fit.csv", 100), ("other.csv", 50)):
         data = Position.simulate(truth, drawn(arm, m, rng), Noise(2e-5), rng)
         (tmp_path / name).write_text(measurement_text(data, arm))
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     assert main(["calibrate", robot, "fit.csv", "--tip", "tool0", "-o", "out.urdf", "--quiet"]) == 0
     assert main(["validate", "out.urdf", "other.csv", "--json", "v.json", "--quiet"]) == 0
     assert json.loads((tmp_path / "v.json").read_text())["after"]["position_rms_m"] < 6e-5
@@ -400,7 +392,7 @@ def test_targets_in_a_file_have_conditions(arm, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     truth = with_errors(arm, "backlash", 2e-3, np.random.default_rng(11))
     write_urdf(truth, tmp_path / "truth.urdf")
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     # Targets are in the base link, and the tip reaches them.
     free = truth.with_base_and_tool(np.eye(4), np.eye(4))
     wanted = arm.poses(np.random.default_rng(7).uniform(-2, 2, (3, 6)))[:, :3, 3]
@@ -425,7 +417,7 @@ def test_simulate_draws_the_conditions_that_the_robot_depends_on(
 ):
     monkeypatch.chdir(tmp_path)
     write_urdf(with_errors(arm, family, size, np.random.default_rng(12)), tmp_path / "truth.urdf")
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     command = [
         "simulate",
         robot,

@@ -1,14 +1,12 @@
 """Tables of joint corrections: a corrected command brings the joint to the value that is meant."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from robots import random_table, robot_file
+from robots import UR10, nominal_arm, random_table
 
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
@@ -33,7 +31,7 @@ def with_limits(chain: Chain, lower, upper) -> Chain:
 
 @pytest.fixture
 def arm() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    return nominal_arm("ur10")
 
 
 def test_corrected_command_reaches_the_value(arm):
@@ -95,7 +93,7 @@ def read(path: str) -> list[dict[str, str]]:
 def test_calibrate_writes_the_table(capsys, tmp_path, monkeypatch, arm):
     """The table agrees with the sidecar; without harmonics it has only a header, and a warning says why."""
     monkeypatch.chdir(tmp_path)
-    robot = str(robot_file("ur_description/urdf/ur10_robot.urdf"))
+    robot = str(UR10)
     rng = np.random.default_rng(1)
     truth = drawn(arm, "harmonics")
     data = Pose.simulate(truth, rng.uniform(-2, 2, (60, 6)), Noise(1e-5, 1e-5), rng)

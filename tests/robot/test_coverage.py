@@ -1,12 +1,10 @@
 """Bins of joint values against plain counting, lattices against the rank of the harmonics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import DATA, MAPS, SCARA, missing, robot_file, write
+from robots import DATA, MAPS, SCARA, missing, nominal_arm, write
 
 from dhcal_pin.io import read_dh, read_measurements, read_robot
 from dhcal_pin.robot import Chain, JointCoverage, joint_coverage, lattice_warnings
@@ -14,10 +12,6 @@ from dhcal_pin.robot.coverage import BIN_CENTRES, BIN_WIDTH_RAD, N_BINS, bin_ind
 
 # Order of the correction curves of the calibration.
 ORDER = 32
-
-
-def arm() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
 
 
 def one_joint(values: np.ndarray) -> JointCoverage:
@@ -34,7 +28,7 @@ def numerical_rank(values: np.ndarray) -> int:
 
 
 def test_counts_equal_those_of_single_values():
-    chain, rng = arm(), np.random.default_rng(0)
+    chain, rng = nominal_arm("ur10"), np.random.default_rng(0)
     q = rng.uniform(-7, 7, (200, 6))
     for i, coverage in enumerate(joint_coverage(chain, q)):
         assert coverage.joint == chain.joint_names[i]
@@ -64,17 +58,17 @@ def test_any_finite_value_has_a_bin():
 def test_coverage_of_values_near_the_largest_number(recwarn):
     q = np.zeros((3, 6))
     q[1, 0], q[2, 0] = 1.7e308, -1.7e308
-    assert [int(one.counts.sum()) for one in joint_coverage(arm(), q)] == [3] * 6
+    assert [int(one.counts.sum()) for one in joint_coverage(nominal_arm("ur10"), q)] == [3] * 6
     assert not recwarn.list
 
 
 def test_repeated_configurations_count_once():
     q = np.repeat(np.random.default_rng(0).uniform(-2, 2, (20, 6)), 3, axis=0)
-    assert all(coverage.counts.sum() == 20 for coverage in joint_coverage(arm(), q))
+    assert all(coverage.counts.sum() == 20 for coverage in joint_coverage(nominal_arm("ur10"), q))
 
 
 def test_limits_and_gaps():
-    chain = arm()
+    chain = nominal_arm("ur10")
     chain = replace(
         chain,
         lower=np.deg2rad([-170, -360, 90, -20, -180, -1]),
@@ -140,7 +134,7 @@ def test_joint_at_rest_is_no_lattice():
 
 
 def test_grid_of_joint_values_gives_one_sentence_for_each_joint():
-    chain = arm()
+    chain = nominal_arm("ur10")
     axes = np.deg2rad([-60, -20, 20, 60])
     q = np.stack(np.meshgrid(*[axes] * 4), -1).reshape(-1, 4)
     q = np.concatenate([q, np.random.default_rng(0).uniform(-2, 2, (len(q), 2))], 1)
@@ -157,7 +151,7 @@ def test_real_series():
     data = read_measurements(DATA / "positioner_2axis/measurements.csv", positioner)
     texts = lattice_warnings(joint_coverage(positioner, data.q), ORDER)
     assert [text.split()[3] for text in texts] == ["joint_2"]
-    chain = arm()
+    chain = nominal_arm("ur10")
     folder = DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv"
     data = read_measurements(folder, chain, MAPS / "ipa_ur10.toml")
     assert not lattice_warnings(joint_coverage(chain, data.q), ORDER)

@@ -1,29 +1,15 @@
 """DH tables from origins, against the chains they came from and against published tables."""
 
-from __future__ import annotations
-
-from importlib.metadata import distribution
-from pathlib import Path
-
 import numpy as np
 import pinocchio as pin
 import pytest
+from robots import ARMS, robot_file
 from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.robot import DHTable, Extraction, extract_dh
 from dhcal_pin.robot.dh import CONVENTIONS
-
-ROBOTS = Path(
-    str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots"))
-)
-UR = {
-    "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "tool0"),
-}
-PANDA = ("panda_description/urdf/panda.urdf", "panda_link8")
 
 
 def product(origins, prismatic, q):
@@ -93,7 +79,7 @@ def random_table(rng, convention, n=None):
 
 def read_robot(path, tip):
     """Origins with every joint along its z, up to the tip, of a robot of example-robot-data."""
-    model = pin.buildModelFromUrdf(str(ROBOTS / path))
+    model = pin.buildModelFromUrdf(str(robot_file(path)))
     frame = model.frames[model.getFrameId(tip)]
     chain = [j for j in model.supports[frame.parentJoint] if j]
     data = model.createData()
@@ -250,10 +236,10 @@ def test_frames_transform_changes_of_a_row(convention, source, count):
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-@pytest.mark.parametrize("robot", UR)
+@pytest.mark.parametrize("robot", ["ur3", "ur5", "ur10"])
 @pytest.mark.parametrize("count", some_slow([15, 50], {0}))
 def test_ur_arms_have_plain_rows_under_small_errors(robot, convention, count):
-    origins, names, q, poses = read_robot(*UR[robot])
+    origins, names, q, poses = read_robot(*ARMS[robot])
     np.testing.assert_allclose(product(origins, np.zeros(6, bool), q), poses, atol=1e-14)
     reach = np.linalg.norm(origins[:, :3, 3], axis=1).sum()
     assert names[0] == "shoulder_pan_joint"
@@ -286,7 +272,7 @@ def test_ur_arms_have_plain_rows_under_small_errors(robot, convention, count):
     ],
 )
 def test_ur_lengths_agree_with_the_published_ones(robot, d1, a2, a3, d4, d5, d6):
-    table = extract(read_robot(*UR[robot])[0]).table
+    table = extract(read_robot(*ARMS[robot])[0]).table
     np.testing.assert_allclose(np.abs(table.a), [0, a2, a3, 0, 0, 0], atol=1e-8)
     # The maker gives one length along the three parallel axes; the URDF spreads it over brackets.
     found = np.abs([table.d[0], table.d[1:4].sum(), table.d[4], table.d[5]])
@@ -294,7 +280,7 @@ def test_ur_lengths_agree_with_the_published_ones(robot, d1, a2, a3, d4, d5, d6)
 
 
 def test_panda_agrees_with_the_published_modified_table():
-    origins, _, q, poses = read_robot(*PANDA)
+    origins, _, q, poses = read_robot(*ARMS["panda"])
     table = extract(origins, convention="modified").table
     np.testing.assert_allclose(table.poses(q), poses, atol=1e-14)
     np.testing.assert_allclose(table.d, [0.333, 0, 0.316, 0, 0.384, 0, 0], atol=1e-15)
@@ -342,7 +328,7 @@ def test_wrong_arguments_are_refused():
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_mounting_pose_does_not_change_the_other_rows(convention):
     """Wherever the base stands, rows 2 and on are the same, and row 1 has no length of the room in it."""
-    origins = read_robot(*UR["ur5"])[0]
+    origins = read_robot(*ARMS["ur5"])[0]
     table = extract(origins, convention=convention).table
     for mount in ([1, 2, 0, 0, 0, 1.0], [1, 2, 0, 1e-3, 0, 0.5], [0.3, 2, 1, 0.4, 0.3, 0.2]):
         moved = origins.copy()

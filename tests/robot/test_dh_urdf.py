@@ -1,7 +1,5 @@
 """URDF text of DH tables, as other libraries read it."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ET
 

@@ -1,7 +1,5 @@
 """Joint positions over time against the splines of SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline

@@ -1,7 +1,5 @@
 """MJCF against MuJoCo: poses of the files as they are, and after their origins were written."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any
@@ -11,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mjcf_robots import BENCH, ROBOTS, SCARA, UR5E, XARM, mujoco_poses
-from robots import write
+from robots import pinocchio_poses, write
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
@@ -47,15 +45,6 @@ def without_poses(data: bytes, chain: Chain, joints) -> bytes:
 
 def draw(chain: Chain, m: int = 20):
     return np.random.default_rng(0).uniform(-2, 2, (m, chain.n_joints))
-
-
-def pinocchio_poses(chain: Chain, q):
-    model, data = chain.model, chain.model.createData()
-    out = []
-    for row in chain.configurations(q):
-        pin.framesForwardKinematics(model, data, row)
-        out.append(data.oMf[chain.frame_id].homogeneous)
-    return np.array(out)
 
 
 @ARMS

@@ -1,15 +1,12 @@
 """Real arms of example-robot-data: kinematics against other engines, write-back, DH, ranks, calibration."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from robots import robot_file
+from robots import ARMS, nominal_arm, pinocchio_poses, robot_file
 
 from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
@@ -23,30 +20,12 @@ from dhcal_pin.robot import Chain, Conditions, extract_dh_table, read_urdf
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
-ARMS = {
-    "ur3": ("ur_description/urdf/ur3_robot.urdf", "tool0"),
-    "ur5": ("ur_description/urdf/ur5_robot.urdf", "tool0"),
-    "ur10": ("ur_description/urdf/ur10_robot.urdf", "ee_link"),
-    "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
-    "panda_finger": ("panda_description/urdf/panda.urdf", "panda_rightfinger"),
-    "xarm7": ("xarm_description/urdf/xarm7.urdf", "link_eef"),
-    "baxter": ("baxter_description/urdf/baxter.urdf", "left_hand_link"),
-    "kinova": ("kinova_description/robots/kinova.urdf", "j2s6s200_end_effector"),
-    "z1": ("z1_description/urdf/z1.urdf", "gripperMover"),
-    "so100": ("so_arm_description/urdf/so100.urdf", "gripper"),
-    "so101": ("so_arm_description/urdf/so101.urdf", "gripper_link"),
-    "hextilt": ("hextilt_description/urdf/hextilt_flying_arm_5.urdf", "flying_arm_5__gripper"),
-    "finger_edu": ("finger_edu_description/robots/finger_edu.urdf", "finger_tip_link"),
-    "tiago": ("tiago_description/robots/tiago.urdf", "arm_tool_link"),
-    "talos": ("talos_data/robots/talos_left_arm.urdf", "wrist_left_ft_tool_link"),
-    "romeo": ("romeo_description/urdf/romeo.urdf", "l_wrist"),
-}
-ARM = pytest.mark.parametrize("arm", ARMS)
+TIPS = {name: tip for name, (_, tip) in ARMS.items()} | {"ur10": "ee_link", "panda": "panda_hand"}
+ARM = pytest.mark.parametrize("arm", TIPS)
 
 
 def load(arm: str) -> Chain:
-    file, tip = ARMS[arm]
-    return Chain.from_urdf(robot_file(file), tip)
+    return nominal_arm(arm, TIPS[arm])
 
 
 def draw(chain: Chain, m: int, seed: int = 0):
@@ -65,16 +44,6 @@ def stripped(arm: str) -> str:
         'balanceinertia="true"/></mujoco>'
     )
     return re.sub(r"(<robot\b[^>]*>)", r"\1" + compiler, text, count=1, flags=re.S)
-
-
-def pinocchio_poses(chain: Chain, q):
-    model = chain.model
-    data = model.createData()
-    out = []
-    for configuration in chain.configurations(q):
-        pin.framesForwardKinematics(model, data, configuration)
-        out.append(data.oMf[model.getFrameId(chain.tip, pin.FrameType.BODY)].homogeneous)
-    return np.array(out)
 
 
 @ARM

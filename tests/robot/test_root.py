@@ -1,10 +1,8 @@
 """Chains that begin at any link: the path leads up to the last common link and down to the tip."""
 
-from __future__ import annotations
-
 import numpy as np
-import pinocchio as pin
 import pytest
+from robots import pinocchio_poses
 
 from dhcal_pin import Chain, select_parameters
 from dhcal_pin.io import write_urdf
@@ -19,22 +17,11 @@ def talos():
     return read_urdf(resolve_robot_path("example:talos_full_v2"))
 
 
-def relative_poses(chain, q):
-    """Return the poses of the tip in the first link by Pinocchio's model of the whole robot."""
-    model, out = chain.model, []
-    data = model.createData()
-    for configuration in chain.configurations(q):
-        pin.framesForwardKinematics(model, data, configuration)
-        first, last = (data.oMf[model.getFrameId(n, pin.FrameType.BODY)] for n in (chain.root, chain.tip))
-        out.append((first.inverse() * last).homogeneous)
-    return np.array(out)
-
-
 def test_poses_equal_those_of_pinocchio(talos):
     for root, tip in ((HEAD, HAND), (HAND, HEAD), (HEAD, "base_link"), ("torso_2_link", HAND)):
         chain = Chain.from_urdf(talos, tip, root)
         q = np.random.default_rng(0).uniform(-1, 1, (20, chain.n_joints))
-        np.testing.assert_allclose(chain.poses(q), relative_poses(chain, q), atol=1e-12)
+        np.testing.assert_allclose(chain.poses(q), pinocchio_poses(chain, q), atol=1e-12)
 
 
 def test_a_chain_from_the_root_is_as_before(talos):
@@ -54,7 +41,7 @@ def test_errors_of_reversed_joints_are_written_back(talos, root, tip, tmp_path):
     again = Chain.from_urdf(tmp_path / "out.urdf", tip, root)
     q = rng.uniform(-1, 1, (10, chain.n_joints))
     np.testing.assert_allclose(again.poses(q), chain.poses(q), atol=1e-12)
-    np.testing.assert_allclose(relative_poses(chain, q), chain.poses(q), atol=1e-12)
+    np.testing.assert_allclose(pinocchio_poses(chain, q), chain.poses(q), atol=1e-12)
     offsets = select_parameters(nominal, "offset")
     x = 1e-2 * rng.normal(size=len(offsets.parameters))
     by_name = {p.name.removesuffix(".offset"): v for p, v in zip(offsets.parameters, x, strict=True)}

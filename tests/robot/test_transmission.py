@@ -1,7 +1,5 @@
 """Gains, harmonics, compliance and coupling: the formula, the sidecar, and what simulations give back."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace
@@ -9,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import paper, random_table, robot_file, with_masses
+from exported_models import random_conditions
+from robots import UR10, nominal_arm, paper, random_table, with_masses
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.cli.main import main
@@ -18,7 +17,7 @@ from dhcal_pin.estimation.batch import ChainBatch
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
-from dhcal_pin.robot import CONDITIONS, FAMILIES, Chain, Conditions, Payload, parse_urdf
+from dhcal_pin.robot import FAMILIES, Chain, Conditions, Payload, parse_urdf
 from dhcal_pin.robot.transmission import (
     MAX_CURVE_ORDER,
     Transmission,
@@ -31,10 +30,6 @@ from dhcal_pin.robot.transmission import (
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
 
-def ur10() -> Chain:
-    return Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
-
-
 def drawn(chain: Chain, sets: str, rng: np.random.Generator):
     """A chain with errors of the size of the priors, frames a little off, and those errors by name."""
     errors = select_parameters(chain, sets)
@@ -42,24 +37,13 @@ def drawn(chain: Chain, sets: str, rng: np.random.Generator):
     return errors.at(x).with_current_loads(), dict(zip([p.name for p in errors.parameters], x, strict=True))
 
 
-def random_conditions(arm: Chain, m: int, rng: np.random.Generator) -> Conditions:
-    """Random joint positions and all conditions that joint errors depend on."""
-    q = rng.uniform(-2.5, 2.5, (m, arm.n_joints))
-    drawn = {
-        name: condition.draw(rng, q.shape, arm.reference_temperature)
-        for name, condition in CONDITIONS.items()
-        if condition.draw
-    }
-    return Conditions(q, **drawn)
-
-
 @pytest.mark.parametrize(
     "sets", ["gain,coupling,harmonics,curves,backlash,compliance", "harmonics,compliance,thermal"]
 )
 def test_moved_zeros_keep_the_poses(sets):
     rng = np.random.default_rng(0)
-    arm, _ = drawn(ur10(), f"{sets},minimal,offset", rng)
-    alone, _ = drawn(ur10(), "minimal,offset", rng)
+    arm, _ = drawn(nominal_arm("ur10"), f"{sets},minimal,offset", rng)
+    alone, _ = drawn(nominal_arm("ur10"), "minimal,offset", rng)
     arm = replace(arm, urdf_origins=alone.origins).with_current_loads()
     conditions = random_conditions(arm, 6, rng)
     summands = rng.uniform(-0.4, 0.4, arm.n_joints)
@@ -72,9 +56,9 @@ def test_moved_zeros_keep_the_poses(sets):
 def test_actual_positions_follow_the_formula():
     """By a fresh Pinocchio model and plain arithmetic, a joint at a time."""
     rng = np.random.default_rng(0)
-    plain = ur10()
+    plain = nominal_arm("ur10")
     arm, x = drawn(plain, "gain,harmonics,curves,fine-curves,compliance,coupling", rng)
-    model = pin.buildModelFromUrdf(str(robot_file("ur_description/urdf/ur10_robot.urdf")))
+    model = pin.buildModelFromUrdf(str(UR10))
     data = model.createData()
     q = rng.uniform(-2, 2, (10, 6))
     wanted = q.copy()
@@ -109,7 +93,7 @@ def test_harmonics_agree_with_direct_evaluation():
 
 def test_every_coefficient_is_a_parameter_of_one_set():
     """Only the compliance of joints that gravity does not load is no parameter."""
-    sets = {name: PARAMETER_SETS[name](ur10()) for name in FAMILIES}
+    sets = {name: PARAMETER_SETS[name](nominal_arm("ur10")) for name in FAMILIES}
     indices = [p.coefficient_index for parameters in sets.values() for p in parameters]
     assert len(set(indices)) == len(indices)
     counts = {
@@ -164,7 +148,9 @@ def test_gravity_on_a_mimic_joint_loads_its_source():
 @pytest.mark.parametrize("robot", ["ur10", "mimic"])
 def test_derivatives_by_the_highest_harmonics_agree_with_finite_differences(robot):
     """At any coefficients, and at a transmission that does not evaluate these orders itself."""
-    arm = ur10() if robot == "ur10" else Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
+    arm = (
+        nominal_arm("ur10") if robot == "ur10" else Chain.from_urdf(parse_urdf(MIMIC.encode(), "mimic.urdf"))
+    )
     rng, step = np.random.default_rng(4), 1e-6
     errors = select_parameters(arm, "curves,fine-curves")
     q = rng.uniform(-2, 2, (5, arm.n_joints))
@@ -182,14 +168,14 @@ def test_derivatives_by_the_highest_harmonics_agree_with_finite_differences(robo
             np.testing.assert_allclose(unevaluated, velocities, rtol=0, atol=1e-15)
 
 
-def test_single_harmonics_are_fixed_and_freed():
-    names = {p.name for p in select_parameters(ur10(), "base", free=["elbow_joint.sin17"]).parameters}
+def test_single_harmonics_are_fixed_and_freed(ur10):
+    names = {p.name for p in select_parameters(ur10, "base", free=["elbow_joint.sin17"]).parameters}
     assert names == {*(f"base.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")), "elbow_joint.sin17"}
-    errors = select_parameters(ur10(), "curves", fix=["elbow_joint.cos32", "elbow_joint.sin3"])
+    errors = select_parameters(ur10, "curves", fix=["elbow_joint.cos32", "elbow_joint.sin3"])
     assert len(errors.parameters) == 6 * 60 - 2
     assert [p.name for p in errors.fixed] == ["elbow_joint.sin3", "elbow_joint.cos32"]
     with pytest.raises(DhcalError, match=r"cannot free 'elbow_joint.sin65': no such parameter") as caught:
-        select_parameters(ur10(), "base", free=["elbow_joint.sin65"])
+        select_parameters(nominal_arm("ur10"), "base", free=["elbow_joint.sin65"])
     # The choices name the 768 harmonics by joint.
     assert "elbow_joint.sin1 ... cos64 (128 harmonics), wrist_1_joint.sin1" in str(caught.value)
 
@@ -207,7 +193,7 @@ def test_empty_sets_are_refused_with_their_requirement(sim_6dof):
 
 
 def test_batches_refuse_transmission_errors():
-    arm = ur10()
+    arm = nominal_arm("ur10")
     driven, _ = drawn(arm, "gain", np.random.default_rng(0))
     for errors in (select_parameters(arm, "base,gain"), select_parameters(driven, "base")):
         with pytest.raises(DhcalError, match=r"gain, harmonics.*one by one"):
@@ -219,7 +205,9 @@ def test_batches_refuse_transmission_errors():
 
 def test_sidecar_preserves_the_robot(tmp_path):
     rng = np.random.default_rng(1)
-    arm, x = drawn(ur10(), "minimal,base,tool,gain,harmonics,curves,fine-curves,compliance,coupling", rng)
+    arm, x = drawn(
+        nominal_arm("ur10"), "minimal,base,tool,gain,harmonics,curves,fine-curves,compliance,coupling", rng
+    )
     x = {name: float(value) for name, value in x.items()}
     write_urdf(arm, tmp_path / "out.urdf")
     q = rng.uniform(-2, 2, (20, 6))
@@ -269,7 +257,7 @@ def test_sidecar_preserves_the_robot(tmp_path):
     ],
 )
 def test_invalid_joint_table_is_refused(tmp_path, text, words):
-    write_urdf(ur10(), tmp_path / "arm.urdf")
+    write_urdf(nominal_arm("ur10"), tmp_path / "arm.urdf")
     (tmp_path / "arm.calibration.toml").write_text(text)
     with pytest.raises(DhcalError, match=words) as caught:
         read_robot(tmp_path / "arm.urdf", "tool0")
@@ -288,7 +276,7 @@ def test_commands_read_the_sidecar_of_calibrate(tmp_path, monkeypatch, capsys):
     """A drooping arm: calibrated, validated, calibrated again; its root stays where gravity counts on it."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(2)
-    plain = ur10()
+    plain = nominal_arm("ur10")
     truth, _ = drawn(plain, "tool,compliance", rng)
     write_urdf(plain, "arm.urdf")
     for name in ("one", "two"):
@@ -335,7 +323,7 @@ MANY = ("curves", "fine-curves", "coupling")
 )
 def test_simulated_family_is_recovered(family, n_arms):
     """All coefficients within 3 σ but for those that chance may put beyond, and their spread as claimed."""
-    off, arm = [], ur10()
+    off, arm = [], nominal_arm("ur10")
     for seed in range(n_arms):
         rng = np.random.default_rng(seed)
         truth, x = drawn(arm, f"minimal,base,tool,{family}", rng)
@@ -365,7 +353,7 @@ CARRIED = Payload(4.0, (0.02, -0.01, 0.15))
 
 def carried_in_the_file() -> bytes:
     """The UR10 with the payload as a link of its own behind the tip."""
-    text = robot_file("ur_description/urdf/ur10_robot.urdf").read_text()
+    text = UR10.read_text()
     x, y, z = CARRIED.centre
     more = f"""<link name="held"><inertial><origin xyz="{x} {y} {z}"/><mass value="{CARRIED.mass}"/>
       <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial></link>
@@ -376,7 +364,7 @@ def carried_in_the_file() -> bytes:
 def test_payload_has_the_torques_of_a_link_in_the_file():
     q = np.random.default_rng(0).uniform(-2, 2, (6, 20))
     wanted = Chain.from_urdf(parse_urdf(carried_in_the_file(), "held.urdf"), "tool0").loads.torques(q)
-    bare, carrying = ur10(), ur10().with_payload(CARRIED)
+    bare, carrying = nominal_arm("ur10"), nominal_arm("ur10").with_payload(CARRIED)
     np.testing.assert_allclose(carrying.loads.torques(q), wanted, atol=1e-10)
     assert np.abs(bare.loads.torques(q) - wanted).max() > 20
     np.testing.assert_array_equal(carrying.poses(q.T), bare.poses(q.T))
@@ -385,9 +373,9 @@ def test_payload_has_the_torques_of_a_link_in_the_file():
 def test_compliance_under_a_payload_is_recovered_and_saved(tmp_path, monkeypatch, capsys):
     """Told of the payload, calibrate finds the compliance that the truth has, and the sidecar says so."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    (tmp_path / "arm.urdf").write_bytes(UR10.read_bytes())
     rng = np.random.default_rng(2)
-    truth, x = drawn(ur10().with_payload(CARRIED), "minimal,compliance", rng)
+    truth, x = drawn(nominal_arm("ur10").with_payload(CARRIED), "minimal,compliance", rng)
     for name, m in (("fit", 60), ("other", 30)):
         data = Pose.simulate(truth, rng.uniform(-2, 2, (m, 6)), Noise(1e-5, 1e-5), rng)
         (tmp_path / f"{name}.csv").write_text(measurement_text(data, truth, []))
@@ -431,7 +419,7 @@ def test_compliance_under_a_payload_is_recovered_and_saved(tmp_path, monkeypatch
     ],
 )
 def test_invalid_payload_is_refused(tmp_path, table, words):
-    (tmp_path / "arm.urdf").write_bytes(robot_file("ur_description/urdf/ur10_robot.urdf").read_bytes())
+    (tmp_path / "arm.urdf").write_bytes(UR10.read_bytes())
     (tmp_path / "arm.calibration.toml").write_text(f"[payload]\n{table}\n")
     with pytest.raises(DhcalError, match=words):
         read_robot(tmp_path / "arm.urdf", "tool0")
@@ -449,7 +437,7 @@ def test_only_coefficients_of_sines_and_cosines_have_an_order():
 
 def test_terms_are_those_of_the_given_conditions():
     """They are kept from one call to the next, but not for other positions, temperatures, orders or loads."""
-    chain = ur10()
+    chain = nominal_arm("ur10")
     transmission, rng = Transmission.zero(chain.loads), np.random.default_rng(0)
     q = rng.uniform(-2, 2, (5, 6))
     first = transmission.terms(Conditions(q))

@@ -1,7 +1,5 @@
 """URDF reading against Pinocchio and bytes written by hand."""
 
-from __future__ import annotations
-
 import math
 import re
 from itertools import pairwise

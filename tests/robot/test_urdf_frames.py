@@ -1,11 +1,9 @@
 """World joint and tool frame in a URDF, as Pinocchio reads them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
@@ -32,7 +30,7 @@ def test_world_joint_and_tool_frame_have_the_given_poses(mark, sim_6dof):
 
 
 def test_an_existing_world_joint_takes_up_the_base():
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     base = se3.exp6([1.0, 2, 3, 0.1, 0.2, 0.3])
     placed = Chain.from_urdf(parse_urdf(with_world(chain.urdf.data, base), "x"), "tool0")
     q = np.zeros((1, 6))

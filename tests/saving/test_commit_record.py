@@ -1,7 +1,5 @@
 """Records of commits: completed by the next command, harmless if they come from somebody else."""
 
-from __future__ import annotations
-
 import json
 import os
 

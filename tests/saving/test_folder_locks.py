@@ -1,7 +1,5 @@
 """Several runs that save the same files: one after the other."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

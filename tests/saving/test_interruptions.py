@@ -1,7 +1,5 @@
 """Saving that is interrupted, ended or killed at any instruction: all files or none."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

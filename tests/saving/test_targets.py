@@ -1,7 +1,5 @@
 """Devices, pipes and open descriptors are written to and stay what they are."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat

@@ -1,7 +1,5 @@
 """Saving: all files or none."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

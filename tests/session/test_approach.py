@@ -1,13 +1,10 @@
 """Backlash of the joints of files that state no directions of motion, from the order of their samples."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
-from robots import with_small_errors
-from sessions import nominal_arm
+from robots import nominal_arm, with_small_errors
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate

@@ -1,7 +1,5 @@
 """Files of one arm whose measuring frames differ by large rotations, against the true arm and motions."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras and boards that move while photographs are taken."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from itertools import product

@@ -1,12 +1,10 @@
 """Sessions of an arm with gear errors and elastic joints: changes are found, and none are invented."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
 import pytest
-from sessions import nominal_arm
+from robots import nominal_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3

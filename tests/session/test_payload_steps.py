@@ -1,15 +1,13 @@
 """Sessions of an elastic arm that takes up a load: the load is named, and no motion of the base."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
-from robots import robot_file
-from sessions import ANGLE_NOISE, ARMS, NOISE, Simulation
+from robots import ARMS, robot_file
+from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3

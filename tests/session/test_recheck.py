@@ -1,7 +1,5 @@
 """Checks of calibrated arms, simulated with Pinocchio and NumPy only, against the change that was made."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from functools import cache
@@ -11,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from sessions import ANGLE_NOISE, NOISE, Simulation, nominal_arm
+from command_line import error_of, json_of
+from robots import nominal_arm
+from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, select_parameters
@@ -183,7 +183,7 @@ def test_it_cannot_say():
         recheck(fit.chain, [Inclination.simulate(fit.chain, q, Noise(0, 1e-4), sim.rng)], fit.uncertainty)
 
 
-def test_command(tmp_path: Path, capsys):
+def test_command(tmp_path: Path, run, capsys):
     sim, fit, q = calibrated("ur10", 7, Position)
     robot, history = tmp_path / "cal.urdf", tmp_path / "h.jsonl"
     write_urdf(fit, robot)
@@ -203,20 +203,16 @@ def test_command(tmp_path: Path, capsys):
     assert "joint wrist_1_joint" in (tmp_path / "h.html").read_text()
     history.write_text(history.read_text() + "{}\n")
     before = history.read_text()
-    assert main(args) == 2
-    assert f"{history}:3: time is missing" in capsys.readouterr().err
+    assert f"{history}:3: time is missing" in error_of(run(*args))
     assert history.read_text() == before
     history.write_text("[" * 10**5)
-    assert main(args) == 2
-    assert f"{history}:1: not JSON" in capsys.readouterr().err
+    assert f"{history}:1: not JSON" in error_of(run(*args))
     history.unlink()
     joints = ",".join(f"{name}[rad]" for name in fit.chain.joint_names)
     data.write_text(f"{joints},corner,u[px],v[px]\n0,0,0,0,0,0,1,2,3\n")
-    assert main(args) == 2
-    assert f"{data}: recheck does not use images; expected positions or poses" in capsys.readouterr().err
+    assert f"{data}: recheck does not use images; expected positions or poses" in error_of(run(*args))
     (tmp_path / "cal.calibration.toml").unlink()
-    assert main(args) == 2
-    assert "no sidecar" in capsys.readouterr().err
+    assert "no sidecar" in error_of(run(*args))
 
 
 @pytest.mark.parametrize("arm", ["ur10", "panda"])
@@ -344,18 +340,16 @@ def test_backlash_counts_as_uncertainty_where_directions_are_unknown(n_known):
     assert changed_zero.verdict == "changed"
 
 
-def test_mistakes_in_files_are_named_beside_the_answer(tmp_path: Path, capsys):
+def test_mistakes_in_files_are_named_beside_the_answer(tmp_path: Path, run, capsys):
     sim, fit, q = calibrated("ur10", 7, Position)
     robot, file = tmp_path / "cal.urdf", tmp_path / "check.csv"
     write_urdf(fit, robot)
     text = measurement_text(measured(sim, q, Position, True), fit.chain, [])
     args = ["recheck", str(robot), str(file), "--tip"]
     file.write_text(text)
-    assert main([*args, "ee_link"]) == 2
-    assert "tip ee_link; expected --tip tool0" in capsys.readouterr().err
+    assert "tip ee_link; expected --tip tool0" in error_of(run(*args, "ee_link"))
     file.write_text(measurement_text(fit.data[0], fit.chain, []))
-    assert main([*args, "tool0", "--json", "-"]) == 0
-    assert "60 of 60 rows were fitted" in json.loads(capsys.readouterr().out)["warnings"][0]
+    assert "60 of 60 rows were fitted" in json_of(run(*args, "tool0", "--json", "-"))["warnings"][0]
     assert "x[m],y[m],z[m]" in text
     file.write_text(text.replace("x[m],y[m],z[m]", "y[m],x[m],z[m]"))
     assert main([*args, "tool0", "--json", "-"]) == 2

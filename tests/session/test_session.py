@@ -1,7 +1,5 @@
 """What happens during a session is found, named and accounted for, and nothing is found in clean sets."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import product
@@ -9,12 +7,12 @@ from itertools import product
 import numpy as np
 import pinocchio as pin
 import pytest
-from robots import DATA, MAPS, missing, robot_file
+from robots import ARMS, DATA, MAPS, missing, nominal_arm, robot_file
 from scipy.stats import multivariate_normal
-from sessions import ARMS, Changes, Simulation, nominal_arm, write_csv
+from sessions import Changes, Simulation, session_of, write_csv
 from slow_cases import some_slow
 
-from dhcal_pin import Result, calibrate, se3
+from dhcal_pin import calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, select_parameters
@@ -24,7 +22,6 @@ from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
-from dhcal_pin.session import Session
 from dhcal_pin.session import search as search_module
 from dhcal_pin.session.causes import Cause, Drift, FreeDrift, Step
 from dhcal_pin.session.facts import Scale, SlowChange
@@ -340,12 +337,6 @@ def test_a_session_of_one_time_has_no_drift():
 def test_nothing_drifts_before_and_after_a_session(shape):
     begin, before, end, after = shape.values(np.arange(4), np.array([2.0, 0.0, 6.0, 9.0]))
     np.testing.assert_allclose([before, end, after], [begin, 0 * begin, 0 * begin], atol=1e-12)
-
-
-def session_of(fit: Result) -> Session:
-    """Return what was found in a calibration."""
-    assert fit.session is not None
-    return fit.session
 
 
 EVENTS = {
@@ -770,7 +761,7 @@ def test_nothing_happened_in_the_public_series_of_a_ur10(series):
     """Left-out blocks of time of these series are not predicted better by any event or drift."""
     if not DATA.exists():
         missing(f"measurements at {DATA}")
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     data = read_measurements(DATA / f"ipa_ur10/Series_{series}.csv", chain, MAPS / "ipa_ur10.toml")
     assert not session_of(calibrate(chain, data, extend="none")).found
 

@@ -1,7 +1,5 @@
 """Sessions along smooth paths: errors that the model of an arm does not contain are no change over time."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

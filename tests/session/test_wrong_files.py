@@ -1,19 +1,16 @@
 """Mistakes in a whole file, with and without an event of the session."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
 import pytest
-from sessions import Changes, Simulation
+from sessions import Changes, Simulation, session_of
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import Result, calibrate
 from dhcal_pin.measurements import Measurement, Pose, Position
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.plausibility.mixups import diagnose_mixups
-from dhcal_pin.session import Session
 
 DEGREE = np.deg2rad(1.0)
 NOTHING = Changes()
@@ -32,12 +29,6 @@ def with_mistake(data: Measurement, name: str, joint: int) -> tuple[Measurement,
     else:
         q[:, joint] += 90 * DEGREE
     return data.resample(q), f"{name}:{{}}" + ":-90deg" * (name == "zero")
-
-
-def session_of(fit: Result) -> Session:
-    """Return what was found in a calibration."""
-    assert fit.session is not None
-    return fit.session
 
 
 def judge(arm: str, seed: int, kind: type[Measurement], name: str, joint: int, event: str) -> Result:

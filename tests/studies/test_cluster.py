@@ -1,7 +1,5 @@
 """Work shared out to a real Dask scheduler with two workers, one of which may die."""
 
-from __future__ import annotations
-
 import os
 import signal
 import warnings

@@ -1,7 +1,5 @@
 """Study files: invalid ones are refused with a message, and those of the package can be read."""
 
-from __future__ import annotations
-
 import pytest
 from robots import URDF
 from study_runs import SMALL_STUDY

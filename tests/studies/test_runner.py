@@ -1,7 +1,5 @@
 """Studies against verified figures of the paper's simulations; shared out, killed and taken up again."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

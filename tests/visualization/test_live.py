@@ -1,7 +1,5 @@
 """The live scene listens on this computer only, shows Pinocchio's poses, and reports a dead server."""
 
-from __future__ import annotations
-
 import os
 import signal
 import webbrowser

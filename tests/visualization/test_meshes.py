@@ -1,7 +1,5 @@
 """What links look like: meshes cut down to size, and rods where one is missing."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

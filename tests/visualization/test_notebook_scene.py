@@ -1,7 +1,5 @@
 """A notebook that was executed and saved still shows the scene, and so does its HTML."""
 
-from __future__ import annotations
-
 import nbformat
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Plots: what is drawn where, the same SVG for the same data, and no import of matplotlib before a plot."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

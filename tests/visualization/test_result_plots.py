@@ -1,7 +1,5 @@
 """Methods of results, plans and studies that draw them: what is drawn, and in which units."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

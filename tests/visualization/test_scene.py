@@ -1,7 +1,5 @@
 """The offline page: what it shows is proven by its pixels, where it says the tool is by Pinocchio."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

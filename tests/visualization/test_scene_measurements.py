@@ -1,7 +1,5 @@
 """What the page shows of measurements: sets, arrows, picked samples, cells, frames; keyboard."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise

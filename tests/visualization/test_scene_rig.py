@@ -1,7 +1,5 @@
 """Cameras and boards in a scene: viewing pyramids, boards, and lines of sight."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

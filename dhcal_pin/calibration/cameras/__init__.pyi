@@ -2,18 +2,13 @@
 
 from .arm_types import arm_type as arm_type
 from .axis_order import Exchange as Exchange
-from .axis_order import axis_stages as axis_stages
 from .axis_order import exchange_axes as exchange_axes
 from .axis_order import reorder as reorder
 from .board_size import BoardSize as BoardSize
-from .board_size import find_board_size as find_board_size
 from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import describe_contradiction as describe_contradiction
-from .gate import apply_gate as apply_gate
-from .gate import judge_stages as judge_stages
-from .gate import judge_target_points as judge_target_points
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
 from .image_checks import describe_weak_positions as describe_weak_positions
 from .image_checks import largest_fixed_std as largest_fixed_std
@@ -23,8 +18,6 @@ from .image_checks import second_rotation as second_rotation
 from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .image_checks import small_ranges as small_ranges
 from .image_session import fit_image_session as fit_image_session
-from .lens_priors import lens_prior_groups as lens_prior_groups
-from .lens_priors import with_lens_priors as with_lens_priors
 from .lens_priors import with_stated_distortion as with_stated_distortion
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images
@@ -43,5 +36,4 @@ from .sets import require_joint_values as require_joint_values
 from .sets import split_sets as split_sets
 from .stages import ImageError as ImageError
 from .stages import Stage as Stage
-from .stages import fitted_error as fitted_error
 from .target_points import judged_boards as judged_boards

@@ -30,15 +30,15 @@ def run(args: Namespace) -> int:
     from ...parallel import open_executor  # lazy import, as the following: they load Pinocchio
     from ...saving import complete_interrupted_save
     from ..output_table import Output
-    from ..outputs import checked_files, existing_sidecars, require_writable_outputs, written_files
+    from ..outputs import checked_files, existing_sidecars, written_files
 
     is_file = os.path.exists(args.study) or args.study.endswith(".toml")
     path = args.study if is_file else io.shipped_file(f"{args.study}.study.toml")
     journal_path = f"{args.output}.part"
     study = studies.read_study(path)
     inputs = [os.fspath(path), *study.robots, *existing_sidecars(study.robots)]
-    checked_files(args, {"output": Output("a table of results", (".csv",)), "json": Output()}, inputs)
-    require_writable_outputs([args.output, journal_path, _figure_path(args.output), args.json], inputs)
+    table = {"output": Output("a table of results", (".csv",)), "json": Output()}
+    checked_files(args, table, inputs, [journal_path, _figure_path(args.output)])
     complete_interrupted_save(journal_path)
     total = len(study.tasks())
     n_done = 0

@@ -1,7 +1,5 @@
 """Column maps: every key, every convention of rotations, and errors that name the problem."""
 
-from __future__ import annotations
-
 import itertools
 import json
 

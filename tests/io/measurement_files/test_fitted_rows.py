@@ -1,16 +1,13 @@
 """Digests of fitted rows."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 
 import numpy as np
-from robots import robot_file
+from robots import nominal_arm
 
 from dhcal_pin.io.measurement_files.fitted_rows import MAX_ROWS, count_fitted_rows, fitted_row_digests
 from dhcal_pin.measurements import KINDS, Noise, Position
-from dhcal_pin.robot import Chain
 
 
 def test_a_digest_is_that_of_the_documented_numbers():
@@ -22,7 +19,7 @@ def test_a_digest_is_that_of_the_documented_numbers():
 
 def test_rows_of_every_kind_are_recognized_by_their_values():
     """Known distances between points are no measurements of the robot."""
-    chain = Chain.from_urdf(robot_file("ur_description/urdf/ur10_robot.urdf"), "tool0")
+    chain = nominal_arm("ur10")
     rng = np.random.default_rng(0)
     for kind in KINDS.values():
         is_of_robot = kind.configurations_per_row > 0

@@ -1,7 +1,5 @@
 """The column `image`: it names the images for people, and changes nothing else."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

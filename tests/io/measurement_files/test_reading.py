@@ -1,7 +1,5 @@
 """Measurement files: units, digits, rotations, and errors that name the problem."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

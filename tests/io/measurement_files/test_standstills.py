@@ -1,7 +1,5 @@
 """Stops of recorded series: motion without stops, interruptions, drop-outs, unrelated series."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Corners files with poses of the tip in place of joint values."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Text files: CSV tables and TOML."""
 
-from __future__ import annotations
-
 import csv
 import zipfile
 
