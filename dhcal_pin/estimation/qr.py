@@ -29,7 +29,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack, svd
+from scipy.linalg import lapack, qr, svd
 
 from .._frozen import frozen
 from .._kernels import append_diagonal, r_factor
@@ -44,6 +44,8 @@ RANK_RTOL = 1e-9
 WELL_CONDITIONED = 1e3 * RANK_RTOL
 # Number of columns that LAPACK eliminates together.
 _BLOCK_COLUMNS = 64
+# Columns count as combinations of others if these leave less than this fraction of the largest column of them.
+_COMBINATION_RTOL = 1e-15
 
 
 def blocked_r_factor(rows: Array) -> Array:
@@ -53,6 +55,16 @@ def blocked_r_factor(rows: Array) -> Array:
     r = np.zeros((c, c), order="F")
     r = lapack.dtpqrt(0, _BLOCK_COLUMNS, r, rows.reshape(c, -1).T, overwrite_a=1, overwrite_b=1)[0]
     return np.ascontiguousarray(r)
+
+
+def independent_columns(a: Array) -> tuple[Array, Array]:
+    """Find the numbers (k,) of columns of which all are combinations, and the coefficients of these, (k, n)."""
+    r, order = qr(np.linalg.qr(a, mode="r"), mode="r", pivoting=True, check_finite=False)
+    pivots = np.abs(np.diag(r))
+    k = int(np.sum(pivots > _COMBINATION_RTOL * pivots.max(initial=0.0)))
+    coefficients = np.zeros((k, len(order)))
+    coefficients[:, order] = lapack.dtrtrs(r[:k, :k], r[:k])[0] if k else coefficients
+    return order[:k], coefficients
 
 
 def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
@@ -70,9 +82,16 @@ def singular_values(r: Array) -> Array:
     return np.linalg.svd(r, compute_uv=False)
 
 
+def right_singular_vectors(r: Array) -> tuple[Array, Array]:
+    """Compute the singular values of R and its right singular vectors, the rows of a matrix (p, p)."""
+    # Rows of zeros only add singular values of 0.
+    _, s, vt = singular_value_decomposition(r[r.any(1)])
+    return np.append(s, np.zeros(len(vt) - len(s))), vt
+
+
 def row_space(r: Array) -> Array:
     """Compute an orthonormal basis of the observable directions in parameter space."""
-    _, s, vt = singular_value_decomposition(r)
+    s, vt = right_singular_vectors(r)
     return vt[: len(_without_zeros(s))]
 
 
@@ -88,7 +107,7 @@ def rank(r: Array) -> int:
 
 def null_space(r: Array) -> Array:
     """Compute an orthonormal basis of the directions that the data do not determine."""
-    _, s, vt = singular_value_decomposition(r)
+    s, vt = right_singular_vectors(r)
     return vt[len(_without_zeros(s)) :].T
 
 
