@@ -44,7 +44,7 @@ RANK_RTOL = 1e-9
 WELL_CONDITIONED = 1e3 * RANK_RTOL
 # Number of columns that LAPACK eliminates together.
 _BLOCK_COLUMNS = 64
-# Columns count as combinations of others if these leave less than this fraction of the largest column of them.
+# Columns count as combinations of others that leave less than this fraction of the largest column.
 _COMBINATION_RTOL = 1e-15
 
 
@@ -58,7 +58,7 @@ def blocked_r_factor(rows: Array) -> Array:
 
 
 def independent_columns(a: Array) -> tuple[Array, Array]:
-    """Find the numbers (k,) of columns of which all are combinations, and the coefficients of these, (k, n)."""
+    """Find numbers (k,) of columns of which all are combinations, and the coefficients of these, (k, n)."""
     r, order = qr(np.linalg.qr(a, mode="r"), mode="r", pivoting=True, check_finite=False)
     pivots = np.abs(np.diag(r))
     k = int(np.sum(pivots > _COMBINATION_RTOL * pivots.max(initial=0.0)))
