@@ -201,10 +201,10 @@ class _Search:
                 rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
         return rows
 
-    def _cause_columns(self, rows: Array, causes: Sequence[Cause]) -> Array:
-        """Return the columns of causes, (N, k, ·)."""
+    def _columns(self, rows: Array, causes: Sequence[Cause], *others: Array) -> Array:
+        """Return the columns of the unknowns, of causes, and others (N, k, ·), (N, k, ·)."""
         parts = [cause.columns_of(rows, self.numbers, self.times) for cause in causes]
-        return np.concatenate([rows[..., :0], *parts], -1)
+        return np.concatenate([rows[..., self.layout.model], *parts, *others], -1)
 
     def _prior(self, causes: Sequence[Cause]) -> Array:
         """Return the weights of the priors of the unknowns and of causes, (p,)."""
@@ -213,13 +213,11 @@ class _Search:
 
     def _columns_without(self, cause: Cause, rows: Array, causes: Sequence[Cause]) -> Array:
         """Return the columns of the unknowns and of causes, and the residual as if one were left out."""
-        residual = self._undone(rows, cause)[..., -1:]
-        return np.concatenate([rows[..., self.layout.model], self._cause_columns(rows, causes), residual], -1)
+        return self._columns(rows, causes, self._residual_without(rows, cause)[..., None])
 
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
         """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
-        layout = self.layout
-        columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
+        columns = self._columns(rows, causes)
         residual, prior = rows[..., -1], self._prior(causes)
         value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
@@ -556,8 +554,12 @@ class _Search:
     def _undone(self, rows: Array, cause: Cause) -> Array:
         """Return the rows as if a cause had been left out of the model."""
         undone = rows.copy()
-        undone[..., -1] += cause.columns_of(rows, self.numbers, self.times) @ cause.values
+        undone[..., -1] = self._residual_without(rows, cause)
         return undone
+
+    def _residual_without(self, rows: Array, cause: Cause) -> Array:
+        """Return the residuals (N, k) as if a cause had been left out of the model."""
+        return rows[..., -1] + cause.columns_of(rows, self.numbers, self.times) @ cause.values
 
     def _move_steps(self, fit: LinearFit) -> bool:
         """Move each step to where the samples before and after it fit best; return whether one moved."""
@@ -720,6 +722,9 @@ class _Search:
 
     def other_robot(self) -> Event | None:
         """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
+        steps = sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)})
+        if not steps:
+            return None
         rows = self.linearize()
         one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
         geometric = [c for c in self.layout.model if c < len(names) and names[c].coefficient_index is None]
@@ -731,7 +736,7 @@ class _Search:
             return None  # Two robots fit so few samples whatever was measured.
         needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
-        for first in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):
+        for first in steps:
             others = [c for c in self.causes if c.shape != Step(first)]
             number, two = self._second_robot(rows, others, block, first)
             gain = count * float(np.mean(np.log(one.noise / two.noise)))

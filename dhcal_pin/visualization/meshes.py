@@ -15,10 +15,12 @@ Meshes are stored with vertices on a grid of integers, and large ones are simpli
 from __future__ import annotations
 
 import base64
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import field
 from functools import lru_cache, partial
+from operator import itemgetter
 from typing import Any
 from xml.etree import ElementTree
 
@@ -264,9 +266,9 @@ class Mesh:
     @classmethod
     def from_geometry(cls, geometry: Any) -> Mesh:
         """Convert a mesh that Coal has read."""
-        numbers = range(_Mesh.num_tris.__get__(geometry))
-        faces = [(t[0], t[1], t[2]) for t in map(partial(_Mesh.tri_indices, geometry), numbers)]
-        return cls.on_grid(np.asarray(_Mesh.vertices(geometry), float), np.array(faces, int).reshape(-1, 3))
+        faces = map(partial(_Mesh.tri_indices, geometry), range(_Mesh.num_tris.__get__(geometry)))
+        numbers = np.fromiter(itertools.chain.from_iterable(map(itemgetter(0, 1, 2), faces)), int)
+        return cls.on_grid(np.asarray(_Mesh.vertices(geometry), float), numbers.reshape(-1, 3))
 
     @classmethod
     def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:
