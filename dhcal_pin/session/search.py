@@ -157,6 +157,8 @@ class _Search:
         self.has_different_rows = n_different >= MIN_DIFFERENT_ROWS_PER_UNKNOWN * len(problem.weights)
         self.rows = self.linearize()
         self.layout = self.layout.restricted_to(self.rows)
+        # Columns of all causes.
+        self.tested = np.unique(np.concatenate([block.columns for block in self.layout.blocks]))
         self.first_fit = self.solve(self.rows, [])
 
     def _noise_groups(self) -> Array:
@@ -308,7 +310,7 @@ class _Search:
 
     def _candidates(self, fit: LinearFit) -> Iterator[Cause]:
         """Yield the causes that are not in a fit, the function of time of greatest evidence of each."""
-        cells, cross = self._products(fit)
+        products = self._products(fit)
         # Blocks with the same number of columns and the same functions of time are tested at once.
         alike: dict[tuple[type[Shape], int, tuple[int, ...]], list[Block]] = {}
         for block in self.layout.blocks:
@@ -317,7 +319,7 @@ class _Search:
                 alike.setdefault((kind, len(block.columns), taken), []).append(block)
         for (kind, _, taken), blocks in alike.items():
             if shapes := self._shapes(kind, taken):
-                yield from self._scores(fit, blocks, shapes, cells, cross)
+                yield from self._scores(fit, blocks, shapes, products)
 
     def _follows_configuration(self, rows: Array, i: int) -> bool:
         """Return whether a function of the configuration explains the samples as well as a cause does."""
@@ -360,16 +362,12 @@ class _Search:
         share = float(np.mean(self.numbers < cause.shape.number))
         return min(share, 1 - share)
 
-    def _products(self, fit: LinearFit) -> tuple[Array, Array]:
-        """Return the inner products of each cell: of the rows, and of rows and columns of the fit."""
-        p = len(self.layout.model)
-        columns = np.concatenate([fit.columns[..., p:], fit.rows], -1)
+    def _products(self, fit: LinearFit) -> Array:
+        """Return the products of tested columns with those of the fit, tested ones and residuals, by cell."""
+        columns = np.concatenate([fit.columns, fit.rows[..., self.tested], fit.residual[..., None]], -1)
         columns /= fit.noise[..., None]
         columns[..., -1] = fit.residual * fit.weights[:, None]
-        q = fit.columns.shape[-1] - p
-        products = _cell_products(columns, self.edges)[:, q:]
-        of_fit = np.concatenate([q + self.layout.model, np.arange(q)])
-        return products[:, :, q:], products[:, :, of_fit]
+        return _cell_products(columns, self.edges, slice(fit.columns.shape[-1], -1))
 
     def _kinds(self, block: Block) -> list[type[Shape]]:
         """Return the types of functions of time that are tested for a block."""
@@ -406,13 +404,13 @@ class _Search:
         return [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
 
     def _scores(
-        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], cells: Array, cross: Array
+        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], products: Array
     ) -> Iterator[Cause]:
         """Yield the cause of greatest evidence among functions of time of each of several blocks."""
-        own = np.array([block.columns for block in blocks])
+        own, p = np.searchsorted(self.tested, [block.columns for block in blocks]), fit.columns.shape[-1]
         firsts = self.edges[:-1]
         # Products of each cell, (K, B, c, ·).
-        parts = [cells[:, own[:, :, None], own[:, None]], cells[:, own, -1], cross[:, own]]
+        parts = [products[:, own[:, :, None], p + own[:, None]], products[:, own, -1], products[:, own, :p]]
         if isinstance(shapes[0], Step):
             steps = [shape.number for shape in shapes if isinstance(shape, Step)]
             ends = np.searchsorted(self.numbers[firsts], steps)
@@ -539,7 +537,7 @@ class _Search:
         if not places:
             return []
         fit = self.solve(self._undone(rows, drift), others)
-        found = self._scores(fit, [block], places, *self._products(fit))
+        found = self._scores(fit, [block], places, self._products(fit))
         return [cause.shape for cause in found if isinstance(cause.shape, Step)]
 
     def _drop_others(self) -> None:
@@ -868,10 +866,10 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
     return found is not None and found.log_evidence > MIN_SCREENED_EVIDENCE
 
 
-def _cell_products(rows: Array, edges: Array) -> Array:
-    """Return the inner products of the columns of each cell, (K, c, c)."""
+def _cell_products(rows: Array, edges: Array, some: slice = np.s_[:]) -> Array:
+    """Return the inner products of some columns of each cell with all columns, (K, ·, c)."""
     if np.ptp(np.diff(edges)) == 0:
         cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
-        return cells.swapaxes(1, 2) @ cells
+        return cells[..., some].swapaxes(1, 2) @ cells
     cells = (rows[a:b].reshape(-1, rows.shape[-1]) for a, b in pairwise(edges))
-    return np.array([cell.T @ cell for cell in cells])
+    return np.array([cell[:, some].T @ cell for cell in cells])
