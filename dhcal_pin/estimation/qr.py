@@ -29,7 +29,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack, qr, svd
+from scipy.linalg import lapack, svd
 
 from .._frozen import frozen
 from .._kernels import append_diagonal, r_factor
@@ -61,7 +61,8 @@ def blocked_r_factor(rows: Array) -> Array:
 
 def independent_columns(a: Array) -> tuple[Array, Array]:
     """Find numbers (k,) of columns of which all are combinations, and the coefficients of these, (k, n)."""
-    r, order = qr(np.linalg.qr(a, mode="r"), mode="r", pivoting=True, check_finite=False)
+    packed, numbers = lapack.dgeqp3(np.linalg.qr(a, mode="r"))[:2]
+    r, order = np.triu(packed), numbers - 1
     pivots = np.abs(np.diag(r))
     k = int(np.sum(pivots > _COMBINATION_RTOL * pivots.max(initial=0.0)))
     coefficients = np.zeros((k, len(order)))
