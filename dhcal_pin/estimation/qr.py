@@ -94,7 +94,7 @@ def right_singular_vectors(r: Array) -> tuple[Array, Array]:
 
 def row_space(r: Array) -> Array:
     """Compute an orthonormal basis of the observable directions in parameter space."""
-    s, vt = right_singular_vectors(r)
+    _, s, vt = singular_value_decomposition(r)
     return vt[: len(_without_zeros(s))]
 
 
@@ -110,7 +110,7 @@ def rank(r: Array) -> int:
 
 def null_space(r: Array) -> Array:
     """Compute an orthonormal basis of the directions that the data do not determine."""
-    s, vt = right_singular_vectors(r)
+    _, s, vt = singular_value_decomposition(r)
     return vt[len(_without_zeros(s)) :].T
 
 
