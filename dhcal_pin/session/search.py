@@ -213,9 +213,13 @@ class _Search:
         # A prior of one metre decides what the measurements do not show, such as turns of a point.
         return np.concatenate([self.layout.weights, *(1 / cause.sizes for cause in causes)])
 
-    def _columns_without(self, cause: Cause, rows: Array, causes: Sequence[Cause]) -> Array:
-        """Return the columns of the unknowns and of causes, and the residual as if one were left out."""
-        return self._columns(rows, causes, self._residual_without(rows, cause)[..., None])
+    def _weighted_columns(
+        self, fit: LinearFit, without: Cause, rows: Array, causes: Sequence[Cause]
+    ) -> Array:
+        """Return weighted columns of the unknowns and of causes, and the residual as if one were left out."""
+        columns = self._columns(rows, causes, self._residual_without(rows, without)[..., None])
+        columns *= (np.sqrt(fit.weights)[:, None] / fit.noise)[..., None]
+        return columns
 
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
         """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
@@ -497,8 +501,7 @@ class _Search:
 
     def _change_drifts(self, fit: LinearFit) -> bool:
         """Replace each drift by the drift or step that fits best; return whether one changed."""
-        n_rows, scaled = float(np.sum(self.groups >= 0)), np.sqrt(fit.weights)[:, None] / fit.noise
-        has_changed = False
+        n_rows, has_changed = float(np.sum(self.groups >= 0)), False
         for i, cause in enumerate(self.causes):
             old = cause.shape
             if not isinstance(old, Drift | FreeDrift):
@@ -512,7 +515,9 @@ class _Search:
             if isinstance(old, FreeDrift):
                 tried.append(cause)
             tried += [replace(simple, shape=step) for step in self._best_steps(cause, rows, others)]
-            products = _information(self._columns_without(cause, rows, [*others, *tried]), scaled)
+            columns = self._weighted_columns(fit, cause, rows, [*others, *tried])
+            flat = columns.reshape(-1, columns.shape[-1])
+            products = flat.T @ flat
             prior = self._prior([*others, *tried])
             ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
             # Each coefficient costs the logarithm of the number of rows; a linear drift is the simplest one.
@@ -610,8 +615,7 @@ class _Search:
         cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
         without = self.solve(self._undone(rows, cause), others)
         # The same noise and weights for both.
-        scaled = np.sqrt(full.weights)[:, None] / full.noise
-        stack = self._columns_without(cause, rows, [*others, cause]) * scaled[..., None]
+        stack = self._weighted_columns(full, cause, rows, [*others, cause])
         prior = self._prior([*others, cause])
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
