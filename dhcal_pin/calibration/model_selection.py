@@ -82,6 +82,7 @@ from ..estimation.folds import (
     NoisyFold,
     NoisyRows,
     count_rows,
+    factor_folds,
     factor_partition,
     solve_columns,
 )
@@ -101,7 +102,7 @@ from .partition import (
     contact_groups,
     different_configurations,
     k_fold,
-    region_partitions,
+    quadrant_folds,
 )
 from .reweighting import Fit, leverages, reweight, with_sigma_scales
 
@@ -558,8 +559,7 @@ def _region_errors(problem: Problem, x: Array, noise: float, temperature: float)
     # Rows, squared error and predicted variance. The systems of one region are in memory at a time.
     found = [
         (fold.n_rows, fold.error(weights, x, columns) ** 2, fold.prediction_std(weights, columns) ** 2)
-        for folds in region_partitions(problem.data, contact_groups(problem, x))
-        for fold in factor_partition(problem, x, folds)
+        for fold in factor_folds(problem, x, quadrant_folds(problem.data, contact_groups(problem, x)))
         if fold.n_rows
     ]
     if not found:

@@ -221,13 +221,11 @@ def blocked_folds(
     return tuple(folds.values())
 
 
-def region_partitions(
-    data: Measurement | Sequence[Measurement], groups: Array
-) -> tuple[tuple[Fold, ...], ...]:
-    """Divide the samples into four regions by the medians along each pair of principal directions."""
+def quadrant_folds(data: Measurement | Sequence[Measurement], groups: Array) -> tuple[Fold, ...]:
+    """Make four folds per pair of principal directions of the joint values, divided by the medians."""
     data = as_measurements(data)
     along, label, is_counted = _principal_coordinates(data, groups)
-    partitions = []
+    made: list[Fold] = []
     for pair in (along[:, i : i + 2] for i in range(0, along.shape[1], 2)):
         side = pair > np.median(pair, 0)
         # Samples without a configuration are never held out: region -1.
@@ -235,9 +233,8 @@ def region_partitions(
         region[is_counted] = side @ (1 << np.arange(side.shape[1]))
         folds = [_by_measurement(data, (region == i)[label]) for i in range(4)]
         folds = [fold for fold in folds if any(mask.any() for mask in fold)]
-        if len(folds) > 1:
-            partitions.append(tuple(folds))
-    return tuple(partitions)
+        made += folds if len(folds) > 1 else []
+    return tuple(made)
 
 
 def _principal_coordinates(data: tuple[Measurement, ...], groups: Array | None) -> tuple[Array, Array, Array]:

@@ -134,7 +134,8 @@ def factor_partition(
     if uses_normal_equations(problem):
         # The last label is that of samples in no fold, which count only in the equations of all samples.
         labels = [np.argmax([*masks, np.ones(len(masks[0]))], 0) for masks in zip(*folds, strict=True)]
-        equations = normal_equations_by_part(problem, x, labels, len(folds) + (0 if whole else 1))
+        has_rest = whole is None and any((label == len(folds)).any() for label in labels)
+        equations = normal_equations_by_part(problem, x, labels, len(folds) + has_rest)
         whole = whole or NormalEquations(reduce(np.add, (one.products for one in equations)))
         for fold, one in zip(folds, equations, strict=False):
             n_rows = sum(

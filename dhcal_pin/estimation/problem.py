@@ -25,9 +25,11 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from functools import cached_property, partial, reduce
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from .._frozen import frozen
 from .._kernels import apply_observation_matrix, factor_jacobian
@@ -41,7 +43,14 @@ from ..robot.chain import Chain
 from ..robot.conditions import SampleState
 from .error_model import ErrorModel, ErrorParameter
 from .normal_equations import NormalEquations
-from .qr import TriangularSystem, blocked_r_factor, combine_r_factors, sum_of_squares
+from .qr import (
+    TriangularSystem,
+    blocked_r_factor,
+    combine_r_factors,
+    independent_columns,
+    right_singular_vectors,
+    sum_of_squares,
+)
 from .scale_gauge import ScaleGauge, normalize_by_scale
 
 # Largest number of samples in a chunk.
@@ -238,7 +247,7 @@ class Linearization:
         if MANY_COLUMNS < self._n_columns > n_rows and not small_angle:
             return self.rows(chunk).reshape(self._n_columns, -1).T
         if self._has_structure(chunk) and not small_angle:
-            return blocked_r_factor(self.rows(chunk))
+            return self.structured_rows(chunk).r_factor()
         data, frames = chunk.data, chunk.frames(self.chain)
         # The kernel computes the columns of geometric errors while it factors them; they are never stored.
         # All other columns, and all columns of measurements that are normalized by scale, are filled before.
@@ -366,6 +375,30 @@ class StructuredRows:
                 np.multiply(self.joint_rows[joint], term, out=out[column])
         return out
 
+    def r_factor(self) -> Array:
+        """Compute the R factor of the rows, shape (c+e, c+e)."""
+        # Over a short range of a joint, many of its terms are combinations of others up to rounding. Only the
+        # columns of the others are factored.
+        found = [independent_columns(self.terms[block].T) for _, block in self.blocks]
+        kept = [
+            block.start + independent for (_, block), (independent, _) in zip(self.blocks, found, strict=True)
+        ]
+        ends = np.cumsum([0, *map(len, kept)]).tolist()
+        blocks = tuple(
+            (joint, slice(*pair)) for (joint, _), pair in zip(self.blocks, pairwise(ends), strict=True)
+        )
+        c, n = len(self.dense) - 1, len(self.columns)
+        # Other columns, terms and r, in this order.
+        order = np.concatenate([np.arange(c), [c + ends[-1]], c + np.arange(ends[-1])])
+        reduced = StructuredRows(self.dense, self.joint_rows, self.terms[np.concatenate(kept)], blocks, order)
+        factor = blocked_r_factor(reduced.multiplied_out())
+        rows = np.empty((len(factor) - 1, n))
+        rows[:, self.columns[: c + 1]] = factor[:-1, [*range(c), -1]]
+        rows[:, self.columns[c + 1 :]] = factor[:-1, c:-1] @ block_diag(*(each for _, each in found))
+        out = np.zeros((n, n))
+        out[: len(rows)], out[-1, -1] = np.linalg.qr(rows, mode="r"), factor[-1, -1]
+        return out
+
     def products(self) -> Array:
         """Compute the inner products [J | r]ᵀ·[J | r], shape (c+e, c+e)."""
         c, m, n = len(self.dense), self.dense.shape[-1], len(self.columns)
@@ -474,6 +507,21 @@ class UnfactoredSystem(NormalEquations):
     def rows(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
         """[R z; 0 ρ], upper triangular, shape (p+s+1, p+s+1)."""
         return linearize_and_factor(self.problem, self.x, small_angle=False).rows
+
+    @cached_property
+    def _right_singular_vectors(self) -> tuple[Array, Array]:
+        """Singular values and right singular vectors of R; most such systems have a null space."""
+        return right_singular_vectors(self.r)
+
+    @cached_property
+    def singular_values(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Singular values of R, those of the Jacobian, largest first."""
+        return self._right_singular_vectors[0]
+
+    @cached_property
+    def null_space(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Orthonormal basis of the directions that the data do not determine."""
+        return self._right_singular_vectors[1][self.rank :].T
 
 
 def uses_normal_equations(problem: Problem) -> bool:

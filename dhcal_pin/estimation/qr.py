@@ -42,17 +42,32 @@ RANK_RTOL = 1e-9
 # A triangular matrix whose reciprocal condition number exceeds this value has no singular value near
 # RANK_RTOL: the estimated condition may be wrong by a factor of the matrix size.
 WELL_CONDITIONED = 1e3 * RANK_RTOL
-# Number of columns that LAPACK eliminates together.
-_BLOCK_COLUMNS = 64
+# Number of columns that LAPACK eliminates together, and of rows, which the cache of a processor holds.
+_BLOCK_COLUMNS, _BLOCK_ROWS = 32, 1024
+# Columns count as combinations of others that leave less than this fraction of the largest column.
+_COMBINATION_RTOL = 1e-15
 
 
 def blocked_r_factor(rows: Array) -> Array:
-    """Compute the R factor of hundreds of columns (c, k, m), which are overwritten."""
+    """Compute the R factor of hundreds of columns (c, k, m)."""
     # LAPACK eliminates many columns at once by matrix products. The compiled kernel eliminates two at a time.
     c = len(rows)
     r = np.zeros((c, c), order="F")
-    r = lapack.dtpqrt(0, _BLOCK_COLUMNS, r, rows.reshape(c, -1).T, overwrite_a=1, overwrite_b=1)[0]
+    flat = rows.reshape(c, -1).T
+    for start in range(0, len(flat), _BLOCK_ROWS):
+        r = lapack.dtpqrt(0, _BLOCK_COLUMNS, r, flat[start : start + _BLOCK_ROWS], overwrite_a=1)[0]
     return np.ascontiguousarray(r)
+
+
+def independent_columns(a: Array) -> tuple[Array, Array]:
+    """Find numbers (k,) of columns of which all are combinations, and the coefficients of these, (k, n)."""
+    packed, numbers = lapack.dgeqp3(np.linalg.qr(a, mode="r"))[:2]
+    r, order = np.triu(packed), numbers - 1
+    pivots = np.abs(np.diag(r))
+    k = int(np.sum(pivots > _COMBINATION_RTOL * pivots.max(initial=0.0)))
+    coefficients = np.zeros((k, len(order)))
+    coefficients[:, order] = lapack.dtrtrs(r[:k, :k], r[:k])[0] if k else coefficients
+    return order[:k], coefficients
 
 
 def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
@@ -68,6 +83,13 @@ def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
 def singular_values(r: Array) -> Array:
     """Compute the singular values of R."""
     return np.linalg.svd(r, compute_uv=False)
+
+
+def right_singular_vectors(r: Array) -> tuple[Array, Array]:
+    """Compute the singular values of R and its right singular vectors, the rows of a matrix (p, p)."""
+    # Rows of zeros only add singular values of 0.
+    _, s, vt = singular_value_decomposition(r[r.any(1)])
+    return np.append(s, np.zeros(len(vt) - len(s))), vt
 
 
 def row_space(r: Array) -> Array:

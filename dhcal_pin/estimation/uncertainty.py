@@ -35,7 +35,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
+from scipy.linalg import blas, lapack, solve_triangular
 
 from .. import se3
 from .._frozen import frozen
@@ -295,7 +295,8 @@ def compact(known: Uncertainty) -> Information | None:
     if not exact.root.size:
         return exact
     root = np.linalg.qr(exact.root.T, mode="r").T
-    difference = root.T @ _information_matrix(exact, known) @ root
+    right = blas.dtrmm(1.0, root, _information_matrix(exact, known), side=1, lower=1)
+    difference = blas.dtrmm(1.0, root, right, trans_a=1, lower=1)
     difference.flat[:: len(root) + 1] -= 1.0
     parts = [np.empty((len(root), 0))] * 2
     if np.linalg.norm(difference) > MAX_ERROR:

@@ -31,7 +31,7 @@ from .. import se3
 from .._frozen import frozen
 from .._typing import Array
 from ..estimation import qr
-from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.problem import Problem, linear_system, linearize_and_factor
 from ..estimation.scale_gauge import ScaleGauge
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
@@ -157,7 +157,7 @@ class ObservabilityProbe:
                 if kind is Pose
                 else Position(q, poses[:, :3, 3], _PROBE_SIGMA)
             )
-        return linearize_and_factor(replace(self.problem, data=tuple(data)), self.x, small_angle=False).r
+        return linear_system(replace(self.problem, data=tuple(data)), self.x).r
 
     @cached_property
     def full_range(self) -> Array:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 
 from .._typing import Array
-from ..estimation.qr import TriangularSystem, null_space
+from ..estimation.qr import TriangularSystem, null_space, right_singular_vectors
 
 # A direction is known if its posterior standard deviation is below this fraction of the prior one.
 MAX_KNOWN_STD_RATIO = 0.5
@@ -86,7 +86,7 @@ def weakly_observable(system: TriangularSystem, prior_std: Array, noise: float) 
     `MAX_KNOWN_STD_RATIO` or more are weakly observable. They are one prior standard deviation long, shape (p,
     w), and come with these ratios. Directions in the null space are not included.
     """
-    _, s, vt = np.linalg.svd(system.r * prior_std)
+    s, vt = right_singular_vectors(system.r * prior_std)
     s = s[: system.rank]
     std_ratios = noise / np.hypot(noise, s)
     weak = np.flatnonzero(std_ratios >= MAX_KNOWN_STD_RATIO)

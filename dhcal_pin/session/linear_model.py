@@ -180,7 +180,6 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
             torque = errors.chain.loads.torques_per_kilogram(item.configurations().T)
         motions = np.concatenate(
             [
-                jacobian,
                 by_joint,
                 growth,
                 growth.sum(0, keepdims=True),
@@ -188,10 +187,8 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
                 by_joint * torque[:, None],
             ]
         )
-        rows = np.empty((len(motions), *residual.shape))
-        apply_observation_matrix(motions, observation, rows)
-        block[: len(bodies)] = rows[: len(bodies)]
-        block[layout.joints[0] : layout.lag] = rows[len(bodies) :]
+        apply_observation_matrix(jacobian, observation, block[: len(bodies)])
+        apply_observation_matrix(motions, observation, block[layout.joints[0] : layout.lag])
         parts = zip(item.instrument_parameters, item.instrument_jacobian(frames, u), strict=True)
         for parameter, part in parts:
             if parameter.name in instrument_columns:

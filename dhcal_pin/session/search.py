@@ -112,8 +112,9 @@ MIN_SIDE = 3
 class LinearFit:
     """Fit of the linear model with weights of bounded influence."""
 
-    rows: Array  # Rows divided by the noise, with the residual after the fit as last column, (N, k, c)
-    columns: Array  # The same columns of the unknowns and causes of the fit, (N, k, p)
+    rows: Array  # Whitened rows, (N, k, c)
+    columns: Array  # Columns of the unknowns and causes of the fit, (N, k, p)
+    residual: Array  # Residual after the fit, divided by the noise, (N, k)
     step: Array  # Step of the unknowns and causes, (p,)
     covariance: Array  # Covariance of them with the weights of the samples, (p, p)
     test_covariance: Array  # Covariance of them with equal weights, (p, p)
@@ -144,6 +145,9 @@ class _Search:
         # Blocks and types of functions of time that were tried in vain.
         self.rejected: set[tuple[Block, type[Shape]]] = set()
         self.groups = self._noise_groups()
+        # Numbers of the rows of each group, of all N·k.
+        labels = self.groups.ravel()
+        self.members = [np.flatnonzero(labels == label) for label in np.unique(labels[labels >= 0])]
         can_lag = is_ordered and sum(map(len, timeline.numbers)) <= MAX_PATH_SAMPLES
         self.paths = JointPaths(timeline) if can_lag else None
         # Repetitions show a change over time, but not one that is the same for all samples.
@@ -153,6 +157,8 @@ class _Search:
         self.has_different_rows = n_different >= MIN_DIFFERENT_ROWS_PER_UNKNOWN * len(problem.weights)
         self.rows = self.linearize()
         self.layout = self.layout.restricted_to(self.rows)
+        # Columns of all causes.
+        self.tested = np.unique(np.concatenate([block.columns for block in self.layout.blocks]))
         self.first_fit = self.solve(self.rows, [])
 
     def _noise_groups(self) -> Array:
@@ -197,38 +203,39 @@ class _Search:
                 rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
         return rows
 
-    def _cause_columns(self, rows: Array, causes: Sequence[Cause]) -> Array:
-        """Return the columns of causes, (N, k, ·)."""
+    def _columns(self, rows: Array, causes: Sequence[Cause], *others: Array) -> Array:
+        """Return the columns of the unknowns, of causes, and others (N, k, ·), (N, k, ·)."""
         parts = [cause.columns_of(rows, self.numbers, self.times) for cause in causes]
-        return np.concatenate([rows[..., :0], *parts], -1)
+        return np.concatenate([rows[..., self.layout.model], *parts, *others], -1)
 
     def _prior(self, causes: Sequence[Cause]) -> Array:
         """Return the weights of the priors of the unknowns and of causes, (p,)."""
         # A prior of one metre decides what the measurements do not show, such as turns of a point.
         return np.concatenate([self.layout.weights, *(1 / cause.sizes for cause in causes)])
 
-    def _columns_without(self, cause: Cause, rows: Array, causes: Sequence[Cause]) -> Array:
-        """Return the columns of the unknowns and of causes, and the residual as if one were left out."""
-        residual = self._undone(rows, cause)[..., -1:]
-        return np.concatenate([rows[..., self.layout.model], self._cause_columns(rows, causes), residual], -1)
+    def _weighted_columns(
+        self, fit: LinearFit, without: Cause, rows: Array, causes: Sequence[Cause]
+    ) -> Array:
+        """Return weighted columns of the unknowns and of causes, and the residual as if one were left out."""
+        columns = self._columns(rows, causes, self._residual_without(rows, without)[..., None])
+        columns *= (np.sqrt(fit.weights)[:, None] / fit.noise)[..., None]
+        return columns
 
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
         """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
-        layout = self.layout
-        columns = np.concatenate([rows[..., layout.model], self._cause_columns(rows, causes)], -1)
+        columns = self._columns(rows, causes)
         residual, prior = rows[..., -1], self._prior(causes)
         value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
-        labels = [self.groups == label for label in range(self.groups.max() + 1)]
-        products = [part.T @ part for part in (columns[chosen] for chosen in labels)]
+        flat = columns.reshape(-1, columns.shape[-1])
+        products = [part.T @ part for part in (flat[chosen] for chosen in self.members)]
         noise, weights = np.ones(residual.shape), np.ones(len(rows))
 
         def information_with(weights: Array) -> Array:
             """Return the inner products of all rows; few samples have weights below 1."""
             total = sum(
-                product / noise[chosen][0] ** 2
-                for product, chosen in zip(products, labels, strict=True)
-                if chosen.any()
+                product / noise.flat[chosen[0]] ** 2
+                for product, chosen in zip(products, self.members, strict=True)
             )
             is_low = weights < 1
             return total - _information(
@@ -246,9 +253,9 @@ class _Search:
             after = residual - columns @ step
             freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
-            for chosen in labels:
-                scale = MAD_TO_STD * np.median(np.abs(after[chosen])) / np.sqrt(freedom)
-                noise[chosen] = max(scale, MIN_NOISE)
+            for chosen in self.members:
+                scale = MAD_TO_STD * np.median(np.abs(after.flat[chosen])) / np.sqrt(freedom)
+                noise.flat[chosen] = max(scale, MIN_NOISE)
             size = np.sqrt(np.sum((after / noise) ** 2 * is_row, 1) / is_row.sum(1))
             previous, weights = weights, np.minimum(1.0, HUBER_LIMIT / np.maximum(size, 1e-12))
             if max(np.abs(weights - previous).max(), np.abs(noise / last_noise - 1).max()) < PASS_TOL:
@@ -257,20 +264,18 @@ class _Search:
         bounded = (after / noise) * weights[:, None]
         variance = np.sum(bounded**2 * is_row) / (np.sum(is_row) * freedom)
         noise = np.maximum(noise * np.sqrt(variance), MIN_NOISE)
-        out = rows / noise[..., None]
-        out[..., -1] = after / noise
         equal, weighted = (
             inverse(information_with(each) + np.diag(prior**2)) for each in (np.ones(len(rows)), weights)
         )
-        columns = columns / noise[..., None]
-        score = np.einsum("nkp,nk->p", columns, out[..., -1] * weights[:, None]) - prior**2 * (value + step)
-        return LinearFit(out, columns, step, weighted, equal, score, weights, noise)
+        residual = after / noise
+        score = np.tensordot(residual * weights[:, None] / noise, columns, 2) - prior**2 * (value + step)
+        return LinearFit(rows, columns, residual, step, weighted, equal, score, weights, noise)
 
     def iterate(self, fit: LinearFit) -> LinearFit:
         """Fit unknowns and causes until the steps are negligible, from a fit at their current values."""
         for _ in range(MAX_ITERATIONS):
             self._advance(fit)
-            change = np.sqrt(np.mean((fit.columns @ fit.step) ** 2 * fit.weights[:, None]))
+            change = np.sqrt(np.mean((fit.columns @ fit.step / fit.noise) ** 2 * fit.weights[:, None]))
             fit = self._fit()
             if change < 0.05:
                 break
@@ -309,14 +314,16 @@ class _Search:
 
     def _candidates(self, fit: LinearFit) -> Iterator[Cause]:
         """Yield the causes that are not in a fit, the function of time of greatest evidence of each."""
-        cells, cross = self._products(fit)
+        products = self._products(fit)
         # Blocks with the same number of columns and the same functions of time are tested at once.
-        alike: dict[tuple[int, tuple[Shape, ...]], list[Block]] = {}
+        alike: dict[tuple[type[Shape], int, tuple[int, ...]], list[Block]] = {}
         for block in self.layout.blocks:
-            for shapes in self._shapes(block):
-                alike.setdefault((len(block.columns), tuple(shapes)), []).append(block)
-        for (_, shapes), blocks in alike.items():
-            yield from self._scores(fit, blocks, shapes, cells, cross)
+            for kind in self._kinds(block):
+                taken = self._taken_steps(block) if kind is Step else ()
+                alike.setdefault((kind, len(block.columns), taken), []).append(block)
+        for (kind, _, taken), blocks in alike.items():
+            if shapes := self._shapes(kind, taken):
+                yield from self._scores(fit, blocks, shapes, products)
 
     def _follows_configuration(self, rows: Array, i: int) -> bool:
         """Return whether a function of the configuration explains the samples as well as a cause does."""
@@ -328,9 +335,8 @@ class _Search:
 
         def evidence(order: Array) -> float:
             """Return the greatest evidence of a change over the samples in an order."""
-            parts = (each[order] for each in (fit.rows, fit.columns, fit.weights, fit.noise))
-            rows, columns, weights, noise = parts
-            ordered = replace(fit, rows=rows, columns=columns, weights=weights, noise=noise)
+            names = ("rows", "columns", "residual", "weights", "noise")
+            ordered = replace(fit, **{name: getattr(fit, name)[order] for name in names})
             changes = (c for c in without._candidates(ordered) if not c.block.is_constant)
             return max((c.log_evidence for c in changes), default=-np.inf)
 
@@ -349,8 +355,8 @@ class _Search:
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
         own = cause.columns_of(fit.rows, self.numbers, self.times) @ cause.values
-        others = np.einsum("nkp,nk->p", fit.columns, own)
-        effect = own - fit.columns @ (fit.test_covariance @ others)
+        others = np.tensordot(own / fit.noise**2, fit.columns, 2)
+        effect = (own - fit.columns @ (fit.test_covariance @ others)) / fit.noise
         return float(np.sqrt(np.sum(effect**2) / (np.sum(self.groups >= 0) * self._concerned(cause))))
 
     def _concerned(self, cause: Cause) -> float:
@@ -360,54 +366,55 @@ class _Search:
         share = float(np.mean(self.numbers < cause.shape.number))
         return min(share, 1 - share)
 
-    def _products(self, fit: LinearFit) -> tuple[Array, Array]:
-        """Return the inner products of each cell: of the rows, and of rows and columns of the fit."""
-        p = len(self.layout.model)
-        columns = np.concatenate([fit.columns[..., p:], fit.rows], -1)
-        columns[..., -1] *= fit.weights[:, None]
-        q = fit.columns.shape[-1] - p
-        products = _cell_products(columns, self.edges)[:, q:]
-        of_fit = np.concatenate([q + self.layout.model, np.arange(q)])
-        return products[:, :, q:], products[:, :, of_fit]
+    def _products(self, fit: LinearFit) -> Array:
+        """Return the products of tested columns with those of the fit, tested ones and residuals, by cell."""
+        columns = np.concatenate([fit.columns, fit.rows[..., self.tested], fit.residual[..., None]], -1)
+        columns /= fit.noise[..., None]
+        columns[..., -1] = fit.residual * fit.weights[:, None]
+        return _cell_products(columns, self.edges, slice(fit.columns.shape[-1], -1))
 
-    def _shapes(self, block: Block) -> list[list[Shape]]:
-        """Return the functions of time that are tested for a block; those of one list are equally likely."""
+    def _kinds(self, block: Block) -> list[type[Shape]]:
+        """Return the types of functions of time that are tested for a block."""
         if block.is_constant:
-            if not self.has_different_rows or (block.kind == "lag" and self.paths is None):
-                return []
-            return [] if (block, Constant) in self.rejected else [[Constant()]]
-        steps: list[Shape] = []
-        if block.kind != "links":
-            taken = [c.shape.number for c in self.causes if c.block is block and isinstance(c.shape, Step)]
-            n = len(self.numbers)
-            inner = self.edges
-            if not self.is_ordered:
-                inner = np.searchsorted(self.numbers, self.timeline.file_starts)
-            others = [0, n, *(int(np.searchsorted(self.numbers, number)) for number in taken)]
-            inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
-            steps = [Step(int(number)) for number in self.numbers[inner]]
-        drifts: list[Shape] = []
-        free: list[Shape] = []
-        if self.is_ordered and block.kind != "payload":
-            begin, end = float(self.times[0]), float(self.times[-1])
+            is_shown = self.has_different_rows and (block.kind != "lag" or self.paths is not None)
+            kinds: list[type[Shape]] = [Constant] if is_shown else []
+        else:
             used = {
                 type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)
             }
-            if FreeDrift not in used:
-                free = [FreeDrift(begin, end)]
-                if Drift not in used:
-                    drifts = [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
-        kinds = (steps, drifts, free)
-        return [shapes for shapes in kinds if shapes and (block, type(shapes[0])) not in self.rejected]
+            kinds = [Step] if block.kind != "links" else []
+            if self.is_ordered and block.kind != "payload" and FreeDrift not in used:
+                kinds += [FreeDrift] if Drift in used else [Drift, FreeDrift]
+        return [kind for kind in kinds if (block, kind) not in self.rejected]
+
+    def _taken_steps(self, block: Block) -> tuple[int, ...]:
+        """Return the numbers of the samples at which a block has steps."""
+        return tuple(c.shape.number for c in self.causes if c.block is block and isinstance(c.shape, Step))
+
+    def _shapes(self, kind: type[Shape], taken: Sequence[int]) -> list[Shape]:
+        """Return the functions of time of a type, which are equally likely, without steps near others."""
+        if kind is Constant:
+            return [Constant()]
+        if kind is Step:
+            inner = self.edges
+            if not self.is_ordered:
+                inner = np.searchsorted(self.numbers, self.timeline.file_starts)
+            others = [0, len(self.numbers), *np.searchsorted(self.numbers, taken).tolist()]
+            inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
+            return [Step(number) for number in self.numbers[inner].tolist()]
+        begin, end = float(self.times[0]), float(self.times[-1])
+        if kind is FreeDrift:
+            return [FreeDrift(begin, end)]
+        return [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
 
     def _scores(
-        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], cells: Array, cross: Array
+        self, fit: LinearFit, blocks: Sequence[Block], shapes: Sequence[Shape], products: Array
     ) -> Iterator[Cause]:
         """Yield the cause of greatest evidence among functions of time of each of several blocks."""
-        own = np.array([block.columns for block in blocks])
+        own, p = np.searchsorted(self.tested, [block.columns for block in blocks]), fit.columns.shape[-1]
         firsts = self.edges[:-1]
         # Products of each cell, (K, B, c, ·).
-        parts = [cells[:, own[:, :, None], own[:, None]], cells[:, own, -1], cross[:, own]]
+        parts = [products[:, own[:, :, None], p + own[:, None]], products[:, own, -1], products[:, own, :p]]
         if isinstance(shapes[0], Step):
             steps = [shape.number for shape in shapes if isinstance(shape, Step)]
             ends = np.searchsorted(self.numbers[firsts], steps)
@@ -494,8 +501,7 @@ class _Search:
 
     def _change_drifts(self, fit: LinearFit) -> bool:
         """Replace each drift by the drift or step that fits best; return whether one changed."""
-        n_rows, scaled = float(np.sum(self.groups >= 0)), np.sqrt(fit.weights)[:, None] / fit.noise
-        has_changed = False
+        n_rows, has_changed = float(np.sum(self.groups >= 0)), False
         for i, cause in enumerate(self.causes):
             old = cause.shape
             if not isinstance(old, Drift | FreeDrift):
@@ -509,7 +515,9 @@ class _Search:
             if isinstance(old, FreeDrift):
                 tried.append(cause)
             tried += [replace(simple, shape=step) for step in self._best_steps(cause, rows, others)]
-            products = _information(self._columns_without(cause, rows, [*others, *tried]), scaled)
+            columns = self._weighted_columns(fit, cause, rows, [*others, *tried])
+            flat = columns.reshape(-1, columns.shape[-1])
+            products = flat.T @ flat
             prior = self._prior([*others, *tried])
             ends = len(prior) - np.cumsum([0, *(len(c.values) for c in reversed(tried))])[::-1]
             # Each coefficient costs the logarithm of the number of rows; a linear drift is the simplest one.
@@ -529,11 +537,12 @@ class _Search:
 
     def _best_steps(self, drift: Cause, rows: Array, others: Sequence[Cause]) -> list[Step]:
         """Return the step of greatest evidence in place of a drift; none if no place is left."""
-        places = [shapes for shapes in self._shapes(drift.block) if isinstance(shapes[0], Step)]
+        block = drift.block
+        places = self._shapes(Step, self._taken_steps(block)) if Step in self._kinds(block) else []
         if not places:
             return []
         fit = self.solve(self._undone(rows, drift), others)
-        found = self._scores(fit, [drift.block], places[0], *self._products(fit))
+        found = self._scores(fit, [block], places, self._products(fit))
         return [cause.shape for cause in found if isinstance(cause.shape, Step)]
 
     def _drop_others(self) -> None:
@@ -548,8 +557,12 @@ class _Search:
     def _undone(self, rows: Array, cause: Cause) -> Array:
         """Return the rows as if a cause had been left out of the model."""
         undone = rows.copy()
-        undone[..., -1] += cause.columns_of(rows, self.numbers, self.times) @ cause.values
+        undone[..., -1] = self._residual_without(rows, cause)
         return undone
+
+    def _residual_without(self, rows: Array, cause: Cause) -> Array:
+        """Return the residuals (N, k) as if a cause had been left out of the model."""
+        return rows[..., -1] + cause.columns_of(rows, self.numbers, self.times) @ cause.values
 
     def _move_steps(self, fit: LinearFit) -> bool:
         """Move each step to where the samples before and after it fit best; return whether one moved."""
@@ -557,7 +570,7 @@ class _Search:
         for i, cause in enumerate(self.causes):
             if not isinstance(cause.shape, Step):
                 continue
-            change = fit.rows[..., cause.block.columns] @ cause.values
+            change = fit.rows[..., cause.block.columns] @ cause.values / fit.noise
             old, number = cause.shape.number, self._best_place(fit, change, cause.shape.number)
             if number != old:
                 self.causes[i] = replace(cause, shape=Step(number))
@@ -571,8 +584,7 @@ class _Search:
         if not self.is_ordered or not inner.size:
             return number
         is_after = self.numbers >= number
-        residual = fit.rows[..., -1]
-        after = np.where(is_after[:, None], residual, residual - change)
+        after = np.where(is_after[:, None], fit.residual, fit.residual - change)
         costs = [_bounded_cost(r) for r in (after + change, after)]
         # Cost of a step before each sample: `before` for the samples in front of it, `after` behind.
         total = np.concatenate([[0.0], np.cumsum(costs[0] - costs[1])])
@@ -603,8 +615,7 @@ class _Search:
         cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
         without = self.solve(self._undone(rows, cause), others)
         # The same noise and weights for both.
-        scaled = np.sqrt(full.weights)[:, None] / full.noise
-        stack = self._columns_without(cause, rows, [*others, cause]) * scaled[..., None]
+        stack = self._weighted_columns(full, cause, rows, [*others, cause])
         prior = self._prior([*others, cause])
         side = len(rows) * self._concerned(cause)
         length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
@@ -636,7 +647,7 @@ class _Search:
         """Return the logarithm of the ratio of the evidences with and without a cause."""
         limit = np.sum(self.groups >= 0, 1) + MAX_SAMPLE_COST
         costs = [
-            float(np.sum(np.minimum(np.sum((fit.rows[..., -1] * fit.noise / full.noise) ** 2, 1), limit)))
+            float(np.sum(np.minimum(np.sum((fit.residual * fit.noise / full.noise) ** 2, 1), limit)))
             for fit in (without, full)
         ]
         start = len(self.x) + sum(len(c.values) for c in self.causes[:i])
@@ -704,7 +715,7 @@ class _Search:
 
         fit = solve(number)
         for _ in range(MAX_MOVES):
-            change = fit.rows[..., block.columns] @ fit.step[-len(block.sizes) :]
+            change = fit.rows[..., block.columns] @ fit.step[-len(block.sizes) :] / fit.noise
             place = self._best_place(fit, change, number)
             if place == number:
                 break
@@ -713,6 +724,9 @@ class _Search:
 
     def other_robot(self) -> Event | None:
         """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
+        steps = sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)})
+        if not steps:
+            return None
         rows = self.linearize()
         one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
         geometric = [c for c in self.layout.model if c < len(names) and names[c].coefficient_index is None]
@@ -724,7 +738,7 @@ class _Search:
             return None  # Two robots fit so few samples whatever was measured.
         needed = 0.5 * len(sizes) * np.log(count) + MIN_ROBOT_GAIN * count
         best: tuple[float, int, LinearFit] | None = None
-        for first in sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)}):
+        for first in steps:
             others = [c for c in self.causes if c.shape != Step(first)]
             number, two = self._second_robot(rows, others, block, first)
             gain = count * float(np.mean(np.log(one.noise / two.noise)))
@@ -856,10 +870,10 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
     return found is not None and found.log_evidence > MIN_SCREENED_EVIDENCE
 
 
-def _cell_products(rows: Array, edges: Array) -> Array:
-    """Return the inner products of the columns of each cell, (K, c, c)."""
+def _cell_products(rows: Array, edges: Array, some: slice = np.s_[:]) -> Array:
+    """Return the inner products of some columns of each cell with all columns, (K, ·, c)."""
     if np.ptp(np.diff(edges)) == 0:
         cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
-        return cells.swapaxes(1, 2) @ cells
+        return cells[..., some].swapaxes(1, 2) @ cells
     cells = (rows[a:b].reshape(-1, rows.shape[-1]) for a, b in pairwise(edges))
-    return np.array([cell.T @ cell for cell in cells])
+    return np.array([cell[:, some].T @ cell for cell in cells])

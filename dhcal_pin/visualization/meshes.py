@@ -15,10 +15,12 @@ Meshes are stored with vertices on a grid of integers, and large ones are simpli
 from __future__ import annotations
 
 import base64
+import itertools
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import field
-from functools import lru_cache
+from functools import lru_cache, partial
+from operator import itemgetter
 from typing import Any
 from xml.etree import ElementTree
 
@@ -40,9 +42,10 @@ from ..ros_packages import MAX_MESH_BYTES, is_mesh_too_large, mesh_files, mesh_r
 GRID = 8000
 # Coarser grids, which are tried one after the other for meshes that are simplified.
 COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)
-# Coal builds a tree of bounding volumes for each mesh, which is not used here. This type takes the least time
-# among those whose meshes have vertices in Python.
-_MESH_LOADER = coal.MeshLoader(coal.BV_OBB)
+# Coal builds a tree of bounding volumes for each mesh, which is not used here. This type takes the least
+# time. Such a mesh has no class of its own in Python: the methods of `_Mesh` read its vertices.
+_MESH_LOADER = coal.MeshLoader(coal.BV_AABB)
+_Mesh = coal.BVHModelBase
 # Largest number of missing meshes that a note names.
 MAX_NAMED = 3
 # Colours of the tool frame in the URDF of a DH table.
@@ -197,7 +200,7 @@ def _load_geometry(
 def _is_finite(geometry: Any) -> bool:
     """Return whether all sizes of a primitive, or all vertices of a mesh, are finite."""
     primitive = _primitive(geometry)
-    sizes = geometry.vertices() if primitive is None else next(iter(primitive.values()))
+    sizes = _Mesh.vertices(geometry) if primitive is None else next(iter(primitive.values()))
     return bool(np.isfinite(sizes).all())
 
 
@@ -263,8 +266,9 @@ class Mesh:
     @classmethod
     def from_geometry(cls, geometry: Any) -> Mesh:
         """Convert a mesh that Coal has read."""
-        faces = [(t[0], t[1], t[2]) for t in map(geometry.tri_indices, range(geometry.num_tris))]
-        return cls.on_grid(np.asarray(geometry.vertices(), float), np.array(faces, int).reshape(-1, 3))
+        faces = map(partial(_Mesh.tri_indices, geometry), range(_Mesh.num_tris.__get__(geometry)))
+        numbers = np.fromiter(itertools.chain.from_iterable(map(itemgetter(0, 1, 2), faces)), int)
+        return cls.on_grid(np.asarray(_Mesh.vertices(geometry), float), numbers.reshape(-1, 3))
 
     @classmethod
     def on_grid(cls, corners: Array, triangles: Array, grid: int = GRID) -> Mesh:

@@ -20,13 +20,13 @@ from dhcal_pin.measurements import Noise, Pose, Position
 SETS = "minimal,base,tool,gain,coupling,compliance,harmonics,curves"
 
 
-def curved_problem(kind=Pose, m=300, seed=0, sets=SETS):
+def curved_problem(kind=Pose, m=300, seed=0, sets=SETS, reach=2.5):
     """Return a problem of a UR5 with errors of all kinds, and a point near its solution."""
     rng = np.random.default_rng(seed)
     arm = measured_arm("ur5")
     errors = select_parameters(arm, sets)
     x = np.minimum(errors.priors, 1e-3) * rng.standard_normal(len(errors.parameters))
-    data = kind.simulate(errors.at(x), rng.uniform(-2.5, 2.5, (m, 6)), Noise(5e-5, 1e-4), rng)
+    data = kind.simulate(errors.at(x), rng.uniform(-reach, reach, (m, 6)), Noise(5e-5, 1e-4), rng)
     return Problem(errors, (data,), 1 / errors.priors), 0.9 * x
 
 
@@ -76,6 +76,23 @@ def test_covariances_of_the_rows(kind):
     (chunk,) = problem.chunks
     found = problem.linearize(x).structured_rows(chunk).covariances(root @ root.T)
     np.testing.assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("reach", [0.1, 0.5, 2.5])
+def test_the_r_factor_is_that_of_the_plain_rows(reach):
+    """Over short ranges of the joints, most terms are combinations of others."""
+    problem, x = curved_problem(reach=reach)
+    rows = plain_rows(problem, x).reshape(len(x) + 1, -1).T
+    system = UnfactoredSystem(normal_equations(problem, x), problem, x)
+    expected = np.linalg.svd(rows[:, :-1], compute_uv=False)
+    np.testing.assert_allclose(system.singular_values, expected, atol=1e-13 * expected[0])
+    np.testing.assert_array_equal(system.rows, np.triu(system.rows))
+    products = rows.T @ rows
+    scale = np.linalg.norm(rows, axis=0)
+    found = system.rows.T @ system.rows
+    np.testing.assert_allclose(found / scale / scale[:, None], products / scale / scale[:, None], atol=1e-12)
+    np.testing.assert_allclose(rows[:, :-1] @ system.null_space, 0, atol=1e-8 * expected[0])
+    assert system.null_space.shape[1] == len(x) - np.sum(expected > 1e-9 * expected[0])
 
 
 def test_each_member_agrees_with_the_triangular_system():

@@ -257,7 +257,7 @@ def test_steps_lie_between_samples_of_a_cell_but_not_within_files_without_an_ord
     assert [cause.shape for cause in search.causes] == [Step(27)]
     search = search_of(Changes("base", 2e-3, at=0.45), is_ordered=False)
     fit = search.first_fit
-    assert search._best_place(fit, fit.rows[..., -1], 40) == 40
+    assert search._best_place(fit, fit.residual, 40) == 40
 
 
 @pytest.mark.parametrize(("place", "found"), [(2, 3), (20, 20), (58, 57)])
@@ -265,7 +265,7 @@ def test_a_step_has_three_samples_on_either_side(place, found):
     """The samples show a step at one place; the fit has it at another one."""
     search, change, number = search_of(Changes()), np.ones((60, 6)), np.arange(60)[:, None]
     residual = change * ((number >= place) * 1.0 - (number >= 40))
-    fit = replace(search.first_fit, rows=residual[..., None])
+    fit = replace(search.first_fit, residual=residual)
     assert search._best_place(fit, change, 40) == found
 
 
@@ -287,11 +287,11 @@ def test_a_part_drifts_once_beside_the_drifts_of_other_parts():
     base, tool, *_ = search.layout.blocks
     for shape, left in ((Drift(0.0, 59.0), {Step, FreeDrift}), (FreeDrift(0.0, 59.0), {Step})):
         search.causes = [Cause(base, shape, np.zeros(6), np.zeros((6, 6)))]
-        assert {type(shapes[0]) for shapes in search._shapes(base)} == left
-        by_type = {type(shapes[0]): shapes for shapes in search._shapes(tool)}
-        assert set(by_type) == {Step, Drift, FreeDrift}
-        assert [each.time_constant / 59 for each in by_type[Drift]] == pytest.approx(TIME_CONSTANTS)
-        assert {(each.begin, each.end) for each in by_type[Drift]} == {(0.0, 59.0)}
+        assert set(search._kinds(base)) == left
+        assert set(search._kinds(tool)) == {Step, Drift, FreeDrift}
+    drifts = search._shapes(Drift, ())
+    assert [each.time_constant / 59 for each in drifts] == pytest.approx(TIME_CONSTANTS)
+    assert {(each.begin, each.end) for each in drifts} == {(0.0, 59.0)}
 
 
 @pytest.mark.parametrize("step", [4, 6, 8])
