@@ -1,7 +1,5 @@
 """Positions that have nothing to do with the joint values are never `ok`, wherever the fit puts the tool."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from camera_setups import ARMS
