@@ -47,11 +47,12 @@ import numpy as np
 from .. import se3
 from .._typing import Array
 from ..measurements.base import Measurement
+from ..measurements.position import PointMeasurement
 from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 from .error_model import ErrorModel
 from .problem import Problem, merge_instrument_parameters
-from .solver import minimize, next_iterate
+from .solver import complete, minimize
 
 # Spacing of the grid of tool offsets that are tried [m].
 _TOOL_OFFSET = 0.25
@@ -118,9 +119,7 @@ def candidate_frames(
         offset = np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
         best = [(chain.base, offset)]
     else:
-        steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
-        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
-        offsets = grid if is_tool_unknown else chain.tool[None, :3, 3]
+        offsets = _offset_grid() if is_tool_unknown else chain.tool[None, :3, 3]
         points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
         motions, distances = align(points, measured)
         order = np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]
@@ -137,9 +136,32 @@ def candidate_frames(
         yield chain.with_base_and_tool(base, se3.transform(rotation, offset))
 
 
+def _offset_grid() -> Array:
+    """Return the tool offsets (27, 3) that are tried, zero first."""
+    steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
+    return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+
+
+def candidate_tools(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> list[Chain]:
+    """Return chains with a tool offset from the grid, those first whose instruments fit points best."""
+    of_points = [item for item in data if isinstance(item, PointMeasurement)]
+    if not of_points:
+        return []
+    offsets = se3.transform(np.eye(3), _offset_grid())
+    chains = [chain.with_base_and_tool(chain.base, offset @ chain.tool) for offset in offsets]
+    costs = []
+    for each in chains:
+        items = tuple(item.initialized(each) for item in of_points)
+        problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
+        costs.append(problem.cost(problem.instrument_start({})))
+    return [chains[k] for k in np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]]
+
+
 def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     """Compute the RMS position error relative to the RMS distance of the positions from their mean."""
     with_positions = [item for item in data if len(item.positions())]
+    if not with_positions:
+        return np.inf
     measured = np.concatenate([item.positions() for item in with_positions])
     modelled = np.concatenate([chain.poses(item.conditions())[:, :3, 3] for item in with_positions])
     spread = np.linalg.norm(measured - measured.mean(0))
@@ -244,12 +266,12 @@ def make_problem(
 def _fit_frames(
     frames: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> tuple[float, Chain]:
-    """Fit base and tool alone; return the approximate cost and the chain with them."""
+    """Fit base and tool alone; return the cost and the chain with them."""
     data = tuple(item.initialized(frames.chain) for item in data)
     problem = make_problem(frames, data, 1 / frames.priors, known)
     solution = minimize(problem, max_iterations=max_iterations, loose=True)
-    cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
-    return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
+    x, cost = complete(problem, solution, max_iterations)
+    return cost, frames.at(x[: len(frames.parameters)])
 
 
 def initialize_frames(
@@ -281,7 +303,9 @@ def _best_frames(
 ) -> tuple[float, Chain] | None:
     """Return the cost and the chain of the best candidate, see `candidate_frames`; None if there is none."""
     best: tuple[float, Chain] | None = None
-    for start in candidate_frames(frames.chain, data, *is_unknown):
+    has_positions = any(len(item.positions()) for item in data)
+    starts = candidate_frames(frames.chain, data, *is_unknown)
+    for start in starts if has_positions else candidate_tools(frames.chain, data, known):
         fitted = _fit_frames(replace(frames, chain=start), data, known, max_iterations)
         best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
         if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
