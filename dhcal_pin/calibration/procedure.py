@@ -35,7 +35,12 @@ from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
-from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
+from ..estimation.initialization import (
+    compare_mirror_images,
+    gross_outliers,
+    initialize_frames,
+    make_problem,
+)
 from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
 from ..estimation.priors import (
     PriorGroups,
@@ -623,6 +628,8 @@ def _solve(
     if progress:
         further["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
     solution = minimize(problem, method, start, max_iterations, **further)
+    if method == "lm":
+        solution = compare_mirror_images(problem, solution, max_iterations)
     fit = Fit(data, problem, solution, tuple(weights))
     errors = problem.errors
     if not errors.has_transmission:

@@ -52,7 +52,7 @@ from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 from .error_model import ErrorModel
 from .problem import Problem, merge_instrument_parameters
-from .solver import complete, minimize
+from .solver import SolverResult, complete, minimize
 
 # Spacing of the grid of tool offsets that are tried [m].
 _TOOL_OFFSET = 0.25
@@ -68,6 +68,8 @@ _N_SUBSETS, _N_CONCENTRATIONS = 300, 4
 _MAX_DISTANCE_RATIO = 10.0
 # Fraction of the largest information below which a direction of the linear equations is held at zero.
 _MIN_INFORMATION = 1e-10
+# Smallest relative reduction of the cost by a mirror image; loose solutions of one minimum differ by less.
+_MIN_COST_REDUCTION = 0.02
 # Largest number of iterations of a fit of the frames to all data.
 _MAX_ITERATIONS = 100
 
@@ -311,6 +313,34 @@ def _best_frames(
         if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
             break
     return best
+
+
+def compare_mirror_images(problem: Problem, solution: SolverResult, max_iterations: int) -> SolverResult:
+    """Fit mirror images of instruments, too, from a loose solution; return the loose solution that is best."""
+    best, cost = solution, problem.cost(solution.x)
+    is_better = True
+    while is_better:
+        is_better = False
+        for start in _mirrored_starts(problem, best.x):
+            trial = minimize(problem, "lm", start, max_iterations, loose=True)
+            trial_cost = problem.cost(trial.x)
+            if trial_cost < (1 - _MIN_COST_REDUCTION) * cost:
+                best, cost, is_better = trial, trial_cost, True
+                break
+    return best
+
+
+def _mirrored_starts(problem: Problem, x: Array) -> Iterator[Array]:
+    """Generate solutions (p,) in which one instrument is replaced by a mirror image."""
+    chain, values = problem.chain(x), problem.instruments(x)
+    index = {p.name: i for i, p in enumerate(problem.parameters)}
+    for item in problem.data:
+        for image in item.mirror_images(chain, values):
+            if all(name in index for name in image):
+                start = x.copy()
+                for name, value in image.items():
+                    start[index[name]] += value - values[name]
+                yield start
 
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:

@@ -26,7 +26,7 @@ from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
 from .groups import LENGTHS, POSITION, Group
-from .length import MIN_DIVISOR, norm_and_direction
+from .length import MIN_DIVISOR, images_of_point, norm_and_direction
 from .mounting import MountedRig
 from .position import PointMeasurement
 from .trilateration import locate_point
@@ -329,6 +329,11 @@ class SphereContact(PointMeasurement):
         """Return a copy whose centre fits the chain's tool points best."""
         centre = locate_point(chain.poses(self.q)[:, :3, 3], self.values[:, 0])
         return self.replace(instrument_parameters=point_parameters(f"sphere_{self.name}", centre))
+
+    def mirror_images(self, chain: Chain, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Return the mirror images of the centre."""
+        points = chain.poses(self.conditions())[:, :3, 3]
+        return images_of_point(f"sphere_{self.name}", points, values)
 
     @classmethod
     def _simulate(

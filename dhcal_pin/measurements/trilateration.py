@@ -28,6 +28,9 @@ POINT_RCOND = 1e-9
 _INITIAL_DAMPING, _MAX_REFINEMENTS, _NEGLIGIBLE_STEP = 1e-6, 30, 1e-9
 # Largest number of known points that a point is located from.
 _MAX_POINTS = 300
+# Largest RMS change of the distances to a mirror image, relative to their mean, that a fit could explain, and
+# smallest distance of the image from the located point.
+_MAX_MIRROR_CHANGE = 0.02
 # Smallest distance by which a direction is divided [m].
 _MIN_DIVISOR = 1e-12
 
@@ -73,6 +76,20 @@ def locate_point(points: ArrayLike, distances: ArrayLike) -> Array:
     points, distances = np.asarray(points, float)[drawn], np.asarray(distances, float)[drawn]
     located, costs = _refine(points, distances, _point_starts(points, distances))
     return located[np.argmin(costs)]
+
+
+def mirror_images(points: ArrayLike, located: ArrayLike) -> Array:
+    """Return other points (k, 3) with nearly the distances of a located one (3,) from known points (m, 3)."""
+    # Points near a plane have one, its mirror image, and points near a line three at right angles.
+    points, located = np.asarray(points, float), np.asarray(located, float)
+    centre = points.mean(0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2]
+    reflections = (np.array([[1, 1, -1], [1, -1, 1], [1, -1, -1]]) * (axes @ (located - centre))) @ axes
+    distances = np.linalg.norm(points - located, axis=1)
+    changes = np.linalg.norm(points - (centre + reflections)[:, None], axis=2) - distances
+    is_near = np.sqrt(np.mean(changes**2, 1)) <= _MAX_MIRROR_CHANGE * distances.mean()
+    is_other = np.linalg.norm(centre + reflections - located, axis=1) > _MAX_MIRROR_CHANGE * distances.mean()
+    return (centre + reflections)[is_near & is_other]
 
 
 def _point_starts(points: Array, distances: Array) -> Array:
