@@ -39,8 +39,10 @@ References:
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations, islice, product
 
 import numpy as np
 
@@ -51,7 +53,7 @@ from ..measurements.position import PointMeasurement
 from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 from .error_model import ErrorModel
-from .problem import Problem, merge_instrument_parameters
+from .problem import Problem, linear_system, merge_instrument_parameters
 from .solver import SolverResult, complete, minimize
 
 # Spacing of the grid of tool offsets that are tried [m].
@@ -68,6 +70,8 @@ _N_SUBSETS, _N_CONCENTRATIONS = 300, 4
 _MAX_DISTANCE_RATIO = 10.0
 # Fraction of the largest information below which a direction of the linear equations is held at zero.
 _MIN_INFORMATION = 1e-10
+# Largest number of combinations of mirror images that are compared.
+_MAX_MIRRORED = 64
 # Smallest relative reduction of the cost by a mirror image; loose solutions of one minimum differ by less.
 _MIN_COST_REDUCTION = 0.02
 # Largest number of iterations of a fit of the frames to all data.
@@ -144,26 +148,9 @@ def _offset_grid() -> Array:
     return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
 
 
-def candidate_tools(chain: Chain, data: Sequence[Measurement], known: Mapping[str, float]) -> list[Chain]:
-    """Return chains with a tool offset from the grid, those first whose instruments fit points best."""
-    of_points = [item for item in data if isinstance(item, PointMeasurement)]
-    if not of_points:
-        return []
-    offsets = se3.transform(np.eye(3), _offset_grid())
-    chains = [chain.with_base_and_tool(chain.base, offset @ chain.tool) for offset in offsets]
-    costs = []
-    for each in chains:
-        items = tuple(item.initialized(each) for item in of_points)
-        problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
-        costs.append(problem.cost(problem.instrument_start({})))
-    return [chains[k] for k in np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]]
-
-
 def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
     """Compute the RMS position error relative to the RMS distance of the positions from their mean."""
     with_positions = [item for item in data if len(item.positions())]
-    if not with_positions:
-        return np.inf
     measured = np.concatenate([item.positions() for item in with_positions])
     modelled = np.concatenate([chain.poses(item.conditions())[:, :3, 3] for item in with_positions])
     spread = np.linalg.norm(measured - measured.mean(0))
@@ -305,9 +292,7 @@ def _best_frames(
 ) -> tuple[float, Chain] | None:
     """Return the cost and the chain of the best candidate, see `candidate_frames`; None if there is none."""
     best: tuple[float, Chain] | None = None
-    has_positions = any(len(item.positions()) for item in data)
-    starts = candidate_frames(frames.chain, data, *is_unknown)
-    for start in starts if has_positions else candidate_tools(frames.chain, data, known):
+    for start in candidate_frames(frames.chain, data, *is_unknown):
         fitted = _fit_frames(replace(frames, chain=start), data, known, max_iterations)
         best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
         if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
@@ -315,32 +300,72 @@ def _best_frames(
     return best
 
 
+def compare_tools(
+    started: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
+) -> ErrorModel:
+    """Fit base and tool from other tool offsets, too, where no position is measured; return the best."""
+    frames, drawn = started.only_frames, tuple(subsample(item) for item in data)
+    is_tool_unknown = any(p.error_frame == started.chain.tool_frame_index for p in started.parameters)
+    has_points = any(isinstance(item, PointMeasurement) for item in data)
+    if frames is None or not is_tool_unknown or not has_points or any(len(i.positions()) for i in data):
+        return started
+    offsets = se3.transform(np.eye(3), _offset_grid())
+    chains = [
+        frames.chain.with_base_and_tool(frames.chain.base, frames.chain.tool @ each) for each in offsets
+    ]
+    costs = []
+    for chain in chains:
+        items = tuple(item.initialized(chain) for item in drawn)
+        problem = make_problem(ErrorModel(chain, ()), items, np.empty(0), known)
+        costs.append(problem.cost(np.zeros(len(problem.weights))))
+    best = [chains[k] for k in np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]]
+    fits = [_fit_frames(replace(frames, chain=chain), drawn, known, max_iterations) for chain in best]
+    return replace(started, chain=min(fits, key=lambda each: each[0])[1])
+
+
 def compare_mirror_images(problem: Problem, solution: SolverResult, max_iterations: int) -> SolverResult:
     """Fit mirror images of instruments, too, from a loose solution; return the loose solution that is best."""
-    best, cost = solution, problem.cost(solution.x)
-    is_better = True
+    best, cost, is_better = solution, problem.cost(solution.x), True
     while is_better:
+        starts = _mirrored_starts(problem, best.x)
+        order = np.argsort([_predicted_cost(problem, start) for start in starts], kind="stable")
         is_better = False
-        for start in _mirrored_starts(problem, best.x):
-            trial = minimize(problem, "lm", start, max_iterations, loose=True)
+        for k in order[:_MAX_CANDIDATES]:
+            trial = minimize(problem, "lm", starts[k], max_iterations, loose=True)
             trial_cost = problem.cost(trial.x)
             if trial_cost < (1 - _MIN_COST_REDUCTION) * cost:
                 best, cost, is_better = trial, trial_cost, True
-                break
     return best
 
 
-def _mirrored_starts(problem: Problem, x: Array) -> Iterator[Array]:
-    """Generate solutions (p,) in which one instrument is replaced by a mirror image."""
+def _mirrored_starts(problem: Problem, x: Array) -> list[Array]:
+    """Return solutions (p,) in which one or several instruments are replaced by mirror images."""
     chain, values = problem.chain(x), problem.instruments(x)
     index = {p.name: i for i, p in enumerate(problem.parameters)}
+    # Images that change the same parameters exclude each other.
+    choices: dict[tuple[str, ...], list[dict[str, float]]] = {}
     for item in problem.data:
         for image in item.mirror_images(chain, values):
-            if all(name in index for name in image):
-                start = x.copy()
-                for name, value in image.items():
-                    start[index[name]] += value - values[name]
-                yield start
+            if index.keys() >= image.keys():
+                choices.setdefault(tuple(image), []).append(image)
+    combined = (
+        images
+        for n_changed in range(1, len(choices) + 1)
+        for group in combinations(choices.values(), n_changed)
+        for images in product(*group)
+    )
+    starts = []
+    for images in islice(combined, _MAX_MIRRORED):
+        start = x.copy()
+        for name, value in ChainMap(*images).items():
+            start[index[name]] += value - values[name]
+        starts.append(start)
+    return starts
+
+
+def _predicted_cost(problem: Problem, x: Array) -> float:
+    """Return the cost that an undamped step from x (p,) would lead to if the model were linear."""
+    return linear_system(problem, x).with_priors(problem.weights, x).min_cost
 
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:

@@ -114,21 +114,23 @@ def _refine(points: Array, distances: Array, starts: Array) -> tuple[Array, Arra
     """Fit points (k, 3) to their distances by damped steps from starts; return them with their costs (k,)."""
     located, damping = starts, np.full(len(starts), _INITIAL_DAMPING)
     directions, errors = _directions_and_errors(points, distances, located)
+    costs = np.sum(errors**2, 1)
     for _ in range(_MAX_REFINEMENTS):
         information = directions.swapaxes(1, 2) @ directions
-        scale = damping * np.trace(information, axis1=1, axis2=2)
-        right = np.einsum("kmi,km->ki", directions, errors)
-        steps = np.linalg.solve(information + scale[:, None, None] * np.eye(3), right[..., None])[..., 0]
-        trial = located + steps
-        trial_directions, trial_errors = _directions_and_errors(points, distances, trial)
-        is_better = np.sum(trial_errors**2, 1) < np.sum(errors**2, 1)
+        information += (damping * len(points))[:, None, None] * np.eye(3)
+        right = directions.swapaxes(1, 2) @ errors[..., None]
+        steps = np.linalg.solve(information, right)[..., 0]
+        trial_directions, trial_errors = _directions_and_errors(points, distances, located + steps)
+        trial_costs = np.sum(trial_errors**2, 1)
+        is_better = trial_costs < costs
         damping = np.where(is_better, 0.1, 10.0) * damping
-        located = np.where(is_better[:, None], trial, located)
+        located = np.where(is_better[:, None], located + steps, located)
         errors = np.where(is_better[:, None], trial_errors, errors)
         directions = np.where(is_better[:, None, None], trial_directions, directions)
-        if np.all(np.linalg.norm(steps, axis=1) <= _NEGLIGIBLE_STEP * distances.max()):
+        costs = np.minimum(costs, trial_costs)
+        if np.linalg.norm(steps[np.argmin(costs)]) <= _NEGLIGIBLE_STEP * distances.max():
             break
-    return located, np.sum(errors**2, 1)
+    return located, costs
 
 
 def _directions_and_errors(points: Array, distances: Array, located: Array) -> tuple[Array, Array]:
