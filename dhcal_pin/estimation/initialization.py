@@ -23,6 +23,12 @@ base, and in t, if A need not be a rotation:
 The majority is that of least trimmed squares (Rousseeuw and Van Driessen 2006): fits to random subsets, each
 followed by fits to the half of the samples with the smallest distances.
 
+Lengths and contacts do not measure positions. Base and tool are then fitted together with the
+instruments, from several tool offsets of the same grid (`compare_tools`). If the tool points lie near a
+plane, an anchor and its mirror image have nearly the same distances; if they lie near a line, a whole
+circle of anchors has. The cost of a fit of all unknowns decides between such images
+(`compare_mirror_images`).
+
 Positions come first because they determine the base even if the orientations hardly vary. A start from the
 rotations (hand-eye calibration) then ends in a wrong minimum.
 
@@ -303,38 +309,35 @@ def _best_frames(
 def compare_tools(
     started: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> ErrorModel:
-    """Fit base and tool from other tool offsets, too, where no position is measured; return the best."""
+    """Initialize base and tool from several tool offsets where tool points without positions are measured."""
     frames, drawn = started.only_frames, tuple(subsample(item) for item in data)
     is_tool_unknown = any(p.error_frame == started.chain.tool_frame_index for p in started.parameters)
     has_points = any(isinstance(item, PointMeasurement) for item in data)
     if frames is None or not is_tool_unknown or not has_points or any(len(i.positions()) for i in data):
         return started
+    costs, chain = [], frames.chain
     offsets = se3.transform(np.eye(3), _offset_grid())
-    chains = [
-        frames.chain.with_base_and_tool(frames.chain.base, frames.chain.tool @ each) for each in offsets
-    ]
-    costs = []
-    for chain in chains:
-        items = tuple(item.initialized(chain) for item in drawn)
-        problem = make_problem(ErrorModel(chain, ()), items, np.empty(0), known)
+    chains = [chain.with_base_and_tool(chain.base, chain.tool @ offset) for offset in offsets]
+    for each in chains:
+        items = tuple(item.initialized(each) for item in drawn)
+        problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
         costs.append(problem.cost(np.zeros(len(problem.weights))))
-    best = [chains[k] for k in np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]]
-    fits = [_fit_frames(replace(frames, chain=chain), drawn, known, max_iterations) for chain in best]
+    best = np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]
+    fits = [_fit_frames(replace(frames, chain=chains[k]), drawn, known, max_iterations) for k in best]
     return replace(started, chain=min(fits, key=lambda each: each[0])[1])
 
 
 def compare_mirror_images(problem: Problem, solution: SolverResult, max_iterations: int) -> SolverResult:
-    """Fit mirror images of instruments, too, from a loose solution; return the loose solution that is best."""
-    best, cost, is_better = solution, problem.cost(solution.x), True
+    """Fit mirror images of anchors and centres, too; return the best of these and a loose solution."""
+    best, is_better = solution, True
     while is_better:
+        is_better = False
         starts = _mirrored_starts(problem, best.x)
         order = np.argsort([_predicted_cost(problem, start) for start in starts], kind="stable")
-        is_better = False
         for k in order[:_MAX_CANDIDATES]:
             trial = minimize(problem, "lm", starts[k], max_iterations, loose=True)
-            trial_cost = problem.cost(trial.x)
-            if trial_cost < (1 - _MIN_COST_REDUCTION) * cost:
-                best, cost, is_better = trial, trial_cost, True
+            if problem.cost(trial.x) < (1 - _MIN_COST_REDUCTION) * problem.cost(best.x):
+                best, is_better = trial, True
     return best
 
 

@@ -94,8 +94,8 @@ def mirror_images(points: ArrayLike, located: ArrayLike) -> Array:
 
 def _point_starts(points: Array, distances: Array) -> Array:
     """Return points (7, 3) that have about the given distances, from linear equations."""
-    # Directions in which the known points hardly extend are badly determined. Without the last one or two, the
-    # mean square of the distances says how far the point is from the others, but not on which side.
+    # Directions in which the known points hardly extend are badly determined. Without the last one or two,
+    # the mean square of the distances says how far the point is from the others, but not on which side.
     centre = points.mean(0)
     arms = points - centre
     squares = distances**2 - np.sum(arms**2, 1)
@@ -134,7 +134,7 @@ def _refine(points: Array, distances: Array, starts: Array) -> tuple[Array, Arra
 
 
 def _directions_and_errors(points: Array, distances: Array, located: Array) -> tuple[Array, Array]:
-    """Return unit vectors (k, m, 3) from known points to located ones, and measured minus modelled distances."""
+    """Return unit vectors (k, m, 3) from known points to located ones, and errors (k, m) of the distances."""
     arms = located[:, None] - points
     norms = np.linalg.norm(arms, axis=2)
     return arms / np.maximum(norms, _MIN_DIVISOR)[..., None], distances - norms

@@ -4,11 +4,16 @@ A wrong length or a contact with another object is up to half a metre off. A lea
 samples then places base, tool and instruments far from their actual poses, where neither the model nor its
 linearization says which samples are wrong. The start is therefore searched with the nominal robot:
 
-1. Initialize the instruments from all samples and from random subsets of configurations. The start with the
+1. Fit base, tool and instruments to all samples.
+2. Initialize the instruments from all samples and from random subsets of configurations. The start with the
    smallest median of the residuals is used.
-2. Linearize the model in the unknowns of base, tool and instruments, and search the majority that agrees best
+3. Linearize the model in the unknowns of base, tool and instruments, and search the majority that agrees best
    (`search`).
-3. Fit this majority with the nonlinear model. Repeat steps 2 and 3 there until the majority is the same.
+4. Fit this majority with the nonlinear model. Repeat steps 3 and 4 there until the majority is the same.
+
+Steps 2 to 4 begin at the nominal base and tool, and again at those of step 1. The fit with the smallest
+median of the residuals counts, but a fit to a majority only if its median is far below that of step 1: a
+fit to half of few samples always has smaller residuals.
 
 A sample is an outlier if its residual is a large multiple of the median. Smaller outliers are left to the
 search after the fit of the robot: nominal robots have errors of millimetres themselves.
