@@ -11,7 +11,7 @@ robot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._typing import Array
-from ..exceptions import InvalidArgumentError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from ..robot.inverse_kinematics import position_task, solve_within_limits
-from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
+from .base import POINT_PRIOR, InstrumentParameter, Measurement, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
 from .groups import LENGTHS, POSITION, Group
 from .length import MIN_DIVISOR, images_of_point, norm_and_direction
@@ -200,6 +200,17 @@ class PointDistance(PointMeasurement):
         distances += noise.position * rng.standard_normal(len(pairs))
         names = [(f"p{i + 1}", f"p{j + 1}") for i, j in pairs]
         return cls(chain.n_joints, names, distances, noise.position or None)
+
+
+def require_touched_points(data: Sequence[Measurement], known: Container[str] = ()) -> None:
+    """Raise an error if a distance is between points that no measurement touches."""
+    touched = sorted({name for item in data if isinstance(item, PointContact) for name in item.names})
+    choice = f"choose from {', '.join(touched)}" if touched else "expected measurements of kind point"
+    for item in data:
+        for name in item.names if isinstance(item, PointDistance) else ():
+            if name not in touched and f"point_{name}.x" not in known:
+                where = item.source or item.kind
+                raise UnknownNameError(f"{where}: no measurement touches the point {name!r}; {choice}")
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
