@@ -47,7 +47,7 @@ N_STARTS, MIN_CONFIGURATIONS = 40, 4
 MAX_LINEARIZATIONS, MAX_ITERATIONS = 10, 30
 # Smallest ratio of the median residual of a fit to all samples to that of a majority which makes the
 # majority more credible. A fit to few samples reduces their residuals, too.
-MIN_IMPROVEMENT = 3.0
+MIN_IMPROVEMENT = 5.0
 # Smallest ratio of the residual of an outlier to the median of all.
 MIN_RATIO = 10.0
 # Smallest median of whitened residuals; exact data have none.
