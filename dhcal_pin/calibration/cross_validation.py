@@ -28,7 +28,7 @@ from ..estimation import robust
 from ..estimation.bare_geometry import BareGeometry
 from ..estimation.folds import Fold, Refit, factor_folds, solve_fold
 from ..estimation.problem import Problem
-from ..estimation.solver import minimize, next_iterate
+from ..estimation.solver import complete, minimize
 from ..exceptions import DhcalError, InvalidArgumentError, NotObservableError
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD, MeasuredRegion, draw_joint_space
@@ -124,11 +124,7 @@ def refit(fit: FittedModel, problem: Problem, start: Array) -> Array:
     nominal = np.zeros_like(fit.x)
     if fit.converged and problem.weights.all():
         loose = minimize(problem, "lm", start, MAX_REFIT_ITERATIONS, loose=True)
-        end = next_iterate(problem, loose)
-        if problem.cost(end) <= problem.cost(loose.x):
-            return end
-        # An undamped step in a curved valley can lead far away.
-        return minimize(problem, "lm", loose.x, MAX_REFIT_ITERATIONS, warm_start=loose).x
+        return complete(problem, loose, MAX_REFIT_ITERATIONS)[0]
     if not fit.converged:
         with suppress(DhcalError):  # method "gn" may diverge on few samples
             return minimize(problem, fit.method, nominal, min(fit.iterations, MAX_REFIT_ITERATIONS)).x

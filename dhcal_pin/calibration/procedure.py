@@ -35,7 +35,13 @@ from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation import robust
 from ..estimation.error_model import ErrorModel
-from ..estimation.initialization import gross_outliers, initialize_frames, make_problem
+from ..estimation.initialization import (
+    compare_mirror_images,
+    compare_tools,
+    gross_outliers,
+    initialize_frames,
+    make_problem,
+)
 from ..estimation.parameters import EXTENSIONS, LOW_COST, fold_harmonics, select_parameters
 from ..estimation.priors import (
     PriorGroups,
@@ -508,7 +514,7 @@ def _initialize(
     options: _Options,
 ) -> tuple[ErrorModel, tuple[Measurement, ...], list[Array]]:
     """Initialize base, tool and instruments."""
-    started = initialize_frames(errors, data, known, options.max_iterations)
+    started = _initialize_base_and_tool(errors, data, known, options)
     items = tuple(item.initialized(started.chain) for item in data)
     weights = [np.ones(len(item.rows)) for item in data]
     if options.method != "lm" or options.loss == "linear":
@@ -517,14 +523,22 @@ def _initialize(
         is_gross = gross_outliers(started.chain, data)
     else:
         has_positions = any(len(item.positions()) for item in data)
-        is_gross = find_initial_outliers(started if has_positions else errors, data, known)
+        is_gross = find_initial_outliers(started if has_positions else errors, data, known, started.chain)
         if any(each.any() for each in is_gross):
             kept = tuple(item.take(~each) for item, each in zip(data, is_gross, strict=True))
-            started = initialize_frames(errors, kept, known, options.max_iterations)
+            started = _initialize_base_and_tool(errors, kept, known, options)
             items = tuple(
                 item.initialized_from(started.chain, ~each) for item, each in zip(data, is_gross, strict=True)
             )
     return started, items, [np.where(each, robust.ZERO_WEIGHT, 1.0) for each in is_gross]
+
+
+def _initialize_base_and_tool(
+    errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], options: _Options
+) -> ErrorModel:
+    """Initialize base and tool, from several tool offsets where no position is measured."""
+    started = initialize_frames(errors, data, known, options.max_iterations)
+    return compare_tools(started, data, known, options.max_iterations)
 
 
 def _check_options(options: _Options, data: Sequence[Measurement]) -> None:
@@ -623,6 +637,8 @@ def _solve(
     if progress:
         further["progress"] = lambda iteration, cost: progress("fit", iteration, max_iterations)
     solution = minimize(problem, method, start, max_iterations, **further)
+    if method == "lm":
+        solution = compare_mirror_images(problem, solution, max_iterations)
     fit = Fit(data, problem, solution, tuple(weights))
     errors = problem.errors
     if not errors.has_transmission:

@@ -23,6 +23,12 @@ base, and in t, if A need not be a rotation:
 The majority is that of least trimmed squares (Rousseeuw and Van Driessen 2006): fits to random subsets, each
 followed by fits to the half of the samples with the smallest distances.
 
+Lengths and contacts do not measure positions. Base and tool are then fitted together with the
+instruments, from several tool offsets of the same grid (`compare_tools`). If the tool points lie near a
+plane, an anchor and its mirror image have nearly the same distances; if they lie near a line, a whole
+circle of anchors has. The cost of a fit of all unknowns decides between such images
+(`compare_mirror_images`).
+
 Positions come first because they determine the base even if the orientations hardly vary. A start from the
 rotations (hand-eye calibration) then ends in a wrong minimum.
 
@@ -39,19 +45,22 @@ References:
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations, islice, product
 
 import numpy as np
 
 from .. import se3
 from .._typing import Array
 from ..measurements.base import Measurement
+from ..measurements.position import PointMeasurement
 from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 from .error_model import ErrorModel
-from .problem import Problem, merge_instrument_parameters
-from .solver import minimize, next_iterate
+from .problem import Problem, linear_system, merge_instrument_parameters
+from .solver import SolverResult, complete, minimize
 
 # Spacing of the grid of tool offsets that are tried [m].
 _TOOL_OFFSET = 0.25
@@ -67,6 +76,10 @@ _N_SUBSETS, _N_CONCENTRATIONS = 300, 4
 _MAX_DISTANCE_RATIO = 10.0
 # Fraction of the largest information below which a direction of the linear equations is held at zero.
 _MIN_INFORMATION = 1e-10
+# Largest number of combinations of mirror images that are compared.
+_MAX_MIRRORED = 64
+# Smallest relative reduction of the cost by a mirror image; loose solutions of one minimum differ by less.
+_MIN_COST_REDUCTION = 0.02
 # Largest number of iterations of a fit of the frames to all data.
 _MAX_ITERATIONS = 100
 
@@ -118,9 +131,7 @@ def candidate_frames(
         offset = np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
         best = [(chain.base, offset)]
     else:
-        steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
-        grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
-        offsets = grid if is_tool_unknown else chain.tool[None, :3, 3]
+        offsets = _offset_grid() if is_tool_unknown else chain.tool[None, :3, 3]
         points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
         motions, distances = align(points, measured)
         order = np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]
@@ -135,6 +146,12 @@ def candidate_frames(
         if is_tool_unknown and rotations:
             rotation = nearest_rotation(np.concatenate(rotations).sum(0))
         yield chain.with_base_and_tool(base, se3.transform(rotation, offset))
+
+
+def _offset_grid() -> Array:
+    """Return the tool offsets (27, 3) that are tried, zero first."""
+    steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
+    return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
 
 
 def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
@@ -244,12 +261,12 @@ def make_problem(
 def _fit_frames(
     frames: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> tuple[float, Chain]:
-    """Fit base and tool alone; return the approximate cost and the chain with them."""
+    """Fit base and tool alone; return the cost and the chain with them."""
     data = tuple(item.initialized(frames.chain) for item in data)
     problem = make_problem(frames, data, 1 / frames.priors, known)
     solution = minimize(problem, max_iterations=max_iterations, loose=True)
-    cost = solution.system.cost + float(np.sum((problem.weights * solution.x) ** 2))
-    return cost, frames.at(next_iterate(problem, solution)[: len(frames.parameters)])
+    x, cost = complete(problem, solution, max_iterations)
+    return cost, frames.at(x[: len(frames.parameters)])
 
 
 def initialize_frames(
@@ -287,6 +304,71 @@ def _best_frames(
         if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
             break
     return best
+
+
+def compare_tools(
+    started: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
+) -> ErrorModel:
+    """Initialize base and tool from several tool offsets where tool points without positions are measured."""
+    frames, drawn = started.only_frames, tuple(subsample(item) for item in data)
+    is_tool_unknown = any(p.error_frame == started.chain.tool_frame_index for p in started.parameters)
+    has_points = any(isinstance(item, PointMeasurement) for item in data)
+    if frames is None or not is_tool_unknown or not has_points or any(len(i.positions()) for i in data):
+        return started
+    costs, chain = [], frames.chain
+    offsets = se3.transform(np.eye(3), _offset_grid())
+    chains = [chain.with_base_and_tool(chain.base, chain.tool @ offset) for offset in offsets]
+    for each in chains:
+        items = tuple(item.initialized(each) for item in drawn)
+        problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
+        costs.append(problem.cost(np.zeros(len(problem.weights))))
+    best = np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]
+    fits = [_fit_frames(replace(frames, chain=chains[k]), drawn, known, max_iterations) for k in best]
+    return replace(started, chain=min(fits, key=lambda each: each[0])[1])
+
+
+def compare_mirror_images(problem: Problem, solution: SolverResult, max_iterations: int) -> SolverResult:
+    """Fit mirror images of anchors and centres, too; return the best of these and a loose solution."""
+    best, is_better = solution, True
+    while is_better:
+        is_better = False
+        starts = _mirrored_starts(problem, best.x)
+        order = np.argsort([_predicted_cost(problem, start) for start in starts], kind="stable")
+        for k in order[:_MAX_CANDIDATES]:
+            trial = minimize(problem, "lm", starts[k], max_iterations, loose=True)
+            if problem.cost(trial.x) < (1 - _MIN_COST_REDUCTION) * problem.cost(best.x):
+                best, is_better = trial, True
+    return best
+
+
+def _mirrored_starts(problem: Problem, x: Array) -> list[Array]:
+    """Return solutions (p,) in which one or several instruments are replaced by mirror images."""
+    chain, values = problem.chain(x), problem.instruments(x)
+    index = {p.name: i for i, p in enumerate(problem.parameters)}
+    # Images that change the same parameters exclude each other.
+    choices: dict[tuple[str, ...], list[dict[str, float]]] = {}
+    for item in problem.data:
+        for image in item.mirror_images(chain, values):
+            if index.keys() >= image.keys():
+                choices.setdefault(tuple(image), []).append(image)
+    combined = (
+        images
+        for n_changed in range(1, len(choices) + 1)
+        for group in combinations(choices.values(), n_changed)
+        for images in product(*group)
+    )
+    starts = []
+    for images in islice(combined, _MAX_MIRRORED):
+        start = x.copy()
+        for name, value in ChainMap(*images).items():
+            start[index[name]] += value - values[name]
+        starts.append(start)
+    return starts
+
+
+def _predicted_cost(problem: Problem, x: Array) -> float:
+    """Return the cost that an undamped step from x (p,) would lead to if the model were linear."""
+    return linear_system(problem, x).with_priors(problem.weights, x).min_cost
 
 
 def fit_frames(errors: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float]) -> Chain:

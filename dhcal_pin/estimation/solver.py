@@ -127,6 +127,17 @@ def next_iterate(problem: Problem, solution: SolverResult) -> Array:
     return solution.x + bounded_step(problem, system, solution.x)
 
 
+def complete(problem: Problem, loose: SolverResult, max_iterations: int) -> tuple[Array, float]:
+    """Complete a loose solution by an undamped step, or else by iterations; return its end and the cost."""
+    end = next_iterate(problem, loose)
+    cost = problem.cost(end)
+    if cost <= _cost(problem, loose.system, loose.x):
+        return end, cost
+    # An undamped step in a curved valley, or along an undetermined direction, can lead far away.
+    further = minimize(problem, "lm", loose.x, max_iterations, warm_start=loose)
+    return further.x, _cost(problem, further.system, further.x)
+
+
 def _undamped_change(problem: Problem, data: TriangularSystem, x: Array) -> float:
     """Compute the norm of the change of the whitened rows by an undamped step from x (p,)."""
     system = data.with_priors(problem.weights, x)

@@ -319,6 +319,18 @@ class Measurement(ABC):
         """Return a copy whose instrument parameters are initialized from the tool poses of a robot."""
         return self
 
+    def mirror_images(self, chain: Chain, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Return other values of instrument parameters that explain the samples nearly as well.
+
+        Args:
+            chain: Robot.
+            values: Values of the instrument parameters by name.
+
+        Returns:
+            Changed values by name, one mapping per image; none if the instrument has no mirror images.
+        """
+        return []
+
     def initialized_from(self, chain: Chain, is_used: Array, is_kept: Array | None = None) -> Self:
         """Return a copy with initial values of the instrument parameters from a part of the samples.
 

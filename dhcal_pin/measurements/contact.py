@@ -11,7 +11,7 @@ robot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._typing import Array
-from ..exceptions import InvalidArgumentError
+from ..exceptions import InvalidArgumentError, UnknownNameError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from ..robot.inverse_kinematics import position_task, solve_within_limits
-from .base import POINT_PRIOR, InstrumentParameter, Noise, point_parameters
+from .base import POINT_PRIOR, InstrumentParameter, Measurement, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
 from .groups import LENGTHS, POSITION, Group
-from .length import MIN_DIVISOR, norm_and_direction
+from .length import MIN_DIVISOR, images_of_point, norm_and_direction
 from .mounting import MountedRig
 from .position import PointMeasurement
 from .trilateration import locate_point
@@ -202,6 +202,17 @@ class PointDistance(PointMeasurement):
         return cls(chain.n_joints, names, distances, noise.position or None)
 
 
+def require_touched_points(data: Sequence[Measurement], known: Container[str] = ()) -> None:
+    """Raise an error if a distance is between points that no measurement touches."""
+    touched = sorted({name for item in data if isinstance(item, PointContact) for name in item.names})
+    choice = f"choose from {', '.join(touched)}" if touched else "expected measurements of kind point"
+    for item in data:
+        for name in item.names if isinstance(item, PointDistance) else ():
+            if name not in touched and f"point_{name}.x" not in known:
+                where = item.source or item.kind
+                raise UnknownNameError(f"{where}: no measurement touches the point {name!r}; {choice}")
+
+
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class PlaneContact(PointMeasurement):
     """Contacts of the tool point with an unknown plane, such as a surface plate or a wall.
@@ -329,6 +340,11 @@ class SphereContact(PointMeasurement):
         """Return a copy whose centre fits the chain's tool points best."""
         centre = locate_point(chain.poses(self.q)[:, :3, 3], self.values[:, 0])
         return self.replace(instrument_parameters=point_parameters(f"sphere_{self.name}", centre))
+
+    def mirror_images(self, chain: Chain, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Return the mirror images of the centre."""
+        points = chain.poses(self.conditions())[:, :3, 3]
+        return images_of_point(f"sphere_{self.name}", points, values)
 
     @classmethod
     def _simulate(

@@ -24,7 +24,7 @@ from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import Column, displacement_range, instrument_range, length_columns
 from .groups import LENGTHS, Group
 from .position import PointMeasurement
-from .trilateration import locate_point
+from .trilateration import locate_point, mirror_images
 from .validation import validated_array, validated_joint_positions
 
 # Largest number of wires of a device in a file; columns L1 to L9.
@@ -37,6 +37,13 @@ def norm_and_direction(vectors: Array, axis: int) -> tuple[Array, Array]:
     """Return the norms of vectors and the unit vectors along them."""
     norm = np.linalg.norm(vectors, axis=axis)
     return norm, vectors / np.expand_dims(np.maximum(norm, MIN_DIVISOR), axis)
+
+
+def images_of_point(prefix: str, points: Array, values: Mapping[str, float]) -> list[dict[str, float]]:
+    """Return mirror images of a point among the instrument parameters, from tool points (m, 3)."""
+    names = [f"{prefix}.{axis}" for axis in "xyz"]
+    images = mirror_images(points, [values[name] for name in names])
+    return [dict(zip(names, image.tolist(), strict=True)) for image in images]
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -156,6 +163,12 @@ class Wires(PointMeasurement):
             ]
         )
         return self.replace(instrument_parameters=_wire_parameters(self.anchors, self.offsets, anchors))
+
+    def mirror_images(self, chain: Chain, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Return the mirror images of each unknown anchor."""
+        points = chain.poses(self.conditions())[:, :3, 3]
+        names = (f"wire{i + 1}" for i in np.flatnonzero(np.isnan(self.anchors[:, 0])))
+        return [image for name in names for image in images_of_point(name, points, values)]
 
     @classmethod
     def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Wires:

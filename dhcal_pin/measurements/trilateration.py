@@ -17,11 +17,22 @@ from numpy.typing import ArrayLike
 
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
+from ..subsampling import evenly_spaced_indices
 
 # Anchors of the paper's device closer to one line than this are collinear, relative to its largest dimension.
 MIN_RELATIVE_DIMENSION = 1e-9
-# Relative singular values below this are cut when a point is located.
+# Extents of known points below this fraction of the largest are zero when a point is located.
 POINT_RCOND = 1e-9
+# Damping of the first step of a located point, largest number of steps, and step relative to the largest
+# distance that ends them.
+_INITIAL_DAMPING, _MAX_REFINEMENTS, _NEGLIGIBLE_STEP = 1e-6, 30, 1e-9
+# Largest number of known points that a point is located from.
+_MAX_POINTS = 300
+# Largest RMS change of the distances to a mirror image, relative to their mean, that a fit could explain, and
+# smallest distance of the image from the located point.
+_MAX_MIRROR_CHANGE = 0.02
+# Smallest distance by which a direction is divided [m].
+_MIN_DIVISOR = 1e-12
 
 
 def device_anchors(a: float, b: float, c: float) -> Array:
@@ -60,9 +71,70 @@ def position_dilution(points: ArrayLike, anchors: ArrayLike) -> Array:
 
 
 def locate_point(points: ArrayLike, distances: ArrayLike) -> Array:
-    """Locate the point (3,) with distances (m,) to known points (m, 3) [m], by linear least squares."""
-    points, distances = np.asarray(points, float), np.asarray(distances, float)
+    """Locate the point (3,) with distances (m,) to known points (m, 3) [m], by nonlinear least squares."""
+    drawn = evenly_spaced_indices(len(np.asarray(points)), _MAX_POINTS)
+    points, distances = np.asarray(points, float)[drawn], np.asarray(distances, float)[drawn]
+    located, costs = _refine(points, distances, _point_starts(points, distances))
+    return located[np.argmin(costs)]
+
+
+def mirror_images(points: ArrayLike, located: ArrayLike) -> Array:
+    """Return other points (k, 3) with nearly the distances of a located one (3,) from known points (m, 3)."""
+    # Points near a plane have one, its mirror image, and points near a line three at right angles.
+    points, located = np.asarray(points, float), np.asarray(located, float)
+    centre = points.mean(0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2]
+    reflections = (np.array([[1, 1, -1], [1, -1, 1], [1, -1, -1]]) * (axes @ (located - centre))) @ axes
+    distances = np.linalg.norm(points - located, axis=1)
+    changes = np.linalg.norm(points - (centre + reflections)[:, None], axis=2) - distances
+    is_near = np.sqrt(np.mean(changes**2, 1)) <= _MAX_MIRROR_CHANGE * distances.mean()
+    is_other = np.linalg.norm(centre + reflections - located, axis=1) > _MAX_MIRROR_CHANGE * distances.mean()
+    return (centre + reflections)[is_near & is_other]
+
+
+def _point_starts(points: Array, distances: Array) -> Array:
+    """Return points (7, 3) that have about the given distances, from linear equations."""
+    # Directions in which the known points hardly extend are badly determined. Without the last one or two,
+    # the mean square of the distances says how far the point is from the others, but not on which side.
     centre = points.mean(0)
     arms = points - centre
-    right = 0.5 * (np.sum(arms**2, 1) - distances**2)
-    return centre + np.linalg.lstsq(arms, right - right.mean(), rcond=POINT_RCOND)[0]
+    squares = distances**2 - np.sum(arms**2, 1)
+    left, extents, axes = np.linalg.svd(arms, full_matrices=False)
+    inverse = np.divide(1, extents, out=np.zeros(3), where=extents > POINT_RCOND * extents[0])
+    linear = -0.5 * inverse * (left.T @ (squares - squares.mean()))
+    starts = [linear]
+    for n_known in (2, 1):
+        known = np.where(np.arange(3) < n_known, linear, 0.0)
+        height = np.sqrt(max(squares.mean() - known @ known, 0.0))
+        starts += [known + sign * height * axis for axis in np.eye(3)[n_known:] for sign in (1, -1)]
+    return centre + np.array(starts) @ axes
+
+
+def _refine(points: Array, distances: Array, starts: Array) -> tuple[Array, Array]:
+    """Fit points (k, 3) to their distances by damped steps from starts; return them with their costs (k,)."""
+    located, damping = starts, np.full(len(starts), _INITIAL_DAMPING)
+    directions, errors = _directions_and_errors(points, distances, located)
+    costs = np.sum(errors**2, 1)
+    for _ in range(_MAX_REFINEMENTS):
+        information = directions.swapaxes(1, 2) @ directions
+        information += (damping * len(points))[:, None, None] * np.eye(3)
+        right = directions.swapaxes(1, 2) @ errors[..., None]
+        steps = np.linalg.solve(information, right)[..., 0]
+        trial_directions, trial_errors = _directions_and_errors(points, distances, located + steps)
+        trial_costs = np.sum(trial_errors**2, 1)
+        is_better = trial_costs < costs
+        damping = np.where(is_better, 0.1, 10.0) * damping
+        located = np.where(is_better[:, None], located + steps, located)
+        errors = np.where(is_better[:, None], trial_errors, errors)
+        directions = np.where(is_better[:, None, None], trial_directions, directions)
+        costs = np.minimum(costs, trial_costs)
+        if np.linalg.norm(steps[np.argmin(costs)]) <= _NEGLIGIBLE_STEP * distances.max():
+            break
+    return located, costs
+
+
+def _directions_and_errors(points: Array, distances: Array, located: Array) -> tuple[Array, Array]:
+    """Return unit vectors (k, m, 3) from known points to located ones, and errors (k, m) of the distances."""
+    arms = located[:, None] - points
+    norms = np.linalg.norm(arms, axis=2)
+    return arms / np.maximum(norms, _MIN_DIVISOR)[..., None], distances - norms

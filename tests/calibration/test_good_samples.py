@@ -12,7 +12,7 @@ from slow_cases import some_slow
 from dhcal_pin.calibration import calibrate, good_samples
 from dhcal_pin.cameras.boards import Board
 from dhcal_pin.estimation import select_parameters
-from dhcal_pin.estimation.initialization import align
+from dhcal_pin.estimation.initialization import align, initialize_frames
 from dhcal_pin.estimation.robust import REGIONAL, ZERO_WEIGHT
 from dhcal_pin.estimation.trimmed_squares import find_initial_outliers
 from dhcal_pin.estimation.trimmed_squares.search import LinearizedRows
@@ -466,10 +466,9 @@ def test_the_robust_start_keeps_the_digits_of_clean_data(kind):
     rng = np.random.default_rng(8)
     chain = measured_arm("slide")
     data = kind.simulate(chain, joint_sample(chain, 40, rng), Noise(SIGMA, SIGMA), rng)
-    assert not any(
-        is_outlier.any()
-        for is_outlier in find_initial_outliers(select_parameters(chain, "minimal,base,tool"), [data], {})
-    )
+    errors = select_parameters(chain, "minimal,base,tool")
+    found = find_initial_outliers(errors, [data], {}, initialize_frames(errors, (data,), {}, 100).chain)
+    assert not any(is_outlier.any() for is_outlier in found)
     fits = [
         calibrate(chain, without_sigma(data), "minimal,base,tool", extend="none", loss=loss)
         for loss in ("auto", "linear")

@@ -21,7 +21,7 @@ from dhcal_pin.estimation import (
 )
 from dhcal_pin.estimation import solver_rules as rules
 from dhcal_pin.estimation.initialization import initialize_frames, make_problem
-from dhcal_pin.estimation.solver import next_iterate, remaining_change
+from dhcal_pin.estimation.solver import complete, next_iterate, remaining_change
 from dhcal_pin.exceptions import ConvergenceError, UnknownNameError
 from dhcal_pin.measurements import Noise, Position, SphereContact
 
@@ -59,7 +59,8 @@ def test_a_loose_solution_is_not_a_step_that_damping_shortened(seed):
     problem = make_problem(errors, (data.initialized(nominal),), 1 / errors.priors, {})
     start = np.zeros(len(problem.weights))
     full, loose = (levenberg_marquardt(problem, start, 100, loose=loose) for loose in (False, True))
-    assert problem.cost(loose.x) <= 1.0001 * problem.cost(full.x)
+    # Loose steps change the rows by a tenth of their norm, their squares by a hundredth.
+    assert problem.cost(loose.x) <= 1.02 * problem.cost(full.x)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,7 @@ def test_a_fold_is_not_ended_by_an_undamped_step_that_raises_the_cost(curved_val
     start = np.zeros(len(curved_valley.weights))
     loose = levenberg_marquardt(curved_valley, start, 100, loose=True)
     assert curved_valley.cost(next_iterate(curved_valley, loose)) > curved_valley.cost(loose.x)
+    assert complete(curved_valley, loose, 100)[1] < curved_valley.cost(loose.x)
     fit: Any = SimpleNamespace(x=start, converged=True)
     assert curved_valley.cost(refit(fit, curved_valley, start)) < curved_valley.cost(loose.x)
 

@@ -9,6 +9,7 @@ from dhcal_pin.measurements import Noise, Position, Wires
 from dhcal_pin.measurements.trilateration import (
     device_anchors,
     locate_point,
+    mirror_images,
     position_dilution,
     trilaterate_three_wires,
 )
@@ -97,6 +98,34 @@ def test_position_dilution_equals_that_of_simulated_noise(x, wanted):
 def test_locate_point_is_exact():
     points = random_points(20)
     np.testing.assert_allclose(locate_point(points, lengths(points, RIG[:1])[:, 0]), RIG[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("extents", [(1, 1, 1e-3), (1, 1e-3, 1e-3)])
+def test_points_near_a_plane_or_a_line_locate_a_point(extents):
+    """The linear equations are up to a metre off: they know nothing across the plane."""
+    rng, right = np.random.default_rng(0), 0
+    for _ in range(20):
+        points, anchor = 0.2 * rng.uniform(-1, 1, (40, 3)) * extents, rng.normal(size=3)
+        measured = lengths(points, anchor[None])[:, 0] + 1e-6 * rng.standard_normal(40)
+        found = locate_point(points, measured)
+        cost, true_cost = (
+            np.sum((lengths(points, each[None])[:, 0] - measured) ** 2) for each in (found, anchor)
+        )
+        assert cost <= true_cost
+        right += np.linalg.norm(found - anchor) < 0.02
+    assert right == 20
+
+
+def test_images_of_a_point_have_nearly_its_distances():
+    """One in a plane, three about a line, and none where the points extend in space."""
+    rng, anchor = np.random.default_rng(0), np.array([0.3, 0.4, 1.0])
+    for extents, count in (((1, 0.7, 1e-3), 1), ((1, 1e-3, 2e-3), 3), ((1, 0.7, 0.4), 0)):
+        points = 0.2 * rng.uniform(-1, 1, (40, 3)) * extents
+        images = mirror_images(points, anchor)
+        assert len(images) == count
+        np.testing.assert_allclose(lengths(points, images) - lengths(points, anchor[None]), 0, atol=2e-3)
+    plane = 0.2 * rng.uniform(-1, 1, (40, 3)) * [1, 0.7, 0]
+    np.testing.assert_allclose(mirror_images(plane, anchor), [anchor * [1, 1, -1]], atol=1e-12)
 
 
 def test_unknown_anchors_are_estimated_with_the_robot(sim_6dof, sim_6dof_actual):

@@ -163,7 +163,9 @@ def run(args: Namespace) -> int:
 
 def _read_input(args: Namespace, sidecar: str | None) -> Given:
     """Read robot and measurements, and what a calibration has written beside the robot."""
-    from ...measurements.position import require_common_reference_target  # lazy import: loads Pinocchio
+    # lazy imports: they load Pinocchio
+    from ...measurements.contact import require_touched_points
+    from ...measurements.position import require_common_reference_target
 
     chain = options.read_one_robot(args.robot, args, sidecar)
     servos = io.read_servos(args.servos) if args.servos else None
@@ -172,6 +174,7 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     files = options.read_data(args, chain, servos, rig)
     instrument = io.read_instrument(sidecar) if sidecar else {}
     require_common_reference_target({file.source: file.data for file in files}, instrument)
+    require_touched_points([file.data for file in files], instrument)
     used = {parameter.name for file in files for parameter in file.data.instrument_parameters}
     known = {name: value for name, value in instrument.items() if name in used}
     calibrated_tip = (sidecar and io.read_tip(sidecar)) or chain.tip

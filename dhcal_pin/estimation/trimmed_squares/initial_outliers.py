@@ -4,11 +4,16 @@ A wrong length or a contact with another object is up to half a metre off. A lea
 samples then places base, tool and instruments far from their actual poses, where neither the model nor its
 linearization says which samples are wrong. The start is therefore searched with the nominal robot:
 
-1. Initialize the instruments from all samples and from random subsets of configurations. The start with the
+1. Fit base, tool and instruments to all samples.
+2. Initialize the instruments from all samples and from random subsets of configurations. The start with the
    smallest median of the residuals is used.
-2. Linearize the model in the unknowns of base, tool and instruments, and search the majority that agrees best
+3. Linearize the model in the unknowns of base, tool and instruments, and search the majority that agrees best
    (`search`).
-3. Fit this majority with the nonlinear model. Repeat steps 2 and 3 there until the majority is the same.
+4. Fit this majority with the nonlinear model. Repeat steps 3 and 4 there until the majority is the same.
+
+Steps 2 to 4 begin at the nominal base and tool, and again at those of step 1. The fit with the smallest
+median of the residuals counts, but a fit to a majority only if its median is far below that of step 1: a
+fit to half of few samples always has smaller residuals.
 
 A sample is an outlier if its residual is a large multiple of the median. Smaller outliers are left to the
 search after the fit of the robot: nominal robots have errors of millimetres themselves.
@@ -17,6 +22,7 @@ search after the fit of the robot: nominal robots have errors of millimetres the
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,6 +45,9 @@ MAX_SAMPLES, MIN_PER_GROUP = 200, 4
 N_STARTS, MIN_CONFIGURATIONS = 40, 4
 # Largest number of linearizations, and of iterations of the fit after each.
 MAX_LINEARIZATIONS, MAX_ITERATIONS = 10, 30
+# Smallest ratio of the median residual of a fit to all samples to that of a majority which makes the
+# majority more credible. A fit to few samples reduces their residuals, too.
+MIN_IMPROVEMENT = 5.0
 # Smallest ratio of the residual of an outlier to the median of all.
 MIN_RATIO = 10.0
 # Smallest median of whitened residuals; exact data have none.
@@ -46,33 +55,79 @@ MIN_MEDIAN = 1e-6
 
 
 def find_initial_outliers(
-    errors: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+    errors: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float], started: Chain
 ) -> list[Array]:
     """Find samples that are so far from the nominal robot that a fit must begin without them."""
-    all_good = [np.zeros(len(item.rows), bool) for item in data]
+    # The started chain has base and tool from all samples: outliers ruin them, few clean samples do not.
     frames = errors.only_frames or ErrorModel(errors.chain, ())
+    best = _distances_from_all(replace(frames, chain=started), data, known)
+    least = _log_median(best) - np.log(MIN_IMPROVEMENT)
+    for chain in dict.fromkeys((frames.chain, started)):
+        trial = _distances_from_majority(replace(frames, chain=chain), data, known)
+        if trial is None:
+            return [np.zeros(len(item.rows), bool) for item in data]
+        if _log_median(trial) < least:
+            best, least = trial, _log_median(trial)
+    out = []
+    for groups in best:
+        is_outlier = [each > MIN_RATIO * _median(each) for each in groups]
+        out.append(np.any(is_outlier, 0))
+    return out
+
+
+def _median(distances: Array) -> float:
+    """Return the median of distances (m,), positive also for exact data and none."""
+    return max(float(np.median(distances)), MIN_MEDIAN) if len(distances) else MIN_MEDIAN
+
+
+def _log_median(distances: Sequence[Sequence[Array]]) -> float:
+    """Return the mean logarithm of the medians of all residual groups, weighted by their samples."""
+    groups = [each for of_item in distances for each in of_item]
+    return float(
+        np.average([np.log(_median(each)) for each in groups], weights=[len(each) for each in groups])
+    )
+
+
+def _distances_from_all(
+    frames: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+) -> list[list[Array]]:
+    """Compute the norms (m,) of the residuals by measurement and group after a fit to all samples."""
+    starts = [item.initialized(frames.chain) for item in data]
+    problem = _make_problem(frames, starts, known)
+    drawn = problem.with_data([start.take(_draw_groups(start) & _thin_groups(start)) for start in starts])
+    x = minimize(drawn, "lm", np.zeros(len(problem.weights)), MAX_ITERATIONS, loose=True).x
+    return _distances(problem, x)
+
+
+def _distances_from_majority(
+    frames: ErrorModel, data: Sequence[Measurement], known: Mapping[str, float]
+) -> list[list[Array]] | None:
+    """Compute the norms of the residuals after a fit to a majority; None if the samples are too few."""
     starts = [_initialize_instruments(frames.chain, item, _draw_groups(item)) for item in data]
-    parameters = [p for p in merge_instrument_parameters(starts) if p.name not in known]
-    weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
-    problem = Problem(frames, tuple(starts), weights, known)
+    problem = _make_problem(frames, starts, known)
     x = _fit_majority(problem.with_data([start.take(_thin_groups(start)) for start in starts]))
     if x is None:
-        return all_good
-    full = problem.with_data(
-        [
-            start.replace(**{name: getattr(item, name) for name in item.sample_fields})
-            for start, item in zip(starts, data, strict=True)
-        ]
-    )
-    out = []
-    for item, residual in zip(full.data, whitened_residuals(full, x), strict=True):
-        is_outlier = np.zeros(len(item.rows), bool)
-        for rows in (group.rows for group in item.residual_groups.values()):
-            distances = np.linalg.norm(residual[rows], axis=0)
-            if len(distances):
-                is_outlier |= distances > MIN_RATIO * max(float(np.median(distances)), MIN_MEDIAN)
-        out.append(is_outlier)
-    return out
+        return None
+    full = [
+        start.replace(**{name: getattr(item, name) for name in item.sample_fields})
+        for start, item in zip(starts, data, strict=True)
+    ]
+    return _distances(problem.with_data(full), x)
+
+
+def _make_problem(frames: ErrorModel, items: Sequence[Measurement], known: Mapping[str, float]) -> Problem:
+    """Make the problem of base, tool and instruments."""
+    parameters = [p for p in merge_instrument_parameters(items) if p.name not in known]
+    weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
+    return Problem(frames, tuple(items), weights, known)
+
+
+def _distances(problem: Problem, x: Array) -> list[list[Array]]:
+    """Compute the norms (m,) of the residuals by measurement and group."""
+    return [
+        [np.linalg.norm(residual[group.rows], axis=0) for group in item.residual_groups.values()]
+        for item, residual in zip(problem.data, whitened_residuals(problem, x), strict=True)
+    ]
 
 
 def _draw_groups(item: Measurement) -> Array:
