@@ -11,7 +11,9 @@ changes. The other way round, joint errors imitate a change along a smooth path.
 for with the geometry alone first. They are kept if no joint errors are supported beside them and the noise is
 not larger than with joint errors in place of the changes. Otherwise changes are looked for with the families
 of joint errors that the measurements support without changes, and kept only if the measurements support them
-beside all families, too.
+beside all families, too. Where the configurations change along the session, joint errors that were fitted
+without a change can have taken most of it. They are therefore fitted again with the changes that were found,
+until both stay the same: first from no changes, and from those of the geometry if none are confirmed.
 
 Backlash depends on the direction of the last motion of a joint. A file that states no directions may be in
 the order of measurement, from which they follow, or not: then they are those of chance, and explain nothing.
@@ -43,9 +45,9 @@ from ..plausibility.mixups import diagnose_mixups
 from ..robot.chain import Chain
 from ..robot.error_families import BACKLASH, FAMILIES
 from ..session import Session, find_session
-from ..session.causes import Step
+from ..session.causes import Cause, Step
 from ..session.robot_changes import RobotChanges
-from ..session.search import MAX_SAMPLE_COST, MIN_EFFECT, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
+from ..session.search import MAX_SAMPLE_COST, MIN_LOG_EVIDENCE, MIN_NOISE, has_enough_rows
 from ..session.timeline import order_samples
 from .model_selection import MAX_HINT_RATIO, ExtendedFit, family_gains, outlier_weights, with_joint_errors
 from .partition import of_same_files
@@ -54,6 +56,11 @@ from .verdict import MAX_USUAL_ERROR
 
 # Logarithm of the evidence that each coefficient of a change costs.
 COST_PER_COEFFICIENT = 5.0
+# Smallest RMS effect of a change beside all joint errors, in standard deviations. Joint errors that take most
+# of the effect where configurations were measured can be wrong by many millimetres elsewhere.
+MIN_CONFIRMED_EFFECT = 0.25
+# Largest number of fits of joint errors with the changes that were found beside the joint errors before.
+MAX_REFITS = 4
 # Largest number of iterations of the fit of changes and joint errors.
 MAX_ITERATIONS = 20
 # Smallest share of the degrees of freedom that the noise is estimated with.
@@ -117,7 +124,8 @@ def fit_session(
     progress: Progress | None,
 ) -> SessionFit:
     """Find what happened during a session, and fit the measurements of a first fit again with it."""
-    found = _find_confirmed(fit, data, holdout, models, is_ordered)
+    extended, extension = models.supported(fit)
+    found = _find_confirmed(_Search(fit, data, holdout, models, is_ordered, extended, extension.families))
     session = found.session
     if session is None or not _has_changes(found):
         return found
@@ -130,45 +138,94 @@ def fit_session(
     return replace(found, diagnosis=diagnosis)
 
 
-def _find_confirmed(
-    fit: Fit,
-    data: tuple[Measurement, ...],
-    holdout: tuple[Measurement, ...],
-    models: SessionModels,
-    is_ordered: bool,
-) -> SessionFit:
+def _find_confirmed(search: _Search) -> SessionFit:
     """Find what happened during a session, and keep the changes that are confirmed."""
-    extended, extension = models.supported(fit)
-    problem, x = replace(fit.problem, data=fit.data), fit.solution.x
-
-    def find(problem: Problem, x: Array) -> SessionFit:
-        """Find what happened, from a solution, and fit again with the changes."""
-        chain = fit.problem.errors.chain
-        session = replace(find_session(problem, x, holdout, is_ordered), chain=chain)
-        if session.changes.is_empty:
-            return SessionFit(fit, holdout, session)
-        changed, changed_holdout = session.applied(data, holdout)
-        errors = models.errors
-        held = errors if session.changes.tool.is_identity else _with_held_axes(errors, fit.solution)
-        return SessionFit(models.start(changed, held), changed_holdout, session)
-
-    found = find(problem, x)
-    if extension.families:
+    found = by_geometry = search.find(search.problem, search.fit.solution.x)
+    if search.families:
         # Joint errors can imitate a change. They are dropped if none is supported beside the change.
         if _has_changes(found):
-            changed, remaining = models.supported(found.fit)
-            if not remaining.families and _log_noise(changed) <= _log_noise(extended):
+            changed, remaining = search.models.supported(found.fit)
+            if not remaining.families and _log_noise(changed) <= _log_noise(search.extended):
                 return found
-        with_all, start = with_joint_errors(problem, x, extended, extension.families)
         # Joint errors that are not in the model hide small changes, and look like changes.
-        if has_enough_rows(with_all, order_samples(fit.data, ())):
-            found = find(with_all, start)
-    session = found.session
-    if session is None or not _has_changes(found) or session.has_two_robots:
-        return found
-    if _confirm_changes(session, fit, models.reweighted(found.fit), models.extended):
-        return found
-    return SessionFit(fit, holdout, without_changes(session))
+        found = search.confirmed(search.find_beside(search.extended, found))
+        if not _has_changes(found) and _has_changes(by_geometry):
+            # Joint errors that were fitted without the changes can have taken them.
+            found = search.find_beside(search.refitted(by_geometry), by_geometry)
+    return search.confirmed(found)
+
+
+@frozen(eq=False)
+class _Search:
+    """Search for changes with the geometry alone, or beside joint errors."""
+
+    fit: Fit  # First fit
+    data: tuple[Measurement, ...]
+    holdout: tuple[Measurement, ...]
+    models: SessionModels
+    is_ordered: bool
+    extended: Fit  # Fit with the families of joint errors that the measurements support without changes
+    families: Sequence[str]  # Names of these families
+
+    @property
+    def problem(self) -> Problem:
+        """Problem of the geometry, without weights of the samples."""
+        return replace(self.fit.problem, data=self.fit.data)
+
+    def find(self, problem: Problem, x: Array) -> SessionFit:
+        """Find what happened, from a solution, and fit again with the changes."""
+        chain = self.fit.problem.errors.chain
+        session = replace(find_session(problem, x, self.holdout, self.is_ordered), chain=chain)
+        if session.changes.is_empty:
+            return SessionFit(self.fit, self.holdout, session)
+        changed, changed_holdout = session.applied(self.data, self.holdout)
+        errors = self.models.errors
+        held = errors if session.changes.tool.is_identity else _with_held_axes(errors, self.fit.solution)
+        return SessionFit(self.models.start(changed, held), changed_holdout, session)
+
+    def find_beside(self, extended: Fit, found: SessionFit) -> SessionFit:
+        """Find what happened beside the joint errors of a fit, which are fitted again with what was found."""
+        last = found
+        for _ in range(MAX_REFITS):
+            with_all, x = with_joint_errors(self.problem, self.fit.solution.x, extended, self.families)
+            if not has_enough_rows(with_all, order_samples(self.fit.data, ())):
+                return found
+            last, found = found, self.find(with_all, x)
+            if not _has_changes(found) or _agree(last, found):
+                return found
+            extended = self.refitted(found)
+        # What happened does not come and go with small changes of the joint errors.
+        return min(found, last, key=lambda each: len(_causes(each)))
+
+    def refitted(self, found: SessionFit) -> Fit:
+        """Fit the joint errors again, with changes."""
+        assert found.session is not None
+        return _with_changes(self.extended, self.models.reweighted(found.fit), found.session)
+
+    def confirmed(self, found: SessionFit) -> SessionFit:
+        """Return what was found, without changes that the measurements do not support beside joint errors."""
+        session = found.session
+        if session is None or not _has_changes(found) or session.has_two_robots:
+            return found
+        if _confirm_changes(session, self.fit, self.models.reweighted(found.fit), self.models.extended):
+            return found
+        return SessionFit(self.fit, self.holdout, without_changes(session))
+
+
+def _causes(found: SessionFit) -> tuple[Cause, ...]:
+    """Return what was found in the order of its discovery."""
+    return found.session.causes if found.session else ()
+
+
+def _agree(first: SessionFit, second: SessionFit) -> bool:
+    """Return whether two sessions have the same causes, with values that differ by less than their errors."""
+    one, other = _causes(first), _causes(second)
+    return len(one) == len(other) and all(
+        (a.block.kind, a.block.of) == (b.block.kind, b.block.of)
+        and len(a.values) == len(b.values)
+        and bool(np.all(np.abs(a.values - b.values) <= np.sqrt(np.diag(b.covariance))))
+        for a, b in zip(one, other, strict=True)
+    )
 
 
 def _has_changes(found: SessionFit) -> bool:
@@ -263,7 +320,7 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
     gain, n_rows = costs[0] - costs[1], sum(r.size for r in residuals[1])
     n_coefficients = sum(len(cause.values) for cause in changes)
     needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
-    return bool(gain > max(needed, MIN_EFFECT**2 * n_rows * share))
+    return bool(gain > max(needed, MIN_CONFIRMED_EFFECT**2 * n_rows * share))
 
 
 def _with_changes(fit: Fit, changed: Fit, session: Session) -> Fit:
