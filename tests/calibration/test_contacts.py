@@ -1,6 +1,5 @@
 """Contacts with sockets at known distances."""
 
-
 import numpy as np
 from robots import nominal_arm
 
