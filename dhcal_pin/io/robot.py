@@ -35,7 +35,16 @@ from .origins_file import convert_to_origins, joint_origins, without_negligible_
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import NO_FINDINGS, Findings, Fitted, existing_sidecar, sidecar_path, sidecar_text, with_sidecar
+from .sidecar import (
+    NO_FINDINGS,
+    Findings,
+    Fitted,
+    existing_sidecar,
+    read_tip,
+    sidecar_path,
+    sidecar_text,
+    with_sidecar,
+)
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -179,6 +188,7 @@ def _read(
     """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
     path, folders = resolve_robot_file(path), validated_package_dirs(package_dirs)
     complete_interrupted_save(path)
+    sidecar = sidecar or existing_sidecar(path)
     robot_format = find_format(path)
     table = None
     if robot_format is not None and robot_format.read_table is not None:
@@ -191,8 +201,10 @@ def _read(
         # Messages name the file of the table.
         chain = replace(chain, urdf=replace(chain.urdf, source=os.fspath(path)))
     else:
-        chain = Chain.from_urdf(replace(_read_urdf(path), package_dirs=folders), tip, root)
-    sidecar = sidecar or existing_sidecar(path)
+        urdf = replace(_read_urdf(path), package_dirs=folders)
+        if tip is None and sidecar is not None and (stated := read_tip(sidecar)) in urdf.links:
+            tip = stated
+        chain = Chain.from_urdf(urdf, tip, root)
     return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
 
 
@@ -208,7 +220,7 @@ def read_robot(
     Args:
         path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
             robot of example-robot-data, and `flange.urdf` a flange at any pose that ships with the package.
-        tip: Tip link of a URDF; the deepest leaf if None.
+        tip: Tip link of a URDF; if None, that of the sidecar, or the deepest leaf.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.
         root: Link of a URDF where the chain begins; the root of the URDF if None.
