@@ -25,6 +25,7 @@ from ..robot.formats import mjcf_edit
 from ..robot.formats.mjcf import Mjcf, parse_mjcf, read_mjcf
 from ..robot.urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from ..robot.urdf_edit import with_origins
+from ..robot.urdf_path import default_tip
 from ..ros_packages import validated_package_dirs
 from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
@@ -202,10 +203,19 @@ def _read(
         chain = replace(chain, urdf=replace(chain.urdf, source=os.fspath(path)))
     else:
         urdf = replace(_read_urdf(path), package_dirs=folders)
-        if tip is None and sidecar is not None and (stated := read_tip(sidecar)) in urdf.links:
-            tip = stated
-        chain = Chain.from_urdf(urdf, tip, root)
+        chain = Chain.from_urdf(urdf, _default_tip(urdf, sidecar) if tip is None else tip, root)
     return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
+
+
+def _default_tip(urdf: Urdf, sidecar: PathLike | None) -> str:
+    """Return the deepest leaf; of several equally deep ones, the link that the sidecar states."""
+    try:
+        return default_tip(urdf)
+    except DhcalError:
+        stated = read_tip(sidecar) if sidecar else None
+        if stated not in urdf.links:
+            raise
+        return stated
 
 
 def read_robot(
@@ -220,7 +230,7 @@ def read_robot(
     Args:
         path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
             robot of example-robot-data, and `flange.urdf` a flange at any pose that ships with the package.
-        tip: Tip link of a URDF; if None, that of the sidecar, or the deepest leaf.
+        tip: Tip link of a URDF; the deepest leaf if None, or that of the sidecar if several are equally deep.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.
         root: Link of a URDF where the chain begins; the root of the URDF if None.

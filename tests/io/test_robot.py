@@ -92,7 +92,7 @@ def test_a_robot_has_the_name_of_its_file():
     assert robot_name(".urdf") == "arm"
 
 
-def test_a_sidecar_states_the_tip(tmp_path):
+def test_a_sidecar_chooses_among_equally_deep_tips(tmp_path):
     """Without it, the last joints of the gripper are the deepest ones."""
     links = ("base", "hand", "ball", "left", "right")
     joints = (
