@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from public_series import SERIES as PUBLIC_SERIES
 from robots import DATA, MAPS, UR10, missing, nominal_arm, robot_file
 from slow_cases import some_slow
 
@@ -14,7 +15,7 @@ from dhcal_pin.calibration import blocked_folds, calibrate, cross_validate, k_fo
 from dhcal_pin.calibration.evaluation import position_errors
 from dhcal_pin.cli import main
 from dhcal_pin.io import read_measurement_file, read_measurements
-from dhcal_pin.measurements import Noise
+from dhcal_pin.measurements import Noise, PointDistance
 from dhcal_pin.planning import plan
 from dhcal_pin.robot import joint_coverage
 
@@ -247,6 +248,19 @@ def test_extensions_are_better_at_eight_places(dhcal, tmp_path):
     )
     assert extended[0] < plain[0]
     assert extended[1] < 1.05 * plain[1]
+
+
+def test_known_distances_in_another_unit_are_refused():
+    """A robot of any size fits contacts; the distances remain wrong by tens of metres."""
+    (panda,) = (series for series in PUBLIC_SERIES if series.robot.startswith("mukca_panda"))
+    found = panda.read(DATA)
+    assert found
+    chain, contacts = found
+    pairs = [(f"{place}/hole_0", f"{place}/hole_1") for place in PANDA_2]
+    distances = PointDistance(chain.n_joints, pairs, [50.0] * len(pairs))
+    fit = calibrate(chain, [contacts.take(np.s_[::3]), distances], "placement,tool")
+    assert max(group.rms for group in fit.comparisons[-1].after.groups.values()) > 10
+    assert fit.verdict.status == "refused"
 
 
 @pytest.mark.parametrize("left", some_slow(["front_center", "mid_left"], {0}))

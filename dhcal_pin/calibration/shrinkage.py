@@ -46,7 +46,7 @@ import numpy as np
 from .._typing import Array
 from ..estimation.priors import PriorGroups
 from ..estimation.problem import Problem
-from ..estimation.qr import RANK_RTOL, TriangularSystem
+from ..estimation.qr import RANK_RTOL, TriangularSystem, singular_value_decomposition
 from ..estimation.solver import SolverResult
 
 # Largest accepted probability that the calibrated robot is worse than the nominal one.
@@ -97,9 +97,9 @@ def compute_shrinkage_factor(problem: Problem, solution: SolverResult, groups: P
 def _eliminate(system: TriangularSystem, x: Array, robot: Array, others: Array) -> tuple[Array, Array, Array]:
     """Eliminate the other unknowns from the rows of the system."""
     measured = system.z + system.r @ x
-    u, s, vt = np.linalg.svd(system.r[:, others], full_matrices=False)
-    is_observable = s > RANK_RTOL * s.max(initial=0.0)
-    u, s, vt, rows = u[:, is_observable], s[is_observable], vt[is_observable], system.r[:, robot]
+    u, s, vt = singular_value_decomposition(system.r[:, others])
+    k = int(np.sum(s > RANK_RTOL * s.max(initial=0.0)))
+    u, s, vt, rows = u[:, :k], s[:k], vt[:k], system.r[:, robot]
     return -vt.T @ ((u.T @ rows) / s[:, None]), rows - u @ (u.T @ rows), measured - u @ (u.T @ measured)
 
 

@@ -488,7 +488,7 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
         rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
         text = f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms}"
         # With fewer parameters than the robot has errors, the robot is better than before, but not good.
-        is_restricted = not fit.camera_stages and fit.diagnosis.is_explained and not _missing_frames(fit)
+        is_restricted = not fit.camera_stages and _lacks_parameters(fit) and not _missing_frames(fit)
         status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
         if fit.hand_eye is not None and fit.hand_eye.causes:
             text = f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}"
@@ -621,6 +621,12 @@ def needed_frames(
     return missing if is_needed else []
 
 
+def _lacks_parameters(fit: Evidence) -> bool:
+    """Return whether more parameters of the robot than the estimated ones fit the measurements."""
+    n_minimal = len(select_parameters(fit.errors.chain, "minimal").parameters)
+    return fit.diagnosis.is_explained and fit.errors.is_of_arm.sum() < n_minimal
+
+
 def _configuration_checks(fit: Evidence) -> str:
     """Name what to check of the configurations of images."""
     if fit.has_joint_values:
@@ -644,7 +650,7 @@ def _plausible_cause(fit: Evidence) -> str:
                 f"The measurements fit this robot if its {' and '.join(missing)} {verb} estimated: "
                 "--parameters minimal,base,tool."
             )
-        if fit.errors.is_of_arm.sum() < len(select_parameters(fit.errors.chain, "minimal").parameters):
+        if _lacks_parameters(fit):
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."
         if fit.rank < len(fit.x) and not fit.problem.weights.any():
             return "Nothing holds the parameters that the measurements do not determine: --priors default."

@@ -116,7 +116,7 @@ def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: A
     assert solution is not None
     step = solution[0]
     if not prior.all():
-        _, s, vt = np.linalg.svd(a)
+        _, s, vt = qr.singular_value_decomposition(a)
         null_space = vt[s <= qr.RANK_RTOL * s[0]]
         step = step - null_space.T @ (null_space @ (x[columns] + step))
     return step, system.min_cost + float(np.sum((a @ step - b) ** 2))

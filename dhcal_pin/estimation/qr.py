@@ -85,6 +85,12 @@ def singular_values(r: Array) -> Array:
     return np.linalg.svd(r, compute_uv=False)
 
 
+def left_singular_vectors(a: Array) -> tuple[Array, Array]:
+    """Compute the left singular vectors (m, k) that have a singular value, and these values (k,)."""
+    u, s, _ = singular_value_decomposition(a)
+    return u[:, : len(s)], s
+
+
 def right_singular_vectors(r: Array) -> tuple[Array, Array]:
     """Compute the singular values of R and its right singular vectors, the rows of a matrix (p, p)."""
     # Rows of zeros only add singular values of 0.

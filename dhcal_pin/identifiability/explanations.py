@@ -201,7 +201,7 @@ class Explainer:
         """Describe which combinations of the members, `listed` or named before, are identifiable."""
         # The count refers to the null space of the group's cause, because other groups may share its members.
         members, r = group.members, group.vectors.shape[1]
-        _, s, vt = np.linalg.svd(self.layers[group.cause][members].T)
+        _, s, vt = qr.singular_value_decomposition(self.layers[group.cause][members].T)
         n_lost = int(np.sum(s > NEGLIGIBLE))
         n_lost_now = int(np.linalg.matrix_rank(self.layers["unmoved"][members], NEGLIGIBLE))
         one, several = "can be identified", "can be identified"
@@ -349,7 +349,7 @@ class Explainer:
 
     def _is_determined_by(self, r: Array, group: UnobservableGroup) -> bool:
         """Decide whether measurements with an R factor observe all directions of a group."""
-        s = np.linalg.svd(r @ group.vectors, compute_uv=False)
+        s = qr.singular_values(r @ group.vectors)
         return bool(s.min() > _OBSERVABLE_RTOL * np.linalg.norm(r))
 
     def _suggest_measurement(self, group: UnobservableGroup) -> str:

@@ -72,7 +72,7 @@ class UnobservableGroup:
 
 def _vanishing_combinations(rows: Array) -> Array:
     """Return a basis of the combinations of columns that vanish in these rows of an orthonormal basis."""
-    _, s, vt = np.linalg.svd(rows)
+    _, s, vt = qr.singular_value_decomposition(rows)
     return vt[int(np.sum(s > NEGLIGIBLE)) :].T
 
 
@@ -81,7 +81,7 @@ def _unobservable_part(space: Array, r: Array) -> Array:
     norm = np.linalg.norm(r, 2) if r.size else 0.0
     if not space.shape[1] or norm == 0:
         return space
-    _, s, vt = np.linalg.svd(r @ space)
+    _, s, vt = qr.singular_value_decomposition(r @ space)
     return space @ vt[int(np.sum(s > _RTOL * norm)) :].T
 
 

@@ -25,6 +25,7 @@ from ..robot.formats import mjcf_edit
 from ..robot.formats.mjcf import Mjcf, parse_mjcf, read_mjcf
 from ..robot.urdf import Urdf, parse_urdf, read_urdf, suggest_names
 from ..robot.urdf_edit import with_origins
+from ..robot.urdf_path import default_tip
 from ..ros_packages import validated_package_dirs
 from ..saving import complete_interrupted_save, write_files
 from .dh_file import convert_to_dh, read_dh
@@ -35,7 +36,16 @@ from .origins_file import convert_to_origins, joint_origins, without_negligible_
 from .read_back import require_agreement
 from .robot_format import ConvertedRobot, RobotFormat, RobotSource
 from .shipped_files import resolve_robot_file
-from .sidecar import NO_FINDINGS, Findings, Fitted, existing_sidecar, sidecar_path, sidecar_text, with_sidecar
+from .sidecar import (
+    NO_FINDINGS,
+    Findings,
+    Fitted,
+    existing_sidecar,
+    read_tip,
+    sidecar_path,
+    sidecar_text,
+    with_sidecar,
+)
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -179,6 +189,7 @@ def _read(
     """Read the chain of a robot file and its sidecar, and its DH table if it has one."""
     path, folders = resolve_robot_file(path), validated_package_dirs(package_dirs)
     complete_interrupted_save(path)
+    sidecar = sidecar or existing_sidecar(path)
     robot_format = find_format(path)
     table = None
     if robot_format is not None and robot_format.read_table is not None:
@@ -191,9 +202,20 @@ def _read(
         # Messages name the file of the table.
         chain = replace(chain, urdf=replace(chain.urdf, source=os.fspath(path)))
     else:
-        chain = Chain.from_urdf(replace(_read_urdf(path), package_dirs=folders), tip, root)
-    sidecar = sidecar or existing_sidecar(path)
+        urdf = replace(_read_urdf(path), package_dirs=folders)
+        chain = Chain.from_urdf(urdf, _default_tip(urdf, sidecar) if tip is None else tip, root)
     return (chain if sidecar is None else with_sidecar(chain, sidecar)), table
+
+
+def _default_tip(urdf: Urdf, sidecar: PathLike | None) -> str:
+    """Return the deepest leaf; of several equally deep ones, the link that the sidecar states."""
+    try:
+        return default_tip(urdf)
+    except DhcalError:
+        stated = read_tip(sidecar) if sidecar else None
+        if stated not in urdf.links:
+            raise
+        return stated
 
 
 def read_robot(
@@ -208,7 +230,7 @@ def read_robot(
     Args:
         path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
             robot of example-robot-data, and `flange.urdf` a flange at any pose that ships with the package.
-        tip: Tip link of a URDF; the deepest leaf if None.
+        tip: Tip link of a URDF; the deepest leaf if None, or that of the sidecar if several are equally deep.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.
         root: Link of a URDF where the chain begins; the root of the URDF if None.

@@ -18,6 +18,7 @@ import numpy as np
 
 from .._typing import Array
 from ..estimation.problem import Problem, linearize_and_factor
+from ..estimation.qr import left_singular_vectors
 from ..measurements.base import Measurement
 
 # Smallest ratio of the residuals with the arm of all and with an arm of its own. It is up to 3.2 for
@@ -51,7 +52,7 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
     system = linearize_and_factor(own, start, small_angle=False)
     n_rows, effects = item.residual_dim * len(item.rows), system.column_norms
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)
-    u, s, _ = np.linalg.svd(system.r / np.maximum(weights, smallest))
+    u, s = left_singular_vectors(system.r / np.maximum(weights, smallest))
     components = u.T @ (system.z + system.r @ values)
     variance, freedom = system.cost / n_rows, float(n_rows)
     common = variance

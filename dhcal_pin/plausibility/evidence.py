@@ -34,7 +34,7 @@ from .._typing import Array
 from ..estimation.initialization import initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
-from ..estimation.qr import RANK_RTOL, TriangularSystem
+from ..estimation.qr import RANK_RTOL, TriangularSystem, left_singular_vectors
 from ..estimation.solver import minimize
 from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, residual_of
 from ..measurements.pose import PoseMeasurement
@@ -221,11 +221,11 @@ def _maximize(
     """Maximize the evidence over the width of the priors and the scale of the noise."""
     robot = prior_std > 0
     measured, rows = system.z + system.r @ x, system.r[:, robot] * prior_std[robot]
-    u, s, _ = np.linalg.svd(system.r[:, ~robot], full_matrices=False)
+    u, s = left_singular_vectors(system.r[:, ~robot])
     is_observable = s > RANK_RTOL * s.max(initial=0.0)
     u, log_frames = u[:, is_observable], float(np.sum(np.log(s[is_observable])))
     rows, measured = rows - u @ (u.T @ rows), measured - u @ (u.T @ measured)
-    left, singular_values, _ = np.linalg.svd(rows, full_matrices=False)
+    left, singular_values = left_singular_vectors(rows)
     components = left.T @ measured
     rest = system.min_cost + max(0.0, float(measured @ measured - components @ components))
     n_rest = max(0, n_rows - u.shape[1] - len(singular_values))

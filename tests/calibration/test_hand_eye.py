@@ -235,6 +235,23 @@ def test_joint_values_that_are_wrong_at_random_displace_images(has_joint_values)
     assert ("errors of the arm of another kind" in found.likely) == has_joint_values
 
 
+@pytest.mark.parametrize("has_joint_values", [True, False])
+def test_poses_with_systematic_mistakes_are_no_errors_of_the_arm(has_joint_values):
+    """Neither deflection nor an arm that had not stopped displaces images by hundreds of pixels."""
+    chain, images, _ = faulty_setup("ur10", "nothing", 61, is_on_wrist=True, n_images=10)
+    factors = np.where(np.arange(chain.n_joints) == 1, 0.6, 1.0)
+    data = images.replace(q=images.q * factors, has_joint_values=has_joint_values)
+    fit = dh.calibrate(chain, data, "camera,board", loss="linear")
+    found = fit.hand_eye
+    assert found is not None
+    assert fit.verdict.status == "refused"
+    assert found.error.pixels > 50
+    stated = "joint values" if has_joint_values else "flange poses"
+    assert f"Likely cause: wrong {stated}: no deflection" in found.likely
+    assert ("zeros of the joints" in found.likely) == has_joint_values
+    assert "take more images" not in found.likely
+
+
 def test_similar_rotations_are_named():
     """An arm that is wrong and turns little: the camera is wrong by more than the images show."""
     chain, images, setup = faulty_setup(

@@ -30,6 +30,17 @@ def pose_file(ur10, robot_folder):
     return q
 
 
+def test_a_robot_is_an_option(run, pose_file, ur10):
+    """Other commands take it first."""
+    robot = ur10.urdf.source
+    status, out, err = run("inspect", robot, "poses.csv")
+    assert (status, out, unfolded(err)) == (
+        2,
+        "",
+        f"dhcal: {robot}: is a robot; state it with --robot {robot}",
+    )
+
+
 def test_a_normal_file_fits_one_screen(run, pose_file, ur10):
     args = ("inspect", "poses.csv", "--robot", ur10.urdf.source, "--tip", "tool0")
     status, out, err = run(*args)

@@ -90,3 +90,27 @@ def test_what_cannot_be_converted_is_an_error(source, target, words):
 def test_a_robot_has_the_name_of_its_file():
     assert robot_name("dir/arm.dh.toml") == "arm"
     assert robot_name(".urdf") == "arm"
+
+
+def test_a_sidecar_chooses_among_equally_deep_tips(tmp_path):
+    """Without it, the last joints of the gripper are the deepest ones."""
+    links = ("base", "hand", "ball", "left", "right")
+    joints = (
+        ("revolute", "base", "hand"),
+        ("fixed", "hand", "ball"),
+        ("prismatic", "hand", "left"),
+        ("prismatic", "hand", "right"),
+    )
+    lines = [f'<link name="{name}"/>' for name in links]
+    lines += [
+        f'<joint name="to_{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        for kind, parent, child in joints
+    ]
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{"".join(lines)}</robot>')
+    with pytest.raises(DhcalError, match="several tips are equally deep"):
+        read_robot(path)
+    (tmp_path / "arm.calibration.toml").write_text('tip = "ball"\n')
+    assert read_robot(path).tip == "ball"
+    assert read_robot(path, "left").tip == "left"

@@ -513,6 +513,14 @@ def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
 def _displacement(hand_eye: HandEyeData, state: _State) -> Trial:
     """Describe displaced images that no cause explains."""
     stated = describe_configurations(hand_eye.data)
+    if state.error.pixels > MAX_LINEAR_ERROR:
+        checks = (
+            "units, order, signs and zeros of the joints, and whether the robot file is that of the robot"
+            if has_joint_values(hand_eye.data)
+            else "units, signs and frame of the positions, and notation and order of the rotations"
+        )
+        text = f"wrong {stated}: no deflection, backlash or motion displaces images so far"
+        return Trial(DISPLACEMENT, state.error, text, f"Check {checks}, and the image of each row.")
     kind = "of another kind " if has_joint_values(hand_eye.data) else ""
     text = (
         f"all corners of an image are displaced together: errors of the arm {kind}(deflection, backlash, "

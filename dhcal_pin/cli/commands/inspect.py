@@ -35,9 +35,13 @@ def run(args: Namespace) -> int:
     """Show the content of files."""
     if any(map(io.is_bundle, args.data)):
         return _inspect_bundle(args)
-    from ...measurements.mounting import mount_rig  # lazy import, as the following: they load Pinocchio
+    from ...io.robot import has_robot_ending  # lazy import, as the following: they load Pinocchio
+    from ...measurements.mounting import mount_rig
     from ..outputs import existing_sidecars, require_workbook, require_writable_outputs, write_outputs
 
+    for path in args.data:
+        if not args.robot and has_robot_ending(path):
+            raise InvalidArgumentError(f"{path}: is a robot; state it with --robot {path}")
     for option, reason in _ROBOT_REASONS.items():
         if getattr(args, option) and not args.robot:
             raise InvalidArgumentError(f"--{option}: needs --robot, {reason}")
