@@ -20,6 +20,8 @@ from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
 from dhcal_pin.session import Session
 
+# Names of the arms whose sessions are simulated.
+NAMES = ("ur10", "ur5", "panda", "xarm7")
 NOISE, ANGLE_NOISE = 5e-5, 1e-4
 ERRORS = 1e-3, np.deg2rad(0.2)
 

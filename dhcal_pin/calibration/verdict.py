@@ -69,6 +69,8 @@ MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
 # belong together. The first of image coordinates depends on the type of arm.
 MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
+# Longest tool [m] that is believed if measured positions are farther from each other than the tip can be.
+MAX_TOOL = 1.0
 # More parameters are suggested if they reduce the error at least to this fraction, and not if the error is
 # below this fraction of that of the nominal robot: exact data.
 MAX_FULL_SET_RATIO, EXACT_FIT_RATIO = 0.8, 1e-6
@@ -501,8 +503,8 @@ def _workspace_size(fit: Evidence) -> float:
     """Return the RMS distance of the tool from its mean position [m], at most that of tip or measurements."""
     # A fit to measurements of something else can put the tool hundreds of metres away.
     tip = workspace_radius(fit.chain.with_base_and_tool(np.eye(4), np.eye(4)))
-    measured = [se3.rms_radius(item.positions()) for item in fit.data if len(item.positions())]
-    return min(workspace_radius(fit.chain), max(tip, *measured, 0.0) or np.inf)
+    measured = max((se3.rms_radius(p) for item in fit.data if len(p := item.positions())), default=0.0)
+    return min(workspace_radius(fit.chain), float(np.clip(measured, tip, tip + MAX_TOOL)) or np.inf)
 
 
 def _hand_eye_error(fit: Evidence) -> list[Finding]:
@@ -656,12 +658,12 @@ def _plausible_cause(fit: Evidence) -> str:
             return "Nothing holds the parameters that the measurements do not determine: --priors default."
     if zero := fit.diagnosis.zero:
         return f"{zero.sentence} {zero.remedy}"
+    if fit.input_warnings:
+        return f"{fit.input_warnings[0]}."
     if fit.session and fit.session.scales:
         return fit.session.scales[0].finding
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
-    if fit.input_warnings:
-        return f"{fit.input_warnings[0]}."
     tried = "No single mistake that is tried explains it, and no pair. " * fit.diagnosis.is_suspicious
     return (
         f"{tried}Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation "

@@ -170,6 +170,7 @@ class Scale:
     std: float  # Standard deviation of the factor
     axis: str  # "x", "y" or "z" of the measuring frame; empty for all
     files: tuple[str, ...] = ()  # Measurement files with this scale; empty for all
+    is_of_distances: bool = False  # Whether stated distances between points are the only lengths
 
     @property
     def finding(self) -> str:
@@ -189,6 +190,11 @@ class Scale:
         """What to do."""
         if self.axis:
             return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
+        if self.is_of_distances:
+            return (
+                "Check the stated distances between the points: nothing else shows the size of the robot. If "
+                f"they are wrong, correct them, or add --mend scale:{self.factor:.6g}."
+            )
         if abs(self.factor - 1) > MAX_INSTRUMENT_SCALE:
             return "No instrument is so wrong: the robot file is probably that of a robot of another size."
         key = f"--mend scale:{self.factor:.6g}"

@@ -58,7 +58,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     is_arm = errors.is_of_arm & is_size
     is_length = is_arm & np.array([p.unit != "rad" for p in errors.parameters], bool)
     sizes = (x[: len(is_arm)] / errors.priors)[is_length]
-    shows_size = all(item.has_length_scale and item.rig is None for item in problem.data)
+    # Contacts and inclinations do not depend on the size; boards in images can take part of it.
+    with_lengths = [item for item in problem.data if item.has_length_scale]
+    shows_size = bool(with_lengths) and all(item.rig is None for item in problem.data)
     if not shows_size or not sizes.size or np.sqrt(np.mean(sizes**2)) < MIN_CORRECTION:
         return None
     (arm,) = np.nonzero(is_arm)
@@ -98,7 +100,9 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     if chance > MAX_CHANCE:
         return None
     variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))
-    return Scale(factor, factor**2 * float(np.sqrt(variance)), "")
+    is_of_distances = all(item.kind == "point_distance" for item in with_lengths)
+    std = factor**2 * float(np.sqrt(variance))
+    return Scale(factor, std, "", is_of_distances=is_of_distances)
 
 
 def _slide_gains(errors: ErrorModel) -> list[ErrorParameter]:

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 from robots import ARMS, robot_file
-from sessions import ANGLE_NOISE, NOISE, Simulation
+from sessions import ANGLE_NOISE, NAMES, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3
@@ -23,7 +23,7 @@ from dhcal_pin.session.robot_changes import RobotChanges
 COUNT = 150
 # The joints of a UR10, which is heavier, yield less [rad/Nm].
 COMPLIANCE = {"ur10": 3e-5}
-SETTINGS = list(product(ARMS, (Position, Pose), range(6)))
+SETTINGS = list(product(NAMES, (Position, Pose), range(6)))
 # Two arms of the fast suite.
 FAST = {SETTINGS.index(("panda", Position, 2)), SETTINGS.index(("ur5", Position, 3))}
 

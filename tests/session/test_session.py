@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from robots import ARMS, DATA, MAPS, missing, nominal_arm, robot_file
 from scipy.stats import multivariate_normal
-from sessions import Changes, Simulation, session_of, write_csv
+from sessions import NAMES, Changes, Simulation, session_of, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3
@@ -401,7 +401,7 @@ def true_ratio(simulation, fit, kind):
 @pytest.mark.parametrize("name", some_slow(list(EVENTS), FAST))
 def test_events_are_named_and_handled(name, request):
     is_fast = request.node.get_closest_marker("slow") is None
-    settings = list(product(ARMS, KINDS, (60, 100, 300), range(5)))
+    settings = list(product(NAMES, KINDS, (60, 100, 300), range(5)))
     if is_fast:
         cases = [("ur10", Position, 100, 0), ("panda", Pose, 60, 1), ("xarm7", Position, 100, 2)]
         settings = [cases[list(EVENTS).index(name) % 3]]
@@ -435,13 +435,13 @@ def test_nothing_is_found_where_nothing_happened(count):
     """Clean sets, and sets of random samples with outliers only."""
     found = []
     for seed in range(count):
-        arm, kind, m = list(ARMS)[seed % 4], KINDS[seed // 4 % 2], (60, 100, 300)[seed // 8 % 3]
+        arm, kind, m = NAMES[seed % 4], KINDS[seed // 4 % 2], (60, 100, 300)[seed // 8 % 3]
         simulation = Simulation(arm, m, 1000 + seed)
         fit = calibrate(simulation.chain, simulation.measure(kind), extend="none")
         found.append(bool(session_of(fit).found))
     assert sum(found) <= 0.01 * count
     for seed in range(max(4, count // 4)):
-        simulation = Simulation(list(ARMS)[seed % 4], (60, 100)[seed % 2], 2000 + seed)
+        simulation = Simulation(NAMES[seed % 4], (60, 100)[seed % 2], 2000 + seed)
         share, size = ((0.1, 0.02), (0.2, 5e-3), (0.05, 0.05))[seed % 3]
         changes = Changes(n_outliers=int(share * simulation.count), outlier=size)
         fit = calibrate(simulation.chain, simulation.measure(KINDS[seed % 2], changes), extend="none")
