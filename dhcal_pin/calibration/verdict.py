@@ -491,6 +491,8 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
         text = f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms}"
         # With fewer parameters than the robot has errors, the robot is better than before, but not good.
         is_restricted = not fit.camera_stages and _lacks_parameters(fit) and not _missing_frames(fit)
+        # Distances alone have no joint values, and say nothing about a robot.
+        is_restricted = is_restricted or not any(item.configurations_per_row for item in fit.data)
         status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
         if fit.hand_eye is not None and fit.hand_eye.causes:
             text = f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}"

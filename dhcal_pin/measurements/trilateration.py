@@ -83,13 +83,20 @@ def mirror_images(points: ArrayLike, located: ArrayLike) -> Array:
     # Points near a plane have one, its mirror image, and points near a line three at right angles.
     points, located = np.asarray(points, float), np.asarray(located, float)
     centre = points.mean(0)
-    axes = np.linalg.svd(points - centre, full_matrices=False)[2]
+    axes = _principal_axes(points - centre)[2]
     reflections = (np.array([[1, 1, -1], [1, -1, 1], [1, -1, -1]]) * (axes @ (located - centre))) @ axes
     distances = np.linalg.norm(points - located, axis=1)
     changes = np.linalg.norm(points - (centre + reflections)[:, None], axis=2) - distances
     is_near = np.sqrt(np.mean(changes**2, 1)) <= _MAX_MIRROR_CHANGE * distances.mean()
     is_other = np.linalg.norm(centre + reflections - located, axis=1) > _MAX_MIRROR_CHANGE * distances.mean()
     return (centre + reflections)[is_near & is_other]
+
+
+def _principal_axes(arms: Array) -> tuple[Array, Array, Array]:
+    """Return the singular value decomposition of vectors (m, 3), with three values also of fewer vectors."""
+    padded = np.concatenate([arms, np.zeros((max(0, 3 - len(arms)), 3))])
+    left, extents, axes = np.linalg.svd(padded, full_matrices=False)
+    return left[: len(arms)], extents, axes
 
 
 def _point_starts(points: Array, distances: Array) -> Array:
@@ -99,7 +106,7 @@ def _point_starts(points: Array, distances: Array) -> Array:
     centre = points.mean(0)
     arms = points - centre
     squares = distances**2 - np.sum(arms**2, 1)
-    left, extents, axes = np.linalg.svd(arms, full_matrices=False)
+    left, extents, axes = _principal_axes(arms)
     inverse = np.divide(1, extents, out=np.zeros(3), where=extents > POINT_RCOND * extents[0])
     linear = -0.5 * inverse * (left.T @ (squares - squares.mean()))
     starts = [linear]

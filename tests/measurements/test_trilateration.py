@@ -160,3 +160,14 @@ def test_trilaterated_positions_calibrate_like_positions(sim_6dof, sim_6dof_actu
         np.linalg.norm(fit.chain.poses(-q)[:, :3, 3] - sim_6dof_actual.poses(-q)[:, :3, 3], axis=1).max()
         < 1e-8
     )
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_points_locate_one_with_their_distances(count):
+    rng = np.random.default_rng(count)
+    points, anchor = rng.standard_normal((count, 3)), np.array([2.0, -1.0, 3.0])
+    distances = np.linalg.norm(points - anchor, axis=1)
+    located = locate_point(points, distances)
+    np.testing.assert_allclose(np.linalg.norm(points - located, axis=1), distances, atol=1e-9)
+    for image in mirror_images(points, located):
+        np.testing.assert_allclose(np.linalg.norm(points - image, axis=1), distances, rtol=0.1)
