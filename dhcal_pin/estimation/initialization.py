@@ -310,11 +310,14 @@ def compare_tools(
     started: ErrorModel, data: tuple[Measurement, ...], known: Mapping[str, float], max_iterations: int
 ) -> ErrorModel:
     """Initialize base and tool from several tool offsets where tool points without positions are measured."""
-    frames, drawn = started.only_frames, tuple(subsample(item) for item in data)
-    is_tool_unknown = any(p.error_frame == started.chain.tool_frame_index for p in started.parameters)
     has_points = any(isinstance(item, PointMeasurement) for item in data)
-    if frames is None or not is_tool_unknown or not has_points or any(len(i.positions()) for i in data):
+    if not has_points or any(len(item.positions()) for item in data):
         return started
+    frames = started.only_frames
+    is_tool_unknown = any(p.error_frame == started.chain.tool_frame_index for p in started.parameters)
+    if frames is None or not is_tool_unknown:
+        return started
+    drawn = tuple(subsample(item) for item in data)
     costs, chain = [], frames.chain
     offsets = se3.transform(np.eye(3), _offset_grid())
     chains = [chain.with_base_and_tool(chain.base, chain.tool @ offset) for offset in offsets]
