@@ -26,10 +26,10 @@ from ..robot.inverse_kinematics import position_task, solve_within_limits
 from .base import POINT_PRIOR, InstrumentParameter, Measurement, Noise, point_parameters
 from .columns import instrument_range, length_columns, point_distance_range, text_column
 from .groups import LENGTHS, POSITION, Group
-from .length import MIN_DIVISOR, images_of_point, norm_and_direction
+from .length import images_of_point
 from .mounting import MountedRig
 from .position import PointMeasurement
-from .trilateration import locate_point
+from .trilateration import MIN_DIVISOR, locate_point, norm_and_direction
 from .validation import encode_labels, validated_array, validated_joint_positions
 
 # Initial position of a touched point before `initialized` [m].

@@ -24,19 +24,11 @@ from .base import OFFSET_PRIOR, InstrumentParameter, Noise, point_parameters
 from .columns import Column, displacement_range, instrument_range, length_columns
 from .groups import LENGTHS, Group
 from .position import PointMeasurement
-from .trilateration import locate_point, mirror_images
+from .trilateration import locate_point, mirror_images, norm_and_direction
 from .validation import validated_array, validated_joint_positions
 
 # Largest number of wires of a device in a file; columns L1 to L9.
 MAX_WIRES = 9
-# Smallest length by which a direction is divided [m]: a wire of length zero has no direction.
-MIN_DIVISOR = 1e-12
-
-
-def norm_and_direction(vectors: Array, axis: int) -> tuple[Array, Array]:
-    """Return the norms of vectors and the unit vectors along them."""
-    norm = np.linalg.norm(vectors, axis=axis)
-    return norm, vectors / np.expand_dims(np.maximum(norm, MIN_DIVISOR), axis)
 
 
 def images_of_point(prefix: str, points: Array, values: Mapping[str, float]) -> list[dict[str, float]]:

@@ -31,8 +31,14 @@ _MAX_POINTS = 300
 # Largest RMS change of the distances to a mirror image, relative to their mean, that a fit could explain, and
 # smallest distance of the image from the located point.
 _MAX_MIRROR_CHANGE = 0.02
-# Smallest distance by which a direction is divided [m].
-_MIN_DIVISOR = 1e-12
+# Smallest length by which a direction is divided [m]: a wire of length zero has no direction.
+MIN_DIVISOR = 1e-12
+
+
+def norm_and_direction(vectors: Array, axis: int) -> tuple[Array, Array]:
+    """Return the norms of vectors and the unit vectors along them."""
+    norm = np.linalg.norm(vectors, axis=axis)
+    return norm, vectors / np.expand_dims(np.maximum(norm, MIN_DIVISOR), axis)
 
 
 def device_anchors(a: float, b: float, c: float) -> Array:
@@ -143,5 +149,5 @@ def _refine(points: Array, distances: Array, starts: Array) -> tuple[Array, Arra
 def _directions_and_errors(points: Array, distances: Array, located: Array) -> tuple[Array, Array]:
     """Return unit vectors (k, m, 3) from known points to located ones, and errors (k, m) of the distances."""
     arms = located[:, None] - points
-    norms = np.linalg.norm(arms, axis=2)
-    return arms / np.maximum(norms, _MIN_DIVISOR)[..., None], distances - norms
+    norms, directions = norm_and_direction(arms, 2)
+    return directions, distances - norms

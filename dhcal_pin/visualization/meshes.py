@@ -43,7 +43,7 @@ GRID = 8000
 # Coarser grids, which are tried one after the other for meshes that are simplified.
 COARSER_GRIDS = (400, 200, 100, 50, 25, 12, 6)
 # Coal builds a tree of bounding volumes for each mesh, which is not used here. This type takes the least
-# time. Such a mesh has no class of its own in Python: the methods of `_Mesh` read its vertices.
+# time. Python has no class for its meshes, so that vertices and triangles are read by the base class `_Mesh`.
 _MESH_LOADER = coal.MeshLoader(coal.BV_AABB)
 _Mesh = coal.BVHModelBase
 # Largest number of missing meshes that a note names.

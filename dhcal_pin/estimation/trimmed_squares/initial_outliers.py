@@ -32,7 +32,8 @@ from ...exceptions import DhcalError
 from ...measurements.base import Measurement
 from ...robot.chain import Chain
 from ..error_model import ErrorModel
-from ..problem import Problem, linearize_and_factor, merge_instrument_parameters, whitened_residuals
+from ..initialization import make_problem
+from ..problem import Problem, linearize_and_factor, whitened_residuals
 from ..solver import minimize
 from .search import linearize_rows, search_majorities
 
@@ -93,7 +94,7 @@ def _distances_from_all(
 ) -> list[list[Array]]:
     """Compute the norms (m,) of the residuals by measurement and group after a fit to all samples."""
     starts = [item.initialized(frames.chain) for item in data]
-    problem = _make_problem(frames, starts, known)
+    problem = make_problem(frames, tuple(starts), 1 / frames.priors, known)
     drawn = problem.with_data([start.take(_draw_groups(start) & _thin_groups(start)) for start in starts])
     x = minimize(drawn, "lm", np.zeros(len(problem.weights)), MAX_ITERATIONS, loose=True).x
     return _distances(problem, x)
@@ -104,7 +105,7 @@ def _distances_from_majority(
 ) -> list[list[Array]] | None:
     """Compute the norms of the residuals after a fit to a majority; None if the samples are too few."""
     starts = [_initialize_instruments(frames.chain, item, _draw_groups(item)) for item in data]
-    problem = _make_problem(frames, starts, known)
+    problem = make_problem(frames, tuple(starts), 1 / frames.priors, known)
     x = _fit_majority(problem.with_data([start.take(_thin_groups(start)) for start in starts]))
     if x is None:
         return None
@@ -113,13 +114,6 @@ def _distances_from_majority(
         for start, item in zip(starts, data, strict=True)
     ]
     return _distances(problem.with_data(full), x)
-
-
-def _make_problem(frames: ErrorModel, items: Sequence[Measurement], known: Mapping[str, float]) -> Problem:
-    """Make the problem of base, tool and instruments."""
-    parameters = [p for p in merge_instrument_parameters(items) if p.name not in known]
-    weights = np.concatenate([1 / frames.priors, [1 / parameter.prior for parameter in parameters]])
-    return Problem(frames, tuple(items), weights, known)
 
 
 def _distances(problem: Problem, x: Array) -> list[list[Array]]:
