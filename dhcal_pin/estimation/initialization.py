@@ -332,7 +332,7 @@ def compare_tools(
 
 def compare_mirror_images(problem: Problem, solution: SolverResult, max_iterations: int) -> SolverResult:
     """Fit mirror images of anchors and centres, too; return the best of these and a loose solution."""
-    best, is_better = solution, True
+    best, is_better = solution, bool(problem.instrument_parameters)
     while is_better:
         is_better = False
         starts = _mirrored_starts(problem, best.x)
