@@ -317,7 +317,9 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
         )
         for each in residuals
     ]
-    gain, n_rows = costs[0] - costs[1], sum(r.size for r in residuals[1])
+    # Correlated residuals, which joint errors leave along a path, count less.
+    gain = (costs[0] - costs[1]) / unchanged.problem.temperature
+    n_rows = sum(r.size for r in residuals[1])
     n_coefficients = sum(len(cause.values) for cause in changes)
     needed = 2 * (MIN_LOG_EVIDENCE + COST_PER_COEFFICIENT * n_coefficients)
     return bool(gain > max(needed, MIN_CONFIRMED_EFFECT**2 * n_rows * share))
