@@ -93,7 +93,8 @@ class Event:
                 "The result is the arm with the load after the change. State the mass at the tip in each "
                 "row, in a column payload[kg]."
             )
-        return f"Both parts were fitted with their own {self.of or self.kind} pose."
+        pose = f"{self.of or self.kind} pose"
+        return f"Both parts were fitted with their own {pose}; the result has that of the later part."
 
 
 @frozen

@@ -73,7 +73,7 @@ def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspec
     assert "verdict: " in err
     if n_files > 1:
         assert re.search(r"\d+ more files?; see --verbose", err)
-        assert re.search(r"\d+ (more )?notes? on rows; see --verbose", err)
+        assert re.search(r"\d+ (more )?notes? on rows(, .*)?; see --verbose", unfolded(err))
     for command in (("inspect", *names, "--robot", "arm.dh.toml"), ("validate", "arm.dh.toml", *names)):
         err = stderr_of(run(*command))
         assert_fits(err)
@@ -195,6 +195,18 @@ def test_a_shortened_list_counts_the_others():
     assert lines == [*numbers[: HEIGHT - 1], f"  {50 - HEIGHT + 1} more files; see --verbose"]
     everything = Screen([Block(numbers, noun="file")]).lines("verbose")
     assert [line.text for line in everything] == numbers
+
+
+def test_what_is_left_out_takes_one_line_and_leaves_space_for_the_first_reason():
+    blocks = [
+        Block(["name " * 8] * 6, noun=noun, rank=rank) for rank, noun in enumerate(("file", "note on rows"))
+    ]
+    fixed = Block(["."] * 12)
+    reasons = Block(["word " * 120, "word " * 120], noun="reason", rank=8)
+    lines = [line.text for line in Screen([*blocks, fixed, reasons]).lines("normal")]
+    assert len(lines) <= HEIGHT
+    assert lines[0] == "6 files, 6 notes on rows; see --verbose"
+    assert lines[-1] == "  1 more reason; see --verbose"
 
 
 @pytest.mark.parametrize(("errors", "is_kept"), [("0mm,0deg", True), ("3mm,1deg", False)])

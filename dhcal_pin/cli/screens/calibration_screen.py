@@ -57,7 +57,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(_data_lines(outcome, names), noun="file", rank=7),
         *_accuracy_blocks(fit),
         Block([] if is_refused else fit.rounding_notes, "yellow", noun="note on joint values", rank=7),
-        Block(by_file if by_file else [], noun="file", rank=6, n_kept=4, has_space=True),
+        Block(by_file if by_file else [], noun="error by file", rank=6, n_kept=4, has_space=True),
         Block(
             fit.hand_eye.table if fit.hand_eye else [],
             noun="row of tried causes",

@@ -102,15 +102,23 @@ class _Part(NamedTuple):
     items: list[list[str]]
 
     def lines(self, count: int) -> list[Line]:
-        """Return the heading, the first items, and the number of the others."""
-        n_hidden = len(self.items) - count
+        """Return the heading, the first items, and the number of the others; nothing without items."""
+        if not count:
+            return []
         texts = [*self.heading, *(text for item in self.items[:count] for text in item)]
-        if n_hidden:
-            first, *rest = self.block.noun.split(" ")
-            noun = " ".join([first if n_hidden == 1 else f"{first}s", *rest])
-            text = f"{n_hidden}{' more' if count else ''} {noun}; see --verbose"
-            texts = [*texts, _INDENT + text] if count else [text]
+        if n_hidden := len(self.items) - count:
+            texts.append(f"{_INDENT}{n_hidden} more {self._noun(n_hidden)}; see --verbose")
         return [Line(text, self.block.style) for text in texts]
+
+    @property
+    def count(self) -> str:
+        """Number of all items, such as "3 notes"."""
+        return f"{len(self.items)} {self._noun(len(self.items))}"
+
+    def _noun(self, count: int) -> str:
+        """Return what items are, in the plural if there are several."""
+        first, *rest = self.block.noun.split(" ")
+        return " ".join([first if count == 1 else f"{first}s", *rest])
 
 
 def _part(block: Block, width: int | None) -> _Part:
@@ -126,7 +134,7 @@ def _part(block: Block, width: int | None) -> _Part:
 def _full_lines(blocks: Sequence[Block], width: int | None) -> list[Line]:
     """Lay out blocks with all items and empty lines."""
     parts = [_part(block, width) for block in blocks]
-    return _joined(parts, [len(part.items) for part in parts], has_spaces=True)
+    return _joined(parts, [len(part.items) for part in parts], has_spaces=True, width=width)
 
 
 def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[Line]:
@@ -139,17 +147,23 @@ def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[L
     for is_last in (False, True):
         for _, i in by_rank:
             n_kept = 0 if is_last else parts[i].block.n_kept
-            while counts[i] > n_kept and len(_joined(parts, counts, has_spaces)) > height:
+            while counts[i] > n_kept and len(_joined(parts, counts, has_spaces, width)) > height:
                 counts[i] -= 1
-        has_spaces = has_spaces and len(_joined(parts, counts, has_spaces)) <= height
-    return _joined(parts, counts, has_spaces)
+        has_spaces = has_spaces and len(_joined(parts, counts, has_spaces, width)) <= height
+    return _joined(parts, counts, has_spaces, width)
 
 
-def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool) -> list[Line]:
-    """Join the first items of each block; `counts` has their numbers."""
+def _joined(
+    parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool, width: int | None
+) -> list[Line]:
+    """Join the first items of each block; `counts` has their numbers. One line names what is left out."""
     lines: list[Line] = []
+    left_out = [part for part, count in zip(parts, counts, strict=True) if part.items and not count]
     for part, count in zip(parts, counts, strict=True):
         new = part.lines(count)
+        if left_out and part is left_out[0]:
+            text = f"{', '.join(each.count for each in left_out)}; see --verbose"
+            new = [Line(each) for each in fold(text, width)]
         if new and lines and has_spaces and part.block.has_space:
             lines.append(Line(""))
         lines += new

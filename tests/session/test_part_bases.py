@@ -1,11 +1,11 @@
-"""Files of one arm whose measuring frames differ by large rotations, against the true arm and motions."""
+"""Parts of a session whose measuring frames differ by large rotations, against the true arm and motions."""
 
 from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from sessions import Simulation
+from sessions import Changes, Simulation, session_of
 
 from dhcal_pin import calibrate
 from dhcal_pin.measurements import Pose, Position
@@ -55,6 +55,44 @@ def test_each_file_has_its_own_pose_of_the_base(arm, angles, kind):
     true = [np.linalg.norm(pin.log3((b * a.inverse()).rotation)) for a, b in pairwise(frames)]
     np.testing.assert_allclose(found, true, atol=1e-3)
     assert fit.verdict.status == "caution"
+    assert sim.true_error(fit.chain) < 1e-4
+
+
+ONE_FILE = [("ur10", 60, (0.6, 1.0), 0), ("panda", 180, (0.25, 1.0), 0), ("xarm7", 100, (0.3, 0.7), 3)]
+
+
+@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize(("arm", "angle", "shares", "n_outliers"), ONE_FILE)
+def test_a_base_that_turned_far_within_a_file_is_found(arm, angle, shares, n_outliers, kind):
+    """The base turns at a share of the rows and, in one case, back again."""
+    sim = Simulation(arm, 80, 6)
+    data = sim.measure(kind, Changes(n_outliers=n_outliers, outlier=0.05))
+    turned = pin.SE3(pin.exp3(np.deg2rad(angle) * sim.direction()), sim.rng.normal(0, 1, 3))
+    first, end = (round(share * 80) for share in shares)
+    poses = np.array(sim_poses(data, np.arange(80)))
+    poses[first:end] = turned.homogeneous @ poses[first:end]
+    moved = Position(data.q, poses[:, :3, 3]) if kind is Position else Pose(data.q, poses)
+    fit = calibrate(sim.chain, moved, extend="none")
+    events = session_of(fit).events
+    places = sorted(place for place in (first, end) if place < 80)
+    # Rows count from 1.
+    assert [(event.kind, event.after.line) for event in events] == [("base", place + 1) for place in places]
+    motion = session_of(fit).changes.base.poses
+    found = np.linalg.norm(pin.log3((motion[1] @ np.linalg.inv(motion[0]))[:3, :3]))
+    assert found == pytest.approx(np.linalg.norm(pin.log3(turned.rotation)), abs=2e-3)
+    assert sim.true_error(fit.chain) < 1e-4
+
+
+@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize("arm", ["ur10", "panda"])
+def test_halves_of_a_file_have_their_own_pose_of_the_base(arm, kind):
+    """A base fits neither half, so that there are no outliers."""
+    sim = Simulation(arm, 80, 7)
+    frames = [pin.SE3(pin.exp3(sim.rng.normal(0, 1, 3)), sim.rng.normal(0, 1, 3)), pin.SE3.Identity()]
+    parts = files(sim, kind, frames)
+    values = np.concatenate([part.positions() if kind is Position else part.poses for part in parts])
+    fit = calibrate(sim.chain, kind(sim.q, values), extend="none")
+    assert [(event.kind, event.after.line) for event in session_of(fit).events] == [("base", 41)]
     assert sim.true_error(fit.chain) < 1e-4
 
 
