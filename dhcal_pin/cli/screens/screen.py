@@ -111,7 +111,7 @@ class _Part(NamedTuple):
         return [Line(text, self.block.style) for text in texts]
 
     @property
-    def count(self) -> str:
+    def summary(self) -> str:
         """Number of all items, such as "3 notes"."""
         return f"{len(self.items)} {self._noun(len(self.items))}"
 
@@ -153,16 +153,14 @@ def _shortened_lines(blocks: Sequence[Block], width: int, height: int) -> list[L
     return _joined(parts, counts, has_spaces, width)
 
 
-def _joined(
-    parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool, width: int | None
-) -> list[Line]:
+def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool, width: int | None) -> list[Line]:
     """Join the first items of each block; `counts` has their numbers. One line names what is left out."""
     lines: list[Line] = []
     left_out = [part for part, count in zip(parts, counts, strict=True) if part.items and not count]
     for part, count in zip(parts, counts, strict=True):
         new = part.lines(count)
         if left_out and part is left_out[0]:
-            text = f"{', '.join(each.count for each in left_out)}; see --verbose"
+            text = f"{', '.join(each.summary for each in left_out)}; see --verbose"
             new = [Line(each) for each in fold(text, width)]
         if new and lines and has_spaces and part.block.has_space:
             lines.append(Line(""))
