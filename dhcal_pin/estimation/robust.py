@@ -93,8 +93,6 @@ OSCILLATION_RATIO = 0.8
 ZERO_WEIGHT = 1e-12
 # Ratio of unknowns to rows below which leverage is negligible and residuals are not studentized.
 NEGLIGIBLE_LEVERAGE = 0.01
-# Penalty of a sample in a run of outliers that is no outlier, in outliers.
-RUN_PENALTY = 2.0
 
 
 def _uniform(t: Array) -> Array:
@@ -165,18 +163,6 @@ def standardize_mean_squares(mean_squares: Array, k: int, is_good: Array | None 
 def standardize_ratios(ratios: Array, k: int | Array) -> Array:
     """Transform mean squares of k residuals over the variance of good ones to standard normal t (m,)."""
     return (np.cbrt(ratios) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
-
-
-def longest_run(is_outlier: Array) -> tuple[int, int]:
-    """Return begin and end of the samples (m,) with the most outliers, less a penalty for each other one."""
-    score, begin, best, found = 0.0, 0, 0.0, (0, 0)
-    for i, outlying in enumerate(is_outlier.tolist()):
-        if score <= 0:
-            score, begin = 0.0, i
-        score += 1.0 if outlying else -RUN_PENALTY
-        if score > best:
-            best, found = score, (begin, i + 1)
-    return found
 
 
 def is_chi_square(mean_squares: Array, k: int) -> bool:

@@ -17,7 +17,6 @@ import numpy as np
 
 from .._frozen import frozen
 from .._typing import Array
-from ..estimation.robust import longest_run
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import Diagnosis
@@ -26,6 +25,8 @@ from .evidence import with_noise_of
 
 # Consecutive outliers are named if independent outliers would form such a series with a lower probability.
 _MAX_CHANCE = 1e-3
+# Penalty of a sample in a series that is no outlier, in outliers.
+_PENALTY = 2.0
 # Samples whose residuals exceed this multiple of the noise do not fit after the change of a hypothesis.
 _MAX_MISFIT, _MIN_SHARE = 16.0, 0.9
 
@@ -55,7 +56,13 @@ def find_deviating_lines(
     item: Measurement, is_outlier: Array, share: float, n_samples: int
 ) -> DeviatingLines | None:
     """Find consecutive outliers (m,) of one file; share of outliers and number are those of all samples."""
-    found = longest_run(is_outlier)
+    score, begin, best, found = 0.0, 0, 0.0, (0, 0)
+    for i, outlying in enumerate(is_outlier.tolist()):
+        if score <= 0:
+            score, begin = 0.0, i
+        score += 1.0 if outlying else -_PENALTY
+        if score > best:
+            best, found = score, (begin, i + 1)
     inside = is_outlier[slice(*found)]
     count, size = int(inside.sum()), len(inside)
     if count < 2:

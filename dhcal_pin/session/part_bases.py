@@ -1,8 +1,8 @@
 """First values of the poses of the base in the parts of a session, which may differ by large rotations.
 
 The search for changes is linear. It does not find a base that turned by more than about 20°, such as that
-of a tracker which was set up anew. Parts of a session are its files, and the longest run of consecutive
-samples that are far from a fit of the others.
+of a tracker which was set up anew. Parts of a session are its files, the longest run of consecutive samples
+that are far from a fit of the others, and consecutive samples that fit by themselves only.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from .. import se3
 from .._typing import Array
 from ..estimation.initialization import initialize_frames
 from ..estimation.problem import Problem
-from ..estimation.robust import longest_run
 from ..measurements.base import Measurement
 from ..robot.chain import BASE_FRAME
 from .robot_changes import Motion
@@ -25,9 +25,12 @@ from .timeline import Timeline
 MIN_ROTATION = np.deg2rad(10.0)
 # Smallest number of samples of a part in which the base is placed.
 MIN_SAMPLES = 6
-# Residual from which a sample is far from a fit, as a multiple of what a share of the samples has at
-# most.
-MIN_FAR_RATIO, FITTING_SHARE = 10.0, 0.25
+# Number of samples at the begin of a part to which base and tool are fitted, of consecutive samples far from
+# this fit with which the next part begins, and of parts at most.
+N_FIRST, N_FAR, MAX_PARTS = 16, 3, 12
+# Residual of a far sample as a multiple of the median of the first ones, and smallest share of samples that
+# are as far from a solution for all.
+MIN_FAR_RATIO, MIN_FAR_SHARE = 10.0, 0.1
 # Largest number of iterations of the fit of the frames.
 MAX_ITERATIONS = 20
 
@@ -61,11 +64,29 @@ def _samples_of(data: tuple[Measurement, ...], of_part: list[Array], part: int) 
     return tuple(item for item in taken if len(item.rows))
 
 
-def starts_of_far_samples(problem: Problem, x: Array, timeline: Timeline) -> tuple[int, ...]:
-    """Return the first samples of parts but the first: files, and a run of samples far from a solution."""
-    sizes = np.concatenate([np.sum(r**2, 0) / len(r) for r in problem.residuals(x, problem.data)])
-    order = np.argsort(timeline.fitted_numbers, kind="stable")
-    numbers = timeline.fitted_numbers[order]
-    first, end = longest_run(sizes[order] > MIN_FAR_RATIO**2 * np.quantile(sizes, FITTING_SHARE))
-    inner = [int(numbers[i]) for i in (first, end) if 0 < i < len(numbers) and first < end]
-    return tuple(sorted({*timeline.file_starts, *inner}))
+def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int, ...]:
+    """Return the first samples of parts but the first that fit by themselves, but not to one solution."""
+    numbers = np.sort(timeline.fitted_numbers)
+    of_solution = _mean_squares(problem, x, timeline)
+    begin, starts = 0, []
+    while len(numbers) - begin >= MIN_SAMPLES and len(starts) < MAX_PARTS:
+        first = numbers[begin : begin + N_FIRST]
+        is_first = [np.isin(each, first) for each in timeline.numbers[: timeline.n_fitted]]
+        part = _samples_of(problem.data, is_first, True)
+        chain = initialize_frames(problem.errors, part, problem.known, MAX_ITERATIONS).chain
+        placed = replace(problem, errors=replace(problem.errors, chain=chain))
+        sizes = _mean_squares(placed, np.zeros_like(x), timeline)[begin:]
+        limit = MIN_FAR_RATIO**2 * np.median(sizes[:N_FIRST])
+        is_far = sliding_window_view(sizes > limit, N_FAR).all(1)
+        is_far[:MIN_SAMPLES] = False
+        if np.mean(of_solution > limit) < MIN_FAR_SHARE or not is_far.any():
+            break
+        begin += int(np.argmax(is_far))
+        starts.append(int(numbers[begin]))
+    return tuple(starts)
+
+
+def _mean_squares(problem: Problem, x: Array, timeline: Timeline) -> Array:
+    """Return the mean squared residual of each fitted sample, in the order of measurement."""
+    sizes = np.concatenate([np.mean(r**2, 0) for r in problem.residuals(x, problem.data)])
+    return sizes[np.argsort(timeline.fitted_numbers, kind="stable")]

@@ -41,7 +41,7 @@ from ..measurements.configurations import group_by_configuration
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, solve_information, whitened_rows
-from .part_bases import place_parts, starts_of_far_samples
+from .part_bases import place_parts, starts_of_parts
 from .robot_changes import JointPaths, Motion, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
@@ -554,10 +554,6 @@ class _Search:
         """Return the mean logarithm of the noise of a fit."""
         return float(np.mean(np.log(fit.noise[self.groups >= 0])))
 
-    def final_log_noise(self) -> float:
-        """Return the mean logarithm of the noise with the causes that were found."""
-        return self.log_noise(self.solve(self.linearize(), self.causes))
-
     def _undone(self, rows: Array, cause: Cause) -> Array:
         """Return the rows as if a cause had been left out of the model."""
         undone = rows.copy()
@@ -826,20 +822,16 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         _Search(problem, start, timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
         for start in (np.zeros_like(x), x)
     ]
-    parts = [timeline.file_starts, *([starts_of_far_samples(problem, x, timeline)] if is_ordered else ())]
-    placed = [_with_bases(problem, timeline, is_ordered, part) for part in dict.fromkeys(parts)]
-    starts += [each for each in placed if each]
+    parts = starts_of_parts(problem, x, timeline) if is_ordered else ()
+    for each in dict.fromkeys((timeline.file_starts, parts)):
+        if moved := place_parts(problem, timeline, each):
+            starts.append(_Search(moved[0], np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS))
+            starts[-1].move_base(moved[1])
     noises = [search.log_noise(search.first_fit) for search in starts]
     search = starts[int(np.argmin(noises))]
     search.run()
-    steps = [c.shape.number for c in search.causes if c.block.kind == "base" and isinstance(c.shape, Step)]
-    moved = _with_bases(problem, timeline, is_ordered, tuple(sorted(steps))) if search not in placed else None
-    if moved:
-        # The linear model finds where a base turned far, but hardly how far.
-        moved.run()
-        search = moved if moved.final_log_noise() < search.final_log_noise() + MAX_NOISE_RISE else search
     # A search that ends in a wrong minimum says nothing.
-    if search.final_log_noise() > min(noises) + MAX_NOISE_RISE:
+    if search.log_noise(search.solve(search.linearize(), search.causes)) > min(noises) + MAX_NOISE_RISE:
         return nothing
     alone = search.with_lag_alone() if len(search.causes) > 1 else None
     if alone and not _is_suspicious(problem, alone.x, alone.corrected_timeline(), is_ordered):
@@ -868,19 +860,6 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
             if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
         ),
     ).described()
-
-
-def _with_bases(
-    problem: Problem, timeline: Timeline, is_ordered: bool, starts: tuple[int, ...]
-) -> _Search | None:
-    """Return a search that begins with a pose of the base in each part; None if no base turned far."""
-    placed = place_parts(problem, timeline, starts)
-    if placed is None:
-        return None
-    moved, base = placed
-    search = _Search(moved, np.zeros(len(problem.weights)), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
-    search.move_base(base)
-    return search
 
 
 def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: bool) -> bool:

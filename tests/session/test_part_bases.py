@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from sessions import Changes, Simulation, session_of
+from slow_cases import some_slow
 
 from dhcal_pin import calibrate
 from dhcal_pin.measurements import Pose, Position
@@ -84,15 +85,17 @@ def test_a_base_that_turned_far_within_a_file_is_found(arm, angle, shares, n_out
 
 
 @pytest.mark.parametrize("kind", [Position, Pose])
-@pytest.mark.parametrize("arm", ["ur10", "panda"])
-def test_halves_of_a_file_have_their_own_pose_of_the_base(arm, kind):
-    """A base fits neither half, so that there are no outliers."""
-    sim = Simulation(arm, 80, 7)
-    frames = [pin.SE3(pin.exp3(sim.rng.normal(0, 1, 3)), sim.rng.normal(0, 1, 3)), pin.SE3.Identity()]
-    parts = files(sim, kind, frames)
+@pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 2), ("panda", 3), ("ur5", 5)], {0, 1}))
+def test_equal_parts_of_a_file_have_their_own_pose_of_the_base(arm, count, kind):
+    """One base fits no part, so that there are no outliers."""
+    sim = Simulation(arm, 40 * count, 7)
+    frames = [pin.SE3(pin.exp3(sim.rng.normal(0, 1, 3)), sim.rng.normal(0, 1, 3)) for _ in range(count - 1)]
+    parts = files(sim, kind, [*frames, pin.SE3.Identity()])
     values = np.concatenate([part.positions() if kind is Position else part.poses for part in parts])
     fit = calibrate(sim.chain, kind(sim.q, values), extend="none")
-    assert [(event.kind, event.after.line) for event in session_of(fit).events] == [("base", 41)]
+    assert [(event.kind, event.after.line) for event in session_of(fit).events] == [
+        ("base", 40 * i + 1) for i in range(1, count)
+    ]
     assert sim.true_error(fit.chain) < 1e-4
 
 
