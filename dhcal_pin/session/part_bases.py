@@ -77,11 +77,11 @@ def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int
         placed = replace(problem, errors=replace(problem.errors, chain=chain))
         sizes = _mean_squares(placed, np.zeros_like(x), timeline)[begin:]
         limit = MIN_FAR_RATIO**2 * np.median(sizes[:N_FIRST])
-        is_far = sliding_window_view(sizes > limit, N_FAR).all(1)
-        is_far[:MIN_SAMPLES] = False
-        if np.mean(of_solution > limit) < MIN_FAR_SHARE or not is_far.any():
+        far = np.flatnonzero(np.all(sliding_window_view(sizes > limit, N_FAR), 1))
+        far = far[far >= MIN_SAMPLES]
+        if np.mean(of_solution > limit) < MIN_FAR_SHARE or not len(far):
             break
-        begin += int(np.argmax(is_far))
+        begin += int(far[0])
         starts.append(int(numbers[begin]))
     return tuple(starts)
 
