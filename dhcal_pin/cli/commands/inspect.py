@@ -56,20 +56,25 @@ def run(args: Namespace) -> int:
     inspections = [
         diagnostics.inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data
     ]
-    robot = None
+    robot, warnings = None, {}
     if chain is not None:
+        warnings = {args.robot: diagnostics.find_robot_warnings(chain)}
         robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}
     document = {
         "robot": robot,
         "files": [asdict(inspection) for inspection in inspections],
-        "warnings": [f"{one.path}: {text}" for one in inspections for text in one.warnings],
+        "warnings": [
+            f"{path}: {text}"
+            for path, texts in (*warnings.items(), *((one.path, one.warnings) for one in inspections))
+            for text in texts
+        ],
         "inputs": report.file_digests(inputs),
     }
     write_outputs({}, args.json, document)
     about = ""
     if chain is not None:
         about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
-    screens.show(screens.inspection_screen(about, inspections), args.verbosity)
+    screens.show(screens.inspection_screen(about, warnings, inspections), args.verbosity)
     return 0
 
 

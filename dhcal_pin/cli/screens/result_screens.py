@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -166,13 +166,15 @@ def _bundled_accuracy(accuracy: Mapping[str, Any]) -> Table:
     return Table(["RMS error", "before", "after"], rows)
 
 
-def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
-    """Describe what measurement files contain."""
-    first = Block([robot] if robot else [])
+def inspection_screen(
+    robot: str, warnings: Mapping[str, Sequence[str]], inspections: Sequence[FileInspection]
+) -> Screen:
+    """Describe what measurement files contain, after the robot and the warnings about it."""
+    first = [Block([robot] if robot else []), replace(warnings_block(warnings), is_verdict=True)]
     blocks = [block for inspection in inspections for block in _inspection_blocks(inspection)]
     if len(inspections) == 1:
-        return Screen([first, *blocks])
-    return Screen([first, *_overview(inspections)], lambda: blocks)
+        return Screen([*first, *blocks])
+    return Screen([*first, *_overview(inspections)], lambda: blocks)
 
 
 def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
