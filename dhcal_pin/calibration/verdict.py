@@ -831,19 +831,19 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
     if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
         return []  # No part of the correction is applied.
-    return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
+    advice = "Measure more poses."
+    if not _is_from_images(fit) and fit.rows_per_direction < (limit := _min_rows_per_direction(fit)):
+        advice = _poses_advice(fit, limit)
+    return [Finding("caution", f"{note} {advice}", not fit.shrinkage_factor) for note in fit.shrinkage_notes]
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
     """Advise caution if the measurements could not have revealed outliers; stated errors need fewer rows."""
-    is_image = bool(fit.camera_stages or fit.hand_eye)
-    if is_image or not fit.shrinkage_factor:
+    if _is_from_images(fit) or not fit.shrinkage_factor:
         return []
     is_stated = all(item.has_stated_sigma for item in fit.data)
     is_known = is_stated and not fit.contradicts_sigma
-    # Joint errors can explain outliers, too.
-    has_families = bool(fit.extension and fit.extension.families)
-    limit = MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
+    limit = _min_rows_per_direction(fit)
     if fit.rows_per_direction >= limit:
         is_searched = not is_known and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
         hidden = fit.hidden_majority if is_searched else None
@@ -859,10 +859,29 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     found = "The residuals contradict the stated standard deviations. " * (is_stated and not is_known)
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
-        f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{_needed_configurations(fit, limit)} different poses{' to be fitted' * bool(fit.holdout)}."
+        f"independent values for each unknown that they determine, {limit:g} are needed. "
+        f"{_poses_advice(fit, limit)}"
     )
     return [Finding("caution", text)]
+
+
+def _is_from_images(fit: Evidence) -> bool:
+    """Return whether measurements are images, whose outliers are found in other ways."""
+    return bool(fit.camera_stages or fit.hand_eye)
+
+
+def _min_rows_per_direction(fit: Evidence) -> float:
+    """Return the number of independent rows per direction with which outliers show."""
+    is_known = all(item.has_stated_sigma for item in fit.data) and not fit.contradicts_sigma
+    # Joint errors can explain outliers, too.
+    has_families = bool(fit.extension and fit.extension.families)
+    return MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
+
+
+def _poses_advice(fit: Evidence, rows_per_direction: float) -> str:
+    """Return the advice to measure the poses that leave no reason about too few samples."""
+    count = _needed_configurations(fit, rows_per_direction)
+    return f"Measure at least {count} different poses{' to be fitted' * bool(fit.holdout)}."
 
 
 def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
