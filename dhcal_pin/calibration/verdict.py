@@ -831,15 +831,14 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
     if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
         return []  # No part of the correction is applied.
-    advice = "Measure more poses."
-    if not _is_from_images(fit) and fit.rows_per_direction < (limit := _min_rows_per_direction(fit)):
-        advice = _poses_advice(fit, limit)
+    advice = _poses_advice(fit)
     return [Finding("caution", f"{note} {advice}", not fit.shrinkage_factor) for note in fit.shrinkage_notes]
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
     """Advise caution if the measurements could not have revealed outliers; stated errors need fewer rows."""
-    if _is_from_images(fit) or not fit.shrinkage_factor:
+    is_image = bool(fit.camera_stages or fit.hand_eye)
+    if is_image or not fit.shrinkage_factor:
         return []
     is_stated = all(item.has_stated_sigma for item in fit.data)
     is_known = is_stated and not fit.contradicts_sigma
@@ -860,14 +859,9 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. "
-        f"{_poses_advice(fit, limit)}"
+        f"{_poses_advice(fit)}"
     )
     return [Finding("caution", text)]
-
-
-def _is_from_images(fit: Evidence) -> bool:
-    """Return whether measurements are images, whose outliers are found in other ways."""
-    return bool(fit.camera_stages or fit.hand_eye)
 
 
 def _min_rows_per_direction(fit: Evidence) -> float:
@@ -878,14 +872,21 @@ def _min_rows_per_direction(fit: Evidence) -> float:
     return MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
 
 
-def _poses_advice(fit: Evidence, rows_per_direction: float) -> str:
+def _poses_advice(fit: Evidence) -> str:
     """Return the advice to measure the poses that leave no reason about too few samples."""
-    count = _needed_configurations(fit, rows_per_direction)
+    if not (count := needed_poses(fit)):
+        return "Measure more poses."
     return f"Measure at least {count} different poses{' to be fitted' * bool(fit.holdout)}."
 
 
-def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
-    """Return the number of configurations with this number of independent rows per direction."""
+def needed_poses(fit: Evidence) -> int:
+    """Return the number of different poses that leaves no reason about too few samples; 0 with enough.
+
+    Outliers among images are found in other ways, so that no number is known.
+    """
+    rows_per_direction = _min_rows_per_direction(fit)
+    if fit.camera_stages or fit.hand_eye or fit.rows_per_direction >= rows_per_direction:
+        return 0
     # The present rows may be too few to determine all directions that many rows would determine.
     factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)

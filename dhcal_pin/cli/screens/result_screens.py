@@ -224,7 +224,7 @@ def _inspection_blocks(inspection: FileInspection) -> list[Block]:
         reasons = [f"  line {line}: {reason}" for line, reason in bad.items()]
     warnings = [f"warning: {text}" for text in inspection.warnings]
     problems = [f"problem: {inspection.problem}"] if inspection.problem else []
-    is_good = not (bad or warnings or problems or inspection.column_map)
+    is_good = not (bad or warnings or problems or inspection.column_map or inspection.notes)
     verdict = ["No problems found."] if is_good and inspection.configurations is not None else []
     return [
         Block([_inspection_title(inspection)], "bold", is_verdict=True, has_space=True),
