@@ -43,6 +43,37 @@ def test_a_robot_is_an_option(run, pose_file, ur10):
     )
 
 
+def test_a_robot_alone_lists_its_joints_and_tips(run, robot_folder):
+    """It is what the message about a robot in place of data advises."""
+    Path("arm.urdf").write_text(
+        """<robot name="arm"><link name="base"/><link name="a"/><link name="tip"/><link name="jaw"/>
+        <joint name="j1" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+        <limit lower="-1.5707963267948966" upper="0.7853981633974483" effort="1" velocity="1"/></joint>
+        <joint name="f" type="fixed"><parent link="a"/><child link="tip"/><origin xyz="0.1 0 0"/></joint>
+        <joint name="grip" type="prismatic"><parent link="a"/><child link="jaw"/><axis xyz="1 0 0"/>
+        <limit lower="0" upper="0.03" effort="1" velocity="1"/></joint></robot>"""
+    )
+    advice = unfolded(run("inspect", "arm.urdf")[2]).split("state it with ")[1]
+    screen = unfolded(stderr_of(run("inspect", *advice.split())))
+    for text in (
+        "arm.urdf: tip jaw, 2 joints from j1 to grip",
+        "j1 revolute deg -90 45",
+        "grip prismatic mm 0 30",
+        "tip, 1 joint jaw, 2 joints (chosen)",
+    ):
+        assert text in screen
+    document = inspect(run, "--robot", "arm.urdf", "--tip", "tip")
+    assert document["robot"] == {
+        "path": "arm.urdf",
+        "tip": "tip",
+        "joints": ["j1"],
+        "tips": ["tip", "jaw"],
+    }
+    assert document["files"] == []
+    status, _, err = run("inspect")
+    assert (status, err) == (2, "dhcal: DATA: expected measurement files, or a robot alone (--robot ROBOT)\n")
+
+
 def test_a_normal_file_fits_one_screen(run, pose_file, ur10):
     args = ("inspect", "poses.csv", "--robot", ur10.urdf.source, "--tip", "tool0")
     status, out, err = run(*args)

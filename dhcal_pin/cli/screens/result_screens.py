@@ -58,6 +58,18 @@ def files_block(paths: Iterable[object]) -> Block:
     return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
 
 
+def robot_line(path: str, chain: Chain) -> str:
+    """Describe a robot by its tip and its joints."""
+    first, *_, last = chain.joint_names * 2
+    joints = f"{chain.n_joints} joints from {first} to {last}" if chain.n_joints > 1 else f"joint {first}"
+    return f"{path}: tip {chain.tip}, {joints}"
+
+
+def simulation_screen(robot: str, paths: Iterable[object]) -> Screen:
+    """Describe the robot that was measured in a simulation, and the files that were written."""
+    return Screen([Block([robot], rank=1), files_block(paths)])
+
+
 def files_screen(
     paths: Iterable[object], notes: Sequence[str] = (), warnings: Mapping[str, Sequence[str]] | None = None
 ) -> Screen:
@@ -175,6 +187,30 @@ def inspection_screen(
     if len(inspections) == 1:
         return Screen([*first, *blocks])
     return Screen([*first, *_overview(inspections)], lambda: blocks)
+
+
+def robot_screen(path: str, chain: Chain, warnings: Mapping[str, Sequence[str]]) -> Screen:
+    """Describe a robot: the joints to its tip, and the links that can be chosen as a tip."""
+    rows = []
+    for j, name in enumerate(chain.joint_names):
+        factor, unit = (1e3, "mm") if chain.is_prismatic[j] else (180 / np.pi, "deg")
+        ends = float(chain.lower[j]), float(chain.upper[j])
+        limits = [f"{factor * end:.6g}" if np.isfinite(end) else "–" for end in ends]
+        rows.append([name, chain.urdf.joint(name).type, unit, *limits])
+    tips = []
+    for link in chain.urdf.leaves():
+        count = sum(joint.type != "fixed" for joint in chain.urdf.path(link))
+        tips.append(f"  {link}, {format_count(count, 'joint')}{' (chosen)' * (link == chain.tip)}")
+    joints = Table(["joint", "type", "unit", "lower", "upper"], rows, n_text_columns=3)
+    title = "Tips (--tip), or any other link behind a joint:"
+    return Screen(
+        [
+            Block([robot_line(path, chain)], is_verdict=True),
+            replace(warnings_block(warnings), is_verdict=True),
+            Block(joints, noun="joint", rank=1),
+            Block(tips, title=title, noun="tip", rank=0, n_kept=5),
+        ]
+    )
 
 
 def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
