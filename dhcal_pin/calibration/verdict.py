@@ -831,8 +831,10 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
     if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
         return []  # No part of the correction is applied.
-    advice = _poses_advice(fit)
-    return [Finding("caution", f"{note} {advice}", not fit.shrinkage_factor) for note in fit.shrinkage_notes]
+    return [
+        Finding("caution", f"{note} {_poses_advice(fit)}", not fit.shrinkage_factor)
+        for note in fit.shrinkage_notes
+    ]
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
