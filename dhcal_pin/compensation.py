@@ -168,6 +168,18 @@ def compensate(
     return Compensation(q, poses, tuple(status.tolist()), residual_error)
 
 
+def nominal_root_pose(nominal: Chain, calibrated: Chain) -> Array:
+    """Return the pose (4, 4) of the root link of the nominal robot in that of the calibrated robot."""
+    # They differ if the calibrated URDF has a world joint. The link that carries the first joint is fixed to
+    # both roots; if the robots call it differently, the roots are the same.
+    first = nominal.urdf.joint(nominal.moving_joints[0])
+    carrier = first.child if nominal.is_reversed[0] else first.parent
+    if carrier not in calibrated.urdf.links:
+        return np.eye(4)
+    own, other = (chain.fixed_pose(chain.root, carrier) for chain in (nominal, calibrated))
+    return np.eye(4) if own is None or other is None else other @ se3.inverse(own)
+
+
 def _with_conditions(
     chain: Chain, targets: Array, q: Array, status: Array, residual_error: Array, conditions: Conditions
 ) -> tuple[Array, Array, Array]:
@@ -330,7 +342,8 @@ def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Arra
     if nominal.n_joints > 6:
         return out  # The controller of a redundant arm may choose other joint positions in any case.
     # A controller that moves from the uncorrected target must end in the same joint positions.
-    uncorrected = replace(nominal, base=calibrated.base, tool=calibrated.tool)
+    base = calibrated.base @ nominal_root_pose(nominal, calibrated)
+    uncorrected = replace(nominal, base=base, tool=calibrated.tool)
     before, _ = solve_ik(uncorrected, _task_error(uncorrected, targets), q)
     commanded, _ = solve_ik(nominal, pose_task(nominal.poses(q), characteristic_length(nominal)), before)
     reached = calibrated.poses(q) if targets.ndim == 3 else calibrated.poses(q)[:, :3, 3]

@@ -22,6 +22,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_targets, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain, DHTable
+from dhcal_pin.robot.urdf_edit import with_world
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
@@ -464,6 +465,30 @@ def test_targets_are_poses_of_the_tip_in_the_base_frame(place, run):
     # The corrections are those of errors of a few millimetres and degrees.
     assert 1e-3 < np.linalg.norm(sent - targets[:, :3, 3], axis=1).min()
     assert np.linalg.norm(sent - targets[:, :3, 3], axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize(("name", "root"), [("ur5", "world"), ("sim_6dof", "base_link")])
+def test_a_world_joint_changes_no_result(name, root, tmp_path, monkeypatch, run):
+    """The root of the UR5 is `world` already, whose joint takes up the base; the other arm has a new one."""
+    monkeypatch.chdir(tmp_path)
+    nominal, rng = ROBOTS[name](), np.random.default_rng(4)
+    Path("arm.urdf").write_bytes(nominal.urdf.data)
+    true, base = wrong(nominal, rng), se3.exp6([2.1, -1.4, 0.35, 0.1, -0.2, 1.1])
+    write_urdf(true, "true.urdf")
+    Path("true.urdf").write_bytes(with_world(Path("true.urdf").read_bytes(), base))
+    placed = Chain.from_urdf("true.urdf", nominal.tip)
+    assert (nominal.urdf.root, placed.urdf.root) == (root, "world")
+    q = draw(nominal, 12, rng)
+    targets = true.poses(q)
+    expected = compensate(nominal, true, targets, q)
+    assert "ok" in expected.status
+    assert compensate(nominal, placed, base @ targets, q).status == expected.status
+    arguments = ("compensate", "arm.urdf", "true.urdf", "targets.csv", "--tip", nominal.tip, "-o", "out.csv")
+    for frame, poses in (("base", targets), ("measuring", base @ targets)):
+        write_targets(poses)
+        said = stderr_of(run(*arguments, "--frame", frame))
+        assert f"the root link {root}" in said or frame == "measuring"
+        np.testing.assert_allclose(placed.poses(joint_values(nominal)), base @ targets, atol=1e-9)
 
 
 def test_targets_in_the_wrong_frame_are_hinted_at(place, run):

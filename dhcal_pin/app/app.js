@@ -351,7 +351,7 @@ function fileCard(file) {
   const out = element("div", { className: `card ${state}` },
     element("h3", {}, file.path), element("p", {}, facts.filter(Boolean).join(", ")),
     file.problem ? element("p", {}, spoken(file.problem)) : null, list(warnings.map(spoken)), list(file.notes.map(spoken)),
-    state === "ok" ? element("p", {}, "No problems found.") : null);
+    state === "ok" && !file.notes.length ? element("p", {}, "No problems found.") : null);
   if (file.column_map.length) out.append(...proposedMap(file.column_map));
   const rows = file.columns.map(column => [column.name, column.unit, column.role, short(column.minimum), short(column.maximum),
     column.lower === null ? "" : `${short(column.lower)} to ${short(column.upper)}`,

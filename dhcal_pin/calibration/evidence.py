@@ -227,7 +227,7 @@ class Evidence(FittedModel):
         if self.shrinkage_factor == 1:
             return []
         applied = f"only {100 * self.shrinkage_factor:.0f} % of the" if self.shrinkage_factor else "no"
-        return [f"Too few measurements: {applied} correction applied. Measure more poses."]
+        return [f"Too few measurements: {applied} correction applied."]
 
     @cached_property
     def rounding_notes(self) -> list[str]:

@@ -831,7 +831,10 @@ def _few_measurements(fit: Evidence) -> list[Finding]:
     """Advise caution if there are too few measurements to apply the correction in full."""
     if any(finding.keeps_nominal for finding in _held_out_errors(fit)):
         return []  # No part of the correction is applied.
-    return [Finding("caution", note, not fit.shrinkage_factor) for note in fit.shrinkage_notes]
+    return [
+        Finding("caution", f"{note} {_poses_advice(fit)}", not fit.shrinkage_factor)
+        for note in fit.shrinkage_notes
+    ]
 
 
 def _hidden_outliers(fit: Evidence) -> list[Finding]:
@@ -841,9 +844,7 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
         return []
     is_stated = all(item.has_stated_sigma for item in fit.data)
     is_known = is_stated and not fit.contradicts_sigma
-    # Joint errors can explain outliers, too.
-    has_families = bool(fit.extension and fit.extension.families)
-    limit = MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
+    limit = _min_rows_per_direction(fit)
     if fit.rows_per_direction >= limit:
         is_searched = not is_known and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
         hidden = fit.hidden_majority if is_searched else None
@@ -859,14 +860,35 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     found = "The residuals contradict the stated standard deviations. " * (is_stated and not is_known)
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
-        f"independent values for each unknown that they determine, {limit:g} are needed. Measure at least "
-        f"{_needed_configurations(fit, limit)} different poses{' to be fitted' * bool(fit.holdout)}."
+        f"independent values for each unknown that they determine, {limit:g} are needed. "
+        f"{_poses_advice(fit)}"
     )
     return [Finding("caution", text)]
 
 
-def _needed_configurations(fit: Evidence, rows_per_direction: float) -> int:
-    """Return the number of configurations with this number of independent rows per direction."""
+def _min_rows_per_direction(fit: Evidence) -> float:
+    """Return the number of independent rows per direction with which outliers show."""
+    is_known = all(item.has_stated_sigma for item in fit.data) and not fit.contradicts_sigma
+    # Joint errors can explain outliers, too.
+    has_families = bool(fit.extension and fit.extension.families)
+    return MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
+
+
+def _poses_advice(fit: Evidence) -> str:
+    """Return the advice to measure the poses that leave no reason about too few samples."""
+    if not (count := needed_poses(fit)):
+        return "Measure more poses."
+    return f"Measure at least {count} different poses{' to be fitted' * bool(fit.holdout)}."
+
+
+def needed_poses(fit: Evidence) -> int:
+    """Return the number of different poses that leaves no reason about too few samples; 0 with enough.
+
+    Outliers among images are found in other ways, so that no number is known.
+    """
+    rows_per_direction = _min_rows_per_direction(fit)
+    if fit.camera_stages or fit.hand_eye or fit.rows_per_direction >= rows_per_direction:
+        return 0
     # The present rows may be too few to determine all directions that many rows would determine.
     factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)

@@ -34,6 +34,7 @@ from ..calibration.session_check import ASSUMED_ORDER, has_assumed_directions
 from ..calibration.verdict import suggest_full_set
 from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
+from ..diagnostics.robot_checks import find_robot_warnings
 from ..estimation.parameters import LOW_COST
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
@@ -162,6 +163,7 @@ def run_job(
         chain = chain.with_payload(parse_payload(job.payload))
     sets = job.parameters if job.parameters is not None else MIXED_SETS if job.rig else chain.parameters
     data = _read_data(chain, job, servos, has_known_frames=not {"base", "tool"} & set(split_commas(sets)))
+    data.warnings[job.robot] = find_robot_warnings(chain)
     if job.parameters is None:
         sets = default_sets(chain, list(data.fitted.values()))
     settings: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Zeros of servos after a calibration: moved from the robot into the servo file.
+"""Zeros of servos after a calibration: moved from the robot into the servo file, and read back with it.
 
 The estimated zeros of the joints, rounded to whole counts, are added to the joint values that the servos
 report. The robot is the same for these values, with the rest of the zeros in its joint origins.
@@ -7,11 +7,14 @@ report. The robot is the same for these values, with the rest of the zeros in it
 from __future__ import annotations
 
 import copy
+import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..calibration.result import Result
+from ..io.servo_file import read_servos
+from .job_outputs import SERVO_ENDING
 
 if TYPE_CHECKING:
     from ..io.servo_file import ServoFile
@@ -50,3 +53,27 @@ def describe_moves(before: ServoFile, after: ServoFile) -> list[str]:
         "; the position limits of LeRobot move, too: approach the ends slowly, do not record the ranges again"
     )
     return [f"zeros of the servos move by counts: {counts}{limits if after.lerobot else ''}"]
+
+
+def other_zeros_warning(robot: str, servos: ServoFile | None, are_fitted: bool) -> list[str]:
+    """Return a warning if a calibrated robot has a servo file with other zeros than those that are stated."""
+    path = os.path.splitext(robot)[0] + SERVO_ENDING
+    if servos is None or not os.path.exists(path):
+        return []
+    # The zeros of LeRobot depend on the homing offsets in the servos; those of measurements that the
+    # calibration fitted are known.
+    if servos.lerobot and not are_fitted:
+        return []
+    own = {servo.joint: servo for servo in read_servos(path).servos}
+    others = [
+        f"{servo.name} {own[servo.joint].zero - servo.zero:+.0f}"
+        for servo in servos.servos
+        if servo.joint in own and (servo.zero, servo.step) != (own[servo.joint].zero, own[servo.joint].step)
+    ]
+    if not others:
+        return []
+    condition = "" if are_fitted else ", unless the offsets in the servos have changed"
+    return [
+        f"the zeros are not those of this calibration, which are in {path} (counts: {', '.join(others)}); "
+        f"state --servos {path}{condition}"
+    ]

@@ -33,6 +33,7 @@ from .residuals import Outlier as Outlier
 from .residuals import find_outliers as find_outliers
 from .residuals import joint_offset_profiles as joint_offset_profiles
 from .residuals import median_sigmas as median_sigmas
+from .robot_checks import find_robot_warnings as find_robot_warnings
 from .workspace import WorkspaceMap as WorkspaceMap
 from .workspace import WorkspacePrediction as WorkspacePrediction
 from .workspace import predict_workspace as predict_workspace

@@ -17,9 +17,12 @@ from ..calibration.evaluation import compute_errors
 from ..estimation.initialization import align
 from ..estimation.parameters import PARAMETER_SETS
 from ..exceptions import FileFormatError
+from ..formatting import join_names
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
+from ..io.measurement_files.counts import TICKS
 from ..io.measurement_files.fitted_rows import count_fitted_rows
+from ..io.servo_file import RESOLUTION
 from ..io.sidecar import Fitted
 from ..measurements.base import Measurement
 from ..measurements.columns import MAX_TOOL_OFFSET
@@ -126,14 +129,14 @@ def _check_fit(chain: Chain, file: MeasurementFile) -> list[str]:
 
 def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
     """Find implausible values in a measurement file."""
-    joint_units = _check_joint_units(chain, file)
-    joints = [*joint_units.values(), *_check_small_joints(chain, file)]
+    too_far = _columns_beyond_motion(chain, file)
+    joints = [*_check_joint_units(chain, file, too_far), *_check_small_joints(chain, file)]
     return [
         *_check_tip(chain, file),
         *joints,
         *_check_lengths(chain, file),
         *_check_rotations(file),
-        *_check_limits(chain, file, joint_units),
+        *_check_limits(chain, file, too_far),
         *_check_payload(chain, file),
         *_check_repetitions(file),
     ]
@@ -144,9 +147,9 @@ def require_joint_units(chain: Chain, file: MeasurementFile) -> None:
     # A fit to such images takes long, and its result does not show the cause.
     if file.data.rig is None:
         return
-    warnings = list(_check_joint_units(chain, file).values())
-    if 2 * len(warnings) > chain.n_joints:
-        raise FileFormatError(f"{file.source}: {warnings[0]}")
+    too_far = _columns_beyond_motion(chain, file)
+    if 2 * len(too_far) > chain.n_joints:
+        raise FileFormatError(f"{file.source}: {_check_joint_units(chain, file, too_far)[0]}")
 
 
 def _check_tip(chain: Chain, file: MeasurementFile) -> list[str]:
@@ -233,23 +236,60 @@ def _format_rows(data: Measurement, mask: Array) -> str:
     )
 
 
-def _check_joint_units(chain: Chain, file: MeasurementFile) -> dict[str, str]:
-    """Return warnings about joints that cannot move as far as their columns say, by column name."""
-    out: dict[str, str] = {}
-    for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(file), strict=False):
-        for j, name in enumerate(chain.joint_names):
-            is_prismatic = chain.urdf.joint(name).type == "prismatic"
-            largest, unit = float(np.max(np.abs(q[:, j]), initial=0.0)), file.units[prefix + name]
-            if largest > (_MAX_STROKE_M if is_prismatic else _MAX_TURN_RAD):
-                problem = (
-                    "too far for a prismatic joint" if is_prismatic else f"{largest / (2 * np.pi):.1f} turns"
-                )
-                true_unit, short = ("millimetres", "mm") if is_prismatic else ("degrees", "deg")
-                out[prefix + name] = (
-                    f"joint {prefix + name} reaches {_format_as_written(largest, unit)}, {problem}; "
-                    f"if the values are {true_unit}, write [{short}] in the header"
-                )
+def _columns_beyond_motion(chain: Chain, file: MeasurementFile) -> dict[str, Array]:
+    """Return the values [rad or m] of joints that cannot move as far as their columns say, by column name."""
+    return {
+        prefix + name: q[:, j]
+        for prefix, q in zip(("", SECOND_PREFIX), _joint_positions_by_configuration(file), strict=False)
+        for j, name in enumerate(chain.joint_names)
+        if np.max(np.abs(q[:, j]), initial=0.0) > (_MAX_STROKE_M if chain.is_prismatic[j] else _MAX_TURN_RAD)
+    }
+
+
+def _check_joint_units(chain: Chain, file: MeasurementFile, too_far: Mapping[str, Array]) -> list[str]:
+    """Return a warning about the revolute and one about the prismatic joints that move too far."""
+    slides = {name for j, name in enumerate(chain.joint_names) if chain.is_prismatic[j]}
+    out = []
+    for units in (ANGLES, LENGTHS):
+        is_slide = units is LENGTHS
+        columns = [name for name in too_far if (name.removeprefix(SECOND_PREFIX) in slides) == is_slide]
+        if not columns:
+            continue
+        first, *others = columns
+        largest, unit = float(np.abs(too_far[first]).max()), file.units[first]
+        problem = f"{largest / (2 * np.pi):.1f} turns" if units is ANGLES else "too far for a prismatic joint"
+        out.append(
+            f"joint {first} reaches {_format_as_written(largest, unit)}, {problem}; "
+            f"{_joint_unit_remedy({name: too_far[name] for name in columns}, file, units)}"
+            + (f" (also {join_names(others)})" if others else "")
+        )
     return out
+
+
+def _joint_unit_remedy(
+    too_far: Mapping[str, Array], file: MeasurementFile, units: Mapping[str, float]
+) -> str:
+    """Say which unit explains that joints move too far: one that the header does not state, or counts."""
+    written = {name: values * units.get(file.units[name], 1.0) for name, values in too_far.items()}
+    largest = max(float(np.abs(values).max()) for values in written.values())
+    word, short, limit = (
+        ("degrees", "deg", _MAX_TURN_RAD) if units is ANGLES else ("millimetres", "mm", _MAX_STROKE_M)
+    )
+    if short not in {file.units[name] for name in too_far} and largest <= limit * units[short]:
+        return f"if the values are {word}, write [{short}] in the header"
+    if units is ANGLES and all(_are_counts(values) for values in written.values()):
+        return (
+            f"whole numbers from 0 to {RESOLUTION - 1} look like counts of servos; if they are, write "
+            f"{next(iter(too_far))}[{TICKS}] in the header, and state a servo file (--servos)"
+        )
+    return "check the values and the unit in the header"
+
+
+def _are_counts(values: Array) -> bool:
+    """Return whether values (m,) are whole numbers in the range of a servo's encoder."""
+    whole = np.round(values)
+    is_whole = np.abs(values - whole) <= 1e-9 * np.maximum(1.0, np.abs(values))
+    return bool(np.all(is_whole & (whole >= 0) & (whole < RESOLUTION)))
 
 
 def _check_small_joints(chain: Chain, file: MeasurementFile) -> list[str]:

@@ -14,14 +14,14 @@ from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import field, replace
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._frozen import frozen
 from .._typing import Array, PathLike
 from ..exceptions import DhcalError
-from ..formatting import Table
+from ..formatting import Table, join_names
 from ..io.measurement_files import columns as file_columns
 from ..io.measurement_files.map_proposal import header_problem, propose_map, skip_line
 from ..io.measurement_files.reading import (
@@ -36,6 +36,9 @@ from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
 from ..units import ANGLES, LENGTHS
 from .input_checks import find_input_warnings, first_equal_rows
+
+if TYPE_CHECKING:
+    from ..calibration import Result
 
 # Decimals to which joint positions of one configuration are equal [rad or m].
 _CONFIGURATION_DECIMALS = 3
@@ -83,7 +86,8 @@ class FileInspection:
     #: Lines of a column map that would read a file with unknown columns; empty if not needed.
     column_map: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()  #: Suspected mistakes, one sentence each.
-    notes: tuple[str, ...] = ()  #: What of the file is not read, such as further sheets.
+    #: What of the file is not read, such as further sheets, and what it lacks for a calibration.
+    notes: tuple[str, ...] = ()
 
 
 def inspect_file(
@@ -107,11 +111,17 @@ def inspect_file(
             lines = tuple(propose_map(table, chain))
             return replace(inspection, problem=header_problem(table, chain), column_map=lines)
         return replace(inspection, problem=str(error))
+    inspection, warnings, notes = _inspect_table(table, chain), find_input_warnings(chain, file), []
+    if (fit := _calibrated(chain, file)) is not None:
+        # With other columns or units it may be a good calibration.
+        notes = [] if warnings else _calibration_notes(fit)
+        warnings += [item.finding for item in fit.session.found] if fit.session else []
     return replace(
-        _inspect_table(table, chain),
+        inspection,
         configurations=_count_configurations(file),
         bad_rows=file.bad_rows,
-        warnings=(*find_input_warnings(chain, file), *_session_warnings(chain, file)),
+        warnings=tuple(warnings),
+        notes=(*inspection.notes, *notes),
     )
 
 
@@ -124,15 +134,34 @@ def _below_titles(table: DataTable, chain: Chain | None) -> DataTable:
     return replace(below, notes=(*below.notes, f"{note}{skip_line(below)} skips the lines above it"))
 
 
-def _session_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Describe what happened while the samples of a file were measured."""
+def _calibrated(chain: Chain, file: MeasurementFile) -> Result | None:
+    """Calibrate with a file, to see what happened during its measurement; None if it is impossible."""
     from ..calibration import calibrate  # lazy import: slow
 
     try:
-        session = calibrate(chain, file.data, SESSION_PARAMETERS, extend="none").session
+        return calibrate(chain, file.data, SESSION_PARAMETERS, extend="none")
     except DhcalError:
-        return []
-    return [item.finding for item in session.found] if session else []
+        return None
+
+
+def _calibration_notes(fit: Result) -> list[str]:
+    """Say what a file lacks for a calibration with it alone: joints that move, and enough poses."""
+    from ..calibration.verdict import needed_poses  # lazy import, as the following: slow
+    from ..identifiability.null_space import ObservabilityProbe
+
+    notes, names = [], fit.chain.joint_names
+    unmoved = [names[j] for j in ObservabilityProbe(fit.problem, fit.x).unmoved_joints()]
+    if unmoved:
+        joints = f"{'joint' if len(unmoved) == 1 else 'joints'} {join_names(unmoved)}"
+        notes.append(
+            f"{joints} never moved; a calibration with this file alone holds only where "
+            f"{'it stands' if len(unmoved) == 1 else 'they stand'}"
+        )
+    if count := needed_poses(fit):
+        notes.append(
+            f"too few poses for a calibration with this file alone; measure at least {count} different ones"
+        )
+    return notes
 
 
 def _names(table: DataTable) -> Mapping[str, Column]:

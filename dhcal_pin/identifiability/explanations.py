@@ -373,7 +373,11 @@ class Explainer:
     def _explain_poses(self, group: UnobservableGroup) -> tuple[str, str]:
         """Explain directions that more or other poses would make observable."""
         if len(self.names) - self.layers["unmoved"].shape[1] == self.probe.n_equations:
-            return _explain_few_equations(self.probe, group.vectors.shape[1])
+            # The number of poses is that of the verdict: as few as determine them leave outliers undetected.
+            return (
+                f"{self.probe.n_equations} equations for {len(self.names)} parameters",
+                "measure more poses",
+            )
         chain = self.plain_errors.chain
         decisive = [
             j
@@ -385,7 +389,7 @@ class Explainer:
 
 
 def _explain_few_equations(probe: ObservabilityProbe, n_open: int) -> tuple[str, str]:
-    """Explain that unknowns are open because there are too few equations, and how many poses are missing."""
+    """Explain that curves are open because there are too few equations, and how many poses are missing."""
     n_equations, samples = probe.n_equations, sum(len(item.rows) for item in probe.problem.data)
     poses = format_count(-(-n_open * samples // n_equations), "more pose")
     return f"{n_equations} equations for {len(probe.x)} parameters", f"measure at least {poses}"

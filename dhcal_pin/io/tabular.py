@@ -55,12 +55,17 @@ def unreadable(path: PathLike, error: Exception, expected: str = "a file") -> Fi
 
 def read_text(path: PathLike, encoding: str = "utf-8", max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Read a text file."""
+    return decode_text(path, read_limited_bytes(path, max_bytes), encoding)
+
+
+def read_limited_bytes(path: PathLike, max_bytes: int) -> bytes:
+    """Read a file that must not be larger than a size."""
     data = read_bytes(path, max_bytes + 1)
     if len(data) > max_bytes:
         raise FileFormatError(
             f"{path}: the file is larger than {size_text(max_bytes)}; check the path or shorten the file"
         )
-    return decode_text(path, data, encoding)
+    return data
 
 
 def decode_text(path: PathLike, data: bytes, encoding: str = "utf-8", first_line: int = 1) -> str:

@@ -333,6 +333,34 @@ def test_a_file_without_header_proposes_a_map_that_reads_it(run, expected, sign)
     assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
 
 
+def test_a_proposed_map_has_the_spelling_of_the_file(run, expected):
+    """Capital X, Y and Z with units are measured values beside the joints' own names, but not to a map."""
+    names = HEADER.replace("joint_", "J").replace("x[", "X[").replace("y[", "Y[").replace("z[", "Z[")
+    write("data.csv", TEXT.replace(HEADER, names).replace(",", ";"))
+    status, _, err = run(*CALIBRATE)
+    assert (status, err.count("\n")) == (2, 1)
+    assert "'X[mm]', 'Y[mm]', 'Z[mm]'" in err
+    Path("map.toml").write_text(proposed_map(err))
+    assert calibrate(run, "--columns", "map.toml")[0]["parameters"] == expected
+
+
+@pytest.mark.usefixtures("expected")
+def test_a_proposed_map_keeps_the_counts_of_servos(run):
+    counts = np.rint(2048 + NUMBERS[:, :3] * 4096 / 360).astype(int)
+    rows = [[*map(str, row), *cells[3:]] for row, cells in zip(counts, CELLS, strict=True)]
+    header = HEADER.replace("[deg]", "[ticks]")
+    text = "\n".join([header, *map(",".join, rows)]) + "\n"
+    Path("servos.toml").write_text("".join(f"[motor.joint_{i}]\n" for i in (1, 2, 3)))
+    write("data.csv", text)
+    known, _ = calibrate(run, "--servos", "servos.toml")
+    write("data.csv", text.replace("x[", "Px[").replace("y[", "Py[").replace("z[", "Pz["))
+    status, _, err = run(*CALIBRATE, "--servos", "servos.toml")
+    assert (status, err.count("\n")) == (2, 1)
+    Path("map.toml").write_text(proposed_map(err))
+    found, _ = calibrate(run, "--servos", "servos.toml", "--columns", "map.toml")
+    assert found["parameters"] == known["parameters"]
+
+
 def test_a_header_in_another_language_proposes_a_map_that_reads_it(run, expected):
     table = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:]))
     table.insert(0, GERMAN[0], range(1, 21))

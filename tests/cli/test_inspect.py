@@ -9,7 +9,9 @@ from command_line import HEADER, json_of, positions_csv, stderr_of, tool_positio
 from robots import DATA, MAPS, missing
 
 from dhcal_pin.io import measurement_text
-from dhcal_pin.measurements import Noise, Pose
+from dhcal_pin.measurements import Noise, Pose, Position
+
+ALONE = "a calibration with this file alone"
 
 
 def inspect(run, *args):
@@ -41,6 +43,37 @@ def test_a_robot_is_an_option(run, pose_file, ur10):
     )
 
 
+def test_a_robot_alone_lists_its_joints_and_tips(run, robot_folder):
+    """It is what the message about a robot in place of data advises."""
+    Path("arm.urdf").write_text(
+        """<robot name="arm"><link name="base"/><link name="a"/><link name="tip"/><link name="jaw"/>
+        <joint name="j1" type="revolute"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+        <limit lower="-1.5707963267948966" upper="0.7853981633974483" effort="1" velocity="1"/></joint>
+        <joint name="f" type="fixed"><parent link="a"/><child link="tip"/><origin xyz="0.1 0 0"/></joint>
+        <joint name="grip" type="prismatic"><parent link="a"/><child link="jaw"/><axis xyz="1 0 0"/>
+        <limit lower="0" upper="0.03" effort="1" velocity="1"/></joint></robot>"""
+    )
+    advice = unfolded(run("inspect", "arm.urdf")[2]).split("state it with ")[1]
+    screen = unfolded(stderr_of(run("inspect", *advice.split())))
+    for text in (
+        "arm.urdf: tip jaw, 2 joints from j1 to grip",
+        "j1 revolute deg -90 45",
+        "grip prismatic mm 0 30",
+        "tip, 1 joint jaw, 2 joints (chosen)",
+    ):
+        assert text in screen
+    document = inspect(run, "--robot", "arm.urdf", "--tip", "tip")
+    assert document["robot"] == {
+        "path": "arm.urdf",
+        "tip": "tip",
+        "joints": ["j1"],
+        "tips": ["tip", "jaw"],
+    }
+    assert document["files"] == []
+    status, _, err = run("inspect")
+    assert (status, err) == (2, "dhcal: DATA: expected measurement files, or a robot alone (--robot ROBOT)\n")
+
+
 def test_a_normal_file_fits_one_screen(run, pose_file, ur10):
     args = ("inspect", "poses.csv", "--robot", ur10.urdf.source, "--tip", "tool0")
     status, out, err = run(*args)
@@ -52,6 +85,33 @@ def test_a_normal_file_fits_one_screen(run, pose_file, ur10):
     assert "poses.csv: pose, 60 rows (lines 3-62), 60 configurations, commas" in lines
     assert "set: fit (45 rows), holdout (15 rows)" in lines
     assert lines[-1] == "No problems found."
+
+
+@pytest.mark.parametrize(
+    ("count", "still", "expected"),
+    [
+        (60, 4, [f"joint wrist_2_joint never moved; {ALONE} holds only where it stands"]),
+        (8, None, [f"too few poses for {ALONE}; measure at least 14 different ones"]),
+        (14, None, []),
+    ],
+)
+def test_what_a_calibration_lacks_is_noted(run, robot_folder, ur10, count, still, expected):
+    rng = np.random.default_rng(2)
+    q = rng.uniform(-2.5, 2.5, (count, 6))
+    if still is not None:
+        q[:, still] = 1.2
+    data = Position.simulate(ur10, q, Noise(1e-4), rng)
+    Path("positions.csv").write_text(measurement_text(data, ur10))
+    args = ("positions.csv", "--robot", ur10.urdf.source, "--tip", "tool0")
+    (file,) = inspect(run, *args)["files"]
+    assert (file["notes"], file["warnings"]) == (expected, [])
+    screen = stderr_of(run("inspect", *args))
+    assert ("No problems found." in screen) == (not expected)
+    # A calibration says the same.
+    calibrated = ("calibrate", args[2], args[0], *args[3:], "-o", "out.urdf", "--json", "-", "--force")
+    reasons = " ".join(json_of(run(*calibrated))["verdict"]["reasons"])
+    assert ("wrist_2_joint never moved" in reasons) == (still is not None)
+    assert ("Measure at least 14 different poses" in reasons) == (count == 8)
 
 
 def test_columns_ranges_and_coverage(run, pose_file, ur10):

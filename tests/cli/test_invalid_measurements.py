@@ -47,8 +47,8 @@ DATA = {
         ["data.csv:6: a zero byte, as in UTF-16; save the file as UTF-8"],
     ),
     "Latin-1": (
-        positions_csv(4).encode() + b"# 20 \xb0C\n",
-        ["data.csv:6: byte 0xb0 is not UTF-8; save the file as UTF-8"],
+        positions_csv(4).encode() + b"# 20 \xb0C\n20 \xb0C\n",
+        ["data.csv:7: byte 0xb0 is not UTF-8; save the file as UTF-8"],
     ),
     "unknown column": (
         with_column("weather", [1, 2]),

@@ -92,6 +92,36 @@ def test_the_calibrated_arm_is_accurate_on_other_counts(arm, run):
     np.testing.assert_array_equal(calibrated.lower[turned], -nominal.upper[turned])
 
 
+def test_the_servo_file_with_the_zeros_of_the_calibration_is_named(arm, run):
+    assert run(*CALIBRATE, "--servos", "so101.json", "-o", "arm.urdf")[0] == 0
+    Path("old.toml").write_text(read_servos("so101.json").toml_content())
+    rng = np.random.default_rng(9)
+    q = arm.configurations(rng, 20)
+    Path("other.csv").write_text(counts_csv(arm.counts(q), arm.poses(q)))
+
+    def validate(data, servos, command="validate"):
+        options = ("--tip", TIP, "--servos", servos, "--json", "v.json")
+        assert run(command, "arm.urdf", data, *options)[0] in (0, 1)
+        document = json.loads(Path("v.json").read_text())
+        return [text for text in document["warnings"] if "the zeros are not those" in text], document
+
+    for old in ("so101.json", "old.toml"):
+        (found,), before = validate("poses.csv", old)
+        assert found.startswith(
+            f"{old}: the zeros are not those of this calibration, which are in arm.servos"
+        )
+        assert found.endswith("state --servos arm.servos.toml")
+    (found,), _ = validate("other.csv", "old.toml")
+    assert found.endswith("state --servos arm.servos.toml, unless the offsets in the servos have changed")
+    assert validate("other.csv", "old.toml", "recheck")[0] == [found]
+    # The homing offsets in the servos are not known.
+    assert validate("other.csv", "so101.json")[0] == []
+    # The advice is followed.
+    found, after = validate("poses.csv", "arm.servos.toml")
+    assert found == []
+    assert after["after"]["position_rms_m"] < 0.2 * before["after"]["position_rms_m"]
+
+
 def test_motors_may_have_other_names_than_joints(arm, run):
     text = lerobot_text().replace('"elbow_flex"', '"motor_3"')
     Path("so101.json").write_text(text)

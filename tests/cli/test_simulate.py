@@ -21,6 +21,19 @@ def test_seed_determines_the_file(run, robot_folder):
     assert Path("a.csv").read_text().splitlines()[2:] != Path("c.csv").read_text().splitlines()[2:]
 
 
+def test_the_tip_is_shown(run, robot_folder):
+    text = Path("arm.urdf").read_text()
+    more = (
+        '<link name="jaw"/><joint name="grip" type="prismatic"><parent link="tool"/><child link="jaw"/>'
+        '<axis xyz="1 0 0"/><limit lower="0" upper="0.03" effort="1" velocity="1"/></joint>'
+    )
+    tip = Chain.from_urdf("arm.urdf").tip
+    Path("grip.urdf").write_text(text.replace("</robot>", f"{more}</robot>".replace('"tool"', f'"{tip}"')))
+    for options, expected in (((), "tip jaw, 4 joints"), (("--tip", tip), f"tip {tip}, 3 joints")):
+        said = run("simulate", "grip.urdf", "-m", "6", "-o", "s.csv", *options)[2]
+        assert said.startswith(f"grip.urdf: {expected} from joint_1 to ")
+
+
 def test_positions_equal_closed_form(run, robot_folder):
     stdout_of(run("simulate", "arm.urdf", "-m", "50", "--kind", "position", "-o", "s.csv"))
     measured = read_measurement_file("s.csv", Chain.from_urdf("arm.urdf")).data

@@ -271,7 +271,17 @@ def test_six_positions_give_no_accuracy_and_no_correction(run, robot_folder):
     document = parse_json(out)
     assert status == 0
     assert document["verdict"]["status"] == "caution"
-    assert "no correction applied" in document["verdict"]["reasons"][0]
+    (reason,) = document["verdict"]["reasons"]
+    assert "no correction applied" in reason
+    # The advice is followed, and the note on the parameters gives no other number.
+    count = int(re.search(r"Measure at least (\d+) different poses\.", reason)[1])  # pyright: ignore
+    assert not any(re.search(r"\d+ more pose", text) for text in document["unobservable"])
+    write_columns(positions_only(tracker_columns(count)))
+    reasons = parse_json(run(*command[:5], "-o", "more.urdf", "--json", "-")[1])["verdict"]["reasons"]
+    assert not any("few" in text for text in reasons)
+    write_columns(positions_only(tracker_columns(count - 1)))
+    (reason,) = parse_json(run(*command[:5], "-o", "less.urdf", "--json", "-")[1])["verdict"]["reasons"]
+    assert f"Measure at least {count} different poses." in reason
     for key in ("cross_validated_before", "cross_validated_after", "holdout_region_after"):
         assert document[key] is None
     # No figure on the screen that these data cannot support, and no robot that differs from the nominal one.

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
 from dhcal_pin.cli.main import main
-from dhcal_pin.io import measurement_text
+from dhcal_pin.io import measurement_text, read_measurement_file, read_servos
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, Position, Wires
 from dhcal_pin.robot import Chain, Payload, parse_urdf
 from dhcal_pin.robot.inverse_kinematics import wrap_into_limits
@@ -43,8 +43,36 @@ def test_a_wrong_unit_gives_one_warning(warnings_of, ur10, kind, units, expected
     declared = {name: pair[0] for name, pair in units.items()}
     wrong = {name: pair[1] for name, pair in units.items()}
     found = warnings_of(ur10, csv_text_of(ur10, joint_positions(ur10), kind=kind, wrong=wrong, **declared))
-    assert len([text for text in found if expected in text]) == len(found) > 0
-    assert len(found) <= (6 if expected.startswith("if the values are degrees") else 1)
+    assert len(found) == 1
+    assert expected in found[0]
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_counts_of_servos_under_another_unit_are_named(warnings_of, ur10, tmp_path, unit):
+    q = np.rint(np.random.default_rng(1).uniform(1000, 3000, (30, 6))) * 2 * np.pi / 4096 - np.pi
+    header, *rows = csv_text_of(ur10, q, kind="position", joint="rad").splitlines()
+    cells = np.array([row.split(",") for row in rows], float)
+    counts = np.rint((cells[:, :6] + np.pi) * 4096 / (2 * np.pi)).astype(int)
+    body = [
+        ",".join(map(repr, (*a, *b))) for a, b in zip(counts.tolist(), cells[:, 6:].tolist(), strict=True)
+    ]
+    written = header.replace("[rad]", f"[{unit}]")
+    (found,) = warnings_of(ur10, "\n".join([written, *body]))
+    first, *others = ur10.joint_names
+    assert (
+        f"whole numbers from 0 to 4095 look like counts of servos; if they are, write {first}[ticks]" in found
+    )
+    assert f"(also {', '.join(others[:-1])} and {others[-1]})" in found
+    assert f"[{unit}]" not in found
+    # The advice is followed.
+    (tmp_path / "servos.toml").write_text("".join(f"[motor.{name}]\n" for name in ur10.joint_names))
+    (tmp_path / "counts.csv").write_text("\n".join([header.replace("[rad]", "[ticks]"), *body]))
+    servos = read_servos(tmp_path / "servos.toml")
+    file = read_measurement_file(tmp_path / "counts.csv", ur10, servos=servos)
+    np.testing.assert_allclose(file.data.q, q, atol=1e-12)
+    # Numbers with decimals are no counts.
+    (found,) = warnings_of(ur10, "\n".join([written, *(row.replace(",", ".5,", 1) for row in body)]))
+    assert "check the values and the unit in the header" in found
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("m", 1e-3)])

@@ -117,13 +117,13 @@ def test_explanations_of_the_papers_robots_agree_with_theory(arm, kind, expected
 
 
 @pytest.mark.parametrize(("poses", "more"), [(2, 2), (3, 1)])
-def test_number_of_missing_poses_is_stated(poses, more):
+def test_too_few_equations_are_named(poses, more):
     """With Table 2 the ranks of 2, 3 and 4 poses are 12, 18 and 21, the largest possible."""
     chain = load("sim_6dof")
     texts = explain(problem(chain, "dh", m=poses))
     assert "only d2 + d3 + d4 can be identified" in texts[0]
     assert f"{6 * poses} equations for 24 parameters" in texts[-1]
-    assert f"measure at least {more} more pose" in texts[-1]
+    assert texts[-1].endswith("; measure more poses")
     assert rank(problem(chain, "dh", m=poses + more)) == 21
     assert rank(problem(chain, "dh", m=poses + more - 1)) < 21
 

@@ -42,8 +42,8 @@ ARGUMENTS: Options = {
     "--frame": {
         "choices": FRAMES,
         "default": BASE,
-        "help": "frame of the targets: base (base link of the robot, default) or measuring (measuring frame "
-        "of the calibration)",
+        "help": "frame of the targets: base (root link of the nominal robot, default) or measuring "
+        "(measuring frame of the calibration)",
     },
     "--tcp FRAME|FILE": "tool that reaches the targets: a link fixed to the tip, or a TOML file with xyz_m "
     "and rotvec_rad in the tip link (default: the tip; with --frame measuring the measured point)",
@@ -75,7 +75,7 @@ def run(args: Namespace) -> int:
     contents = {args.output: corrected_text(result, calibrated, targets, args.joint_units)}
     for path in args.export:
         contents[path] = program_text(_program(result, nominal), path)
-    frame = f"the root link {calibrated.urdf.root}" if args.frame == BASE else "the measuring frame"
+    frame = f"the root link {nominal.root}" if args.frame == BASE else "the measuring frame"
     notes = [f"{targets.source}: {text}" for text in _unstated_conditions(args, calibrated, targets)]
     warning = exchange_warning(args.nominal, args.calibrated, nominal, calibrated)
     write_with_json(
@@ -108,6 +108,9 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
 
     import numpy as np
 
+    from ... import se3
+    from ...compensation import nominal_root_pose
+
     nominal, calibrated = (read_robot_or_table(path, args) for path in (args.nominal, args.calibrated))
     if nominal.tip != calibrated.tip and args.tip is None:
         raise InvalidArgumentError(
@@ -116,7 +119,10 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
         )
     chains = nominal, calibrated
     if args.frame == BASE:
-        chains = tuple(replace(chain, base=np.eye(4), tool=np.eye(4)) for chain in chains)
+        bases = np.eye(4), se3.inverse(nominal_root_pose(nominal, calibrated))
+        chains = tuple(
+            replace(chain, base=base, tool=np.eye(4)) for chain, base in zip(chains, bases, strict=True)
+        )
     if args.tcp:
         is_link = args.tcp in calibrated.urdf.links
         if not is_link and not os.path.exists(args.tcp):

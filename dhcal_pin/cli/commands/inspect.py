@@ -1,4 +1,4 @@
-"""`dhcal inspect`: say what measurement files contain, without a fit."""
+"""`dhcal inspect`: say what measurement files, or a robot, contain."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ROBOT_REASONS = {
 }
 
 ARGUMENTS: Options = {
-    "data": DATA,
+    "data": {**DATA, "nargs": "*", "help": f"{DATA['help']}; without them, the robot is described"},
     "--robot": {**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"},
     **TABLE_OPTIONS,
     "--rig": RIG,
@@ -42,6 +42,8 @@ def run(args: Namespace) -> int:
     for path in args.data:
         if not args.robot and has_robot_ending(path):
             raise InvalidArgumentError(f"{path}: is a robot; state it with --robot {path}")
+    if not args.data and not args.robot:
+        raise InvalidArgumentError("DATA: expected measurement files, or a robot alone (--robot ROBOT)")
     for option, reason in _ROBOT_REASONS.items():
         if getattr(args, option) and not args.robot:
             raise InvalidArgumentError(f"--{option}: needs --robot, {reason}")
@@ -56,20 +58,29 @@ def run(args: Namespace) -> int:
     inspections = [
         diagnostics.inspect_file(path, chain, args.columns, rig, servos, args.sheet) for path in args.data
     ]
-    robot = None
+    robot, warnings = None, {}
     if chain is not None:
-        robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names)}
+        warnings = {args.robot: diagnostics.find_robot_warnings(chain)}
+        tips = list(chain.urdf.leaves())
+        robot = {"path": args.robot, "tip": chain.tip, "joints": list(chain.joint_names), "tips": tips}
     document = {
         "robot": robot,
         "files": [asdict(inspection) for inspection in inspections],
-        "warnings": [f"{one.path}: {text}" for one in inspections for text in one.warnings],
+        "warnings": [
+            f"{path}: {text}"
+            for path, texts in (*warnings.items(), *((one.path, one.warnings) for one in inspections))
+            for text in texts
+        ],
         "inputs": report.file_digests(inputs),
     }
     write_outputs({}, args.json, document)
+    if chain is not None and not inspections:
+        screens.show(screens.robot_screen(args.robot, chain, warnings), args.verbosity)
+        return 0
     about = ""
     if chain is not None:
         about = f"{os.path.basename(args.robot)}: tip {chain.tip}, {chain.n_joints} joints"
-    screens.show(screens.inspection_screen(about, inspections), args.verbosity)
+    screens.show(screens.inspection_screen(about, warnings, inspections), args.verbosity)
     return 0
 
 

@@ -12,6 +12,7 @@ from ... import diagnostics, io, report, session
 from ...exceptions import InvalidArgumentError
 from .. import options, screens
 from ..output_table import Makers, Output
+from ..servo_zeros import other_zeros_warning
 
 if TYPE_CHECKING:
     from ...robot import Chain
@@ -101,6 +102,9 @@ def run(args: Namespace) -> int:
         # Wrong units and the like change all parts of the robot at once.
         result = replace(result, verdict="cannot say", reasons=(_MISTAKE,), changes=())
     warnings = _with_fitted_rows(mistakes, files, io.read_fitted(sidecar))
+    if servos is not None:
+        are_fitted = any(warnings[file.source] != mistakes.get(file.source, []) for file in files)
+        warnings[args.servos] = other_zeros_warning(args.robot, servos, are_fitted)
     notes = [
         f"{file.source}: {text}"
         for file in files

@@ -98,8 +98,8 @@ def run(args: Namespace) -> int:
         contents[rig_path] = io.rig_text(data.rig.cameras, data.rig.boards)
     facts = {"samples": len(data.rows), "kind": args.kind, "noise": args.noise, "seed": args.seed}
     files: dict[str, str] = dict(zip(("output", "rig"), map(str, contents), strict=False))
-    write_with_json(contents, args.json, files, inputs, **facts)
-    screens.show(screens.files_screen(contents), args.verbosity)
+    write_with_json(contents, args.json, files, inputs, tip=nominal.tip, **facts)
+    screens.show(screens.simulation_screen(screens.robot_line(args.robot, nominal), contents), args.verbosity)
     return 0
 
 

@@ -10,6 +10,7 @@ from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
 from .. import options, screens
 from ..output_table import Makers, Output
+from ..servo_zeros import other_zeros_warning
 
 if TYPE_CHECKING:
     from ...measurements import MeasuredRegion, Measurement, MountedRig
@@ -57,6 +58,7 @@ class Given(NamedTuple):
     region: MeasuredRegion | None  # Measured region of the calibration
     predictor: estimation.Predictor | None  # Uncertainty of the robot, for maps
     calibrated_tip: str  # Link that the tool of the sidecar is on
+    servos: io.ServoFile | None
 
     @property
     def data(self) -> list[Measurement]:
@@ -179,7 +181,7 @@ def _read_input(args: Namespace, sidecar: str | None) -> Given:
     known = {name: value for name, value in instrument.items() if name in used}
     calibrated_tip = (sidecar and io.read_tip(sidecar)) or chain.tip
     region = io.read_measured_region(sidecar, chain) if sidecar and calibrated_tip == chain.tip else None
-    return Given(chain, files, known, rig, estimated, region, predictor, calibrated_tip)
+    return Given(chain, files, known, rig, estimated, region, predictor, calibrated_tip, servos)
 
 
 def _judge(args: Namespace, given: Given) -> Judged:
@@ -322,13 +324,18 @@ def _input_warnings(
     """List the warnings about each file, rows that the robot cannot reach included; no row is excluded."""
     fitted = io.read_fitted(sidecar) if sidecar else io.Fitted()
     digests = report.file_digests(args.data)
-    warnings = {}
+    warned = {
+        file.source: diagnostics.fitted_warning(file.data, digests.get(file.source, ""), fitted)
+        for file in given.files
+    }
+    are_fitted = any(warned.values())
+    warnings = {args.servos: other_zeros_warning(args.robot, given.servos, are_fitted)} if args.servos else {}
     for file in given.files:
         unreachable = [] if args.fit_frames else diagnostics.find_unreachable_rows(judged.chain, file)
         warnings[file.source] = [
             *diagnostics.find_input_warnings(judged.chain, file),
             *(f"line {item.row}: {item.reason}" for item in unreachable),
-            *diagnostics.fitted_warning(file.data, digests.get(file.source, ""), fitted),
+            *warned[file.source],
         ]
     if args.nominal and not sidecar and (other := io.existing_sidecar(args.nominal)):
         warnings[args.nominal] = [

@@ -20,6 +20,7 @@ from ...measurements.images.names import list_images
 from ...report.provenance import Provenance, short_names
 from ..job import Job
 from ..run_job import CalibrationOutcome
+from .result_screens import robot_line
 from .screen import Block, Screen, list_first, section_blocks
 
 # Number of corrections that are shown.
@@ -97,9 +98,6 @@ def verdict_blocks(verdict: Verdict, is_forced: bool) -> list[Block]:
 
 def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
     """Describe the robot, its tip and its joints, and what was estimated."""
-    first, *_, last = fit.chain.joint_names * 2
-    count = fit.chain.n_joints
-    joints = f"{count} joints from {first} to {last}" if count > 1 else f"joint {first}"
     supported, families = (fit.extension.supported, fit.extension.families) if fit.extension else ((), ())
     others = [name for name in families if name not in supported]
     added = f"; joint errors added: {', '.join(supported)}" if families else ""
@@ -107,7 +105,7 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
     if any(stage.name == "arm" and not stage.is_kept for stage in fit.camera_stages):
         sets, added = ",".join(split_sets(sets)[1]), "; the arm is kept"
     return [
-        f"{robot}: tip {fit.chain.tip}, {joints}",
+        robot_line(robot, fit.chain),
         f"estimated: {sets.replace(',', ', ')} ({len(fit.parameters)} parameters){added}",
     ]
 

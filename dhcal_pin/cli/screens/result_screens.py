@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,6 +56,18 @@ def warnings_block(warnings: Mapping[str, Sequence[str]]) -> Block:
 def files_block(paths: Iterable[object]) -> Block:
     """Describe the files that were written."""
     return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
+
+
+def robot_line(path: str, chain: Chain) -> str:
+    """Describe a robot by its tip and its joints."""
+    first, *_, last = chain.joint_names * 2
+    joints = f"{chain.n_joints} joints from {first} to {last}" if chain.n_joints > 1 else f"joint {first}"
+    return f"{path}: tip {chain.tip}, {joints}"
+
+
+def simulation_screen(robot: str, paths: Iterable[object]) -> Screen:
+    """Describe the robot that was measured in a simulation, and the files that were written."""
+    return Screen([Block([robot], rank=1), files_block(paths)])
 
 
 def files_screen(
@@ -166,13 +178,39 @@ def _bundled_accuracy(accuracy: Mapping[str, Any]) -> Table:
     return Table(["RMS error", "before", "after"], rows)
 
 
-def inspection_screen(robot: str, inspections: Sequence[FileInspection]) -> Screen:
-    """Describe what measurement files contain."""
-    first = Block([robot] if robot else [])
+def inspection_screen(
+    robot: str, warnings: Mapping[str, Sequence[str]], inspections: Sequence[FileInspection]
+) -> Screen:
+    """Describe what measurement files contain, after the robot and the warnings about it."""
+    first = [Block([robot] if robot else []), replace(warnings_block(warnings), is_verdict=True)]
     blocks = [block for inspection in inspections for block in _inspection_blocks(inspection)]
     if len(inspections) == 1:
-        return Screen([first, *blocks])
-    return Screen([first, *_overview(inspections)], lambda: blocks)
+        return Screen([*first, *blocks])
+    return Screen([*first, *_overview(inspections)], lambda: blocks)
+
+
+def robot_screen(path: str, chain: Chain, warnings: Mapping[str, Sequence[str]]) -> Screen:
+    """Describe a robot: the joints to its tip, and the links that can be chosen as a tip."""
+    rows = []
+    for j, name in enumerate(chain.joint_names):
+        factor, unit = (1e3, "mm") if chain.is_prismatic[j] else (180 / np.pi, "deg")
+        ends = float(chain.lower[j]), float(chain.upper[j])
+        limits = [f"{factor * end:.6g}" if np.isfinite(end) else "–" for end in ends]
+        rows.append([name, chain.urdf.joint(name).type, unit, *limits])
+    tips = []
+    for link in chain.urdf.leaves():
+        count = sum(joint.type != "fixed" for joint in chain.urdf.path(link))
+        tips.append(f"  {link}, {format_count(count, 'joint')}{' (chosen)' * (link == chain.tip)}")
+    joints = Table(["joint", "type", "unit", "lower", "upper"], rows, n_text_columns=3)
+    title = "Tips (--tip), or any other link behind a joint:"
+    return Screen(
+        [
+            Block([robot_line(path, chain)], is_verdict=True),
+            replace(warnings_block(warnings), is_verdict=True),
+            Block(joints, noun="joint", rank=1),
+            Block(tips, title=title, noun="tip", rank=0, n_kept=5),
+        ]
+    )
 
 
 def _overview(inspections: Sequence[FileInspection]) -> list[Block]:
@@ -222,7 +260,7 @@ def _inspection_blocks(inspection: FileInspection) -> list[Block]:
         reasons = [f"  line {line}: {reason}" for line, reason in bad.items()]
     warnings = [f"warning: {text}" for text in inspection.warnings]
     problems = [f"problem: {inspection.problem}"] if inspection.problem else []
-    is_good = not (bad or warnings or problems or inspection.column_map)
+    is_good = not (bad or warnings or problems or inspection.column_map or inspection.notes)
     verdict = ["No problems found."] if is_good and inspection.configurations is not None else []
     return [
         Block([_inspection_title(inspection)], "bold", is_verdict=True, has_space=True),

@@ -12,7 +12,7 @@ themselves has a default:
 
     [joints]               # joints of the robot from base to tip, or those in `names`
     order = ["A1", "A2"]   # header or number of each joint's column
-    unit = "deg"           # or one unit per joint, such as ["deg", "mm"]
+    unit = "deg"           # or one unit per joint, such as ["deg", "mm"]; "ticks" for counts of servos
     sign = [1, -1]         # optional
     offset = [0.0, 90.0]   # optional, in that unit: joint = sign * column + offset
 
@@ -53,6 +53,7 @@ from .. import toml_table as toml
 from ..tables import SEPARATORS, TextLayout
 from ..toml_table import Key, TomlTable
 from .columns import ROTVEC, SECOND_PREFIX, column_contents, known_columns, unknown_column_error
+from .counts import TICKS
 
 # Placeholders in a constant, each written in braces.
 PATH_PARTS = ("file", "stem", "parent")
@@ -213,7 +214,7 @@ def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str,
         if not toml.is_number(offset):
             raise table.error("offset", f"{quote(offset)} is not a number")
     return [
-        _rule(table, str(name), contents, source, unit, float(sign), float(offset))
+        _rule(table, str(name), contents, (TICKS,), source, unit, float(sign), float(offset))
         for name, source, unit, sign, offset in zip(
             values["names"], values["order"], units, signs, offsets, strict=True
         )
@@ -225,7 +226,7 @@ def _column_rules(table: TomlTable, contents: Mapping[str, str]) -> list[ColumnR
     for name in table.keys():
         entry = table.table(name)
         source, unit, scale, offset = entry.values(COLUMN_KEYS).values()
-        rules.append(_rule(entry, name, contents, source, unit, scale, offset))
+        rules.append(_rule(entry, name, contents, (), source, unit, scale, offset))
     return rules
 
 
@@ -233,6 +234,7 @@ def _rule(
     table: TomlTable,
     name: str,
     contents: Mapping[str, str],
+    more_units: Sequence[str],
     source: Any,
     unit: Any,
     scale: float,
@@ -241,7 +243,7 @@ def _rule(
     """Build the rule of a column of the project."""
     # Unknown names of columns are reported by `read_map`.
     content = contents.get(name, "")
-    units = UNITS.get(content, {})
+    units = [*UNITS.get(content, {}), *more_units]
     if not isinstance(unit, str):
         raise FileFormatError(f"{table.where}: {name}: unit {quote(unit)}; expected a text in quotes")
     if content and (units or unit) and unit not in units:

@@ -175,7 +175,9 @@ def with_known_spelling(table: DataTable, chain: Chain | None) -> DataTable:
         is_only = len(known) == names.count(name.lower()) == 1
         if is_only and name != known[0] and column.unit in UNITS[contents[known[0]]]:
             headers[column.index] = column_header(known[0], column.unit)
-    return replace(table, headers=tuple(headers)) if headers != [*table.headers] else table
+    if headers == [*table.headers]:
+        return table
+    return replace(table, headers=tuple(headers), file_headers=table.written_headers)
 
 
 def is_in_order(table: DataTable) -> bool:

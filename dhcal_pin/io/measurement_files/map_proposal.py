@@ -32,6 +32,7 @@ from .columns import (
     has_titles,
     joint_units,
 )
+from .counts import TICKS
 
 # Joint positions beyond this are degrees [rad]; lengths beyond this are millimetres [m].
 _MAX_RADIANS, _MAX_METRES = 2 * np.pi + 0.1, 20.0
@@ -280,7 +281,7 @@ def header_problem(table: DataTable, chain: Chain) -> str:
         return (
             f"{where}: {join_names([*map(quote, angles)])} are Euler angles without their axes; remove them"
         )
-    headers = [quote(header) for header in table.headers if header]
+    headers = [quote(header) for header in table.written_headers if header]
     n_more = len(headers) - _MAX_LISTED_NAMES
     listed = ", ".join(headers[:_MAX_LISTED_NAMES]) + (f" and {n_more} more" if n_more > 0 else "")
     expected = f"a joint of this robot ({', '.join(chain.joint_names)})"
@@ -339,10 +340,10 @@ def _are_quaternions(values: Array) -> bool:
 
 def _unit(table: DataTable, index: int, values: Array, *, is_length: bool) -> str:
     """Return the unit that a header names, or that the size of the numbers (…, m) suggests."""
-    header = "" if table.has_numbers_as_header else table.headers[index].lower()
+    header = "" if table.has_numbers_as_header else table.written_headers[index].lower()
     written = re.search(r"\[(\w+)\]", header)
     for text in (written[1] if written else "", table.units[index] if table.units else ""):
-        if text in (LENGTHS if is_length else ANGLES):
+        if text in (LENGTHS if is_length else (*ANGLES, TICKS)):
             return text
     for unit in ("mm", "m") if is_length else ("deg", "rad"):
         if re.search(_HEADER_UNITS[unit], header):
@@ -360,6 +361,6 @@ def _names(table: DataTable, indices: Sequence[int]) -> str:
 
 def _name(table: DataTable, index: int) -> str:
     """Return how a map names a column: by its number without a header, otherwise by its header."""
-    header = table.headers[index]
-    is_name = bool(header) and table.headers.count(header) == 1 and not table.has_numbers_as_header
+    header = table.written_headers[index]
+    is_name = bool(header) and table.written_headers.count(header) == 1 and not table.has_numbers_as_header
     return json.dumps(header, ensure_ascii=False) if is_name else str(index + 1)

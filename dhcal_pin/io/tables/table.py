@@ -94,6 +94,7 @@ class DataTable:
     units: tuple[str, ...] = ()  # Cells of the row of units under the header; empty if there is none
     header_example: str = MEASUREMENT_HEADER  # Header that is expected, for messages
     euler_angles: EulerAngles | None = None  # Angles that columns of rotation vectors were computed from
+    file_headers: tuple[str, ...] = ()  # Header cells of the file if `headers` differ from them
     # Function that reads the table below lines of titles; None if the first line looks like the header.
     read_below_titles: Callable[[], DataTable] | None = None
 
@@ -115,6 +116,11 @@ class DataTable:
         except DhcalError as error:
             error.args = ("; ".join([str(error), *self.notes]),)
             raise
+
+    @property
+    def written_headers(self) -> tuple[str, ...]:
+        """Header cells as the file has them."""
+        return self.file_headers or self.headers
 
     @property
     def header_location(self) -> str:

@@ -9,6 +9,8 @@ What the layout of a file does not state is detected from its lines:
 
 Lines are split one by one, so that an unbalanced quote does not extend over the following lines. A row with
 another number of cells than the header is a bad row; empty cells at the end of a row do not count.
+
+Files are UTF-8. Only comments may be in the encoding of Windows, as no number and no name depends on them.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import csv
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -28,7 +30,7 @@ import numpy as np
 from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
-from ..tabular import MAX_TABLE_BYTES, parse_number, read_text
+from ..tabular import MAX_TABLE_BYTES, decode_text, parse_number, read_limited_bytes
 from .table import (
     GROUPED_NUMBERS,
     MEASUREMENT_HEADER,
@@ -80,11 +82,39 @@ class TextLayout:
 
 # Layout of a file of which nothing is known.
 DETECTED = TextLayout()
+# Encoding of Windows in Western Europe and America.
+_WINDOWS = "cp1252"
+# All positions at which `str.splitlines` divides text of ASCII characters.
+_LINE_STARTS = re.compile(rb"(?<=[\n\r\x0b\x0c\x1c-\x1e])")
+
+
+def _decode(path: PathLike, data: bytes, layout: TextLayout) -> str:
+    """Decode a text file; comments that are not UTF-8 are taken for the encoding of Windows."""
+    try:
+        return decode_text(path, data, layout.encoding)
+    except FileFormatError:
+        if not layout.comment or b"\0" in data or layout.encoding != DETECTED.encoding:
+            raise
+    return decode_text(path, b"".join(_comments_in_utf8(data, layout.comment.encode())), layout.encoding)
+
+
+def _comments_in_utf8(data: bytes, sign: bytes) -> Iterator[bytes]:
+    """Yield the lines of a file with the comments in UTF-8."""
+    for line in _LINE_STARTS.split(data):
+        if not line.lstrip().startswith(sign):
+            yield line
+            continue
+        try:
+            line.decode()
+            yield line
+        except UnicodeDecodeError:
+            yield line.decode(_WINDOWS, "replace").encode()
 
 
 def read_text_table(path: PathLike, layout: TextLayout) -> DataTable:
     """Read a table from a text file."""
-    source, text = os.fspath(path), read_text(path, layout.encoding, MAX_TABLE_BYTES)
+    source, data = os.fspath(path), read_limited_bytes(path, MAX_TABLE_BYTES)
+    text = _decode(path, data, layout)
     # The other lines are the header and comments.
     sign = layout.comment
     n_comments = text.startswith(sign) + text.count(f"\n{sign}") if sign else 0

@@ -252,6 +252,24 @@ def test_tables_that_are_too_large(tmp_path, monkeypatch, text, words):
         read_table(write(tmp_path, "a.csv", text))
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_only_comments_may_be_in_the_encoding_of_windows(tmp_path, end):
+    path = tmp_path / "a.csv"
+    lines = ["# Müller, 20 °C", "punkt,größe[mm]", "ä,1.5", " # café", "ö,2.5", ""]
+    comments = [line.encode("cp1252" if "#" in line else "utf-8") for line in lines]
+    path.write_bytes(end.join(comments))
+    table = read_table(path)
+    assert table.comments == ("Müller, 20 °C", "café")
+    assert table.headers == ("punkt", "größe[mm]")
+    assert [row[0] for row in table.cells] == ["ä", "ö"]
+    assert list(table.lines) == [3, 5]
+    for i in (1, 2):
+        wrong = [*comments[:i], lines[i].encode("cp1252"), *comments[i + 1 :]]
+        path.write_bytes(end.join(wrong))
+        with pytest.raises(DhcalError, match="is not UTF-8; save the file as UTF-8"):
+            read_table(path)
+
+
 def test_comments_are_no_rows(tmp_path, monkeypatch):
     """A table of as many rows as are read at the most, as `simulate` writes it."""
     monkeypatch.setattr(tables, "MAX_ROWS", 200)
