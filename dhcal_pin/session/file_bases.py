@@ -29,7 +29,9 @@ def place_files(problem: Problem, timeline: Timeline) -> tuple[Problem, Motion] 
     """Fit base and tool to each file by itself; None with one file, and if no base turned far."""
     # The problem gets the base and the tool of the last file, and the base moves where a file begins.
     parts: dict[int, list[int]] = {}
-    for i, numbers in enumerate(timeline.numbers[: timeline.n_fitted]):
+    of_robot = [i for i in range(timeline.n_fitted) if (timeline.numbers[i] >= timeline.begin).all()]
+    for i in of_robot:
+        numbers = timeline.numbers[i]
         of_file = np.unique(np.searchsorted(timeline.file_starts, numbers, side="right"))
         if len(of_file) != 1:
             return None
