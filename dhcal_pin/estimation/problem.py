@@ -150,7 +150,7 @@ class Problem:
     def shown(self) -> Problem:
         """The problem whose rows show what was measured: without motions of base and tool beside contacts."""
         # A motion that was estimated from contacts is no length: it grows with the robot, as their misses do.
-        data = [unmoved(item) for item in self.data] if self.scale_gauge else self.data
+        data = [_unmoved(item) for item in self.data] if self.scale_gauge else self.data
         is_same = all(new is old for new, old in zip(data, self.data, strict=True))
         return self if is_same else self.with_data(data)
 
@@ -334,11 +334,11 @@ class Linearization:
             for group in data.residual_groups.values():
                 if group.unit == "m":  # the size of a robot does not change angles
                     rows = block[:, group.rows]
-                    normalize_by_scale(rows, rows[-1], self.arm_scale, self.gauge_rates, group is POSITION)
+                    normalize_by_scale(rows, self.arm_scale, self.gauge_rates, group is POSITION)
         return observation
 
 
-def unmoved(item: Measurement) -> Measurement:
+def _unmoved(item: Measurement) -> Measurement:
     """Return samples without a length as if base and tool had not moved, others as they are."""
     known = item.recorded
     if item.has_length_scale or known is None or (known.base_motion is None and known.tool_motion is None):

@@ -88,10 +88,10 @@ def _rms_radius(offsets: Array) -> float:
     return float(np.sqrt(np.vdot(offsets, offsets) / _N_SAMPLES))
 
 
-def normalize_by_scale(block: Array, misses: Array, size: float, rates: Array, are_vectors: bool) -> None:
-    """Make whitened rows of lengths, with these misses, invariant to size and orientation of the robot."""
-    misses = misses / size
+def normalize_by_scale(block: Array, size: float, rates: Array, are_vectors: bool) -> None:
+    """Make whitened rows of lengths invariant to the size and the orientation of the robot."""
     block /= size
-    block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * misses
+    residual = block[-1]
+    block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * residual
     if are_vectors:
-        block[: len(rates)] += np.cross(rates[:, 1:, None], misses[None], axis=1)
+        block[: len(rates)] += np.cross(rates[:, 1:, None], residual[None], axis=1)

@@ -19,9 +19,9 @@ from .._frozen import frozen
 from .._kernels import apply_observation_matrix
 from .._typing import Array
 from ..estimation.parameters import base, tool
-from ..estimation.problem import Problem, unmoved
+from ..estimation.problem import Problem
 from ..estimation.scale_gauge import normalize_by_scale
-from ..measurements.base import Measurement, instrument_values, residual_of
+from ..measurements.base import Measurement, instrument_values
 from ..measurements.groups import POSITION
 from ..robot.error_families import COMPLIANCE, JOINT_TERMS, MIN_TORQUE, growing_links
 from .causes import HELD_SIZE, Block
@@ -199,13 +199,9 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
             if parameter.name in instrument_columns:
                 block[instrument_columns[parameter.name]] = part
         if gauge and not item.has_length_scale:
-            # Motions of base and tool grow with the robot.
-            still = unmoved(item)
-            misses = residual if still is item else residual_of(still, chain, values)
             for group in item.residual_groups.values():
                 if group.unit == "m":  # the size of a robot does not change angles
-                    rows = block[:, group.rows]
-                    normalize_by_scale(rows, misses[group.rows], size, gauge_rates, group is POSITION)
+                    normalize_by_scale(block[:, group.rows], size, gauge_rates, group is POSITION)
     out[layout.lag] = np.einsum("nkm,mn->km", out[layout.joints], rates)
     return np.ascontiguousarray(out.transpose(2, 1, 0))
 

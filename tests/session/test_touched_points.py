@@ -82,13 +82,16 @@ def test_nothing_is_found_in_clean_touches(arm, count, n_points, visit, joints):
     assert not session_of(fit).found
 
 
-@pytest.mark.parametrize("plate", some_slow((0.0, 1e-3, 0.05), (0, 2)))
-def test_the_motion_of_a_plate_is_no_length(plate):
-    """A plate moved by 50 mm showed the size of the robot: 0.2 mm was stated, and 2 mm was true."""
+MOTIONS = [Changes(), *(Changes("base", size, size) for size in (1e-3, 0.01, 0.05)), Changes("tool", 1e-3)]
+
+
+@pytest.mark.parametrize("changes", some_slow(MOTIONS, (0, 3)))
+def test_a_motion_among_touches_is_no_length(changes):
+    """A base that moved by 50 mm showed the size of the robot: 0.2 mm was stated, and 2 mm was true."""
     simulation = Simulation("ur5", 80, 702)
-    contacts, distances = simulation.measure_contacts(Changes(), 5, plate=plate)
+    contacts, distances = simulation.measure_contacts(changes, 5)
     fit = calibrate(simulation.chain, [contacts], SETS)
-    assert [event.kind for event in session_of(fit).events] == ["base"] * bool(plate)
+    assert [event.kind for event in session_of(fit).events] == [changes.of] * bool(changes.of)
     assert simulation.true_error(fit.chain) < 3 * fit.position_std
     advice = "Add a known distance between contact points."
     assert any(advice in reason for reason in fit.verdict.reasons)
