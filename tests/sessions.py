@@ -229,7 +229,7 @@ class Simulation:
             return np.array([(base * pose * tool).translation for pose in self.poses(q + zeros)])
 
         for _ in range(200):
-            q = self.rng.uniform(low, high)
+            q, error = self.rng.uniform(low, high), np.full(3, np.inf)
             for _ in range(60):
                 at, *moved = points(np.vstack([q, q + step * np.eye(len(q))]))
                 error = at - target

@@ -632,8 +632,8 @@ class _Search:
         prior = self._prior([*others, cause])
         count = len(rows) - self.begin
         length = min(count / N_BLOCKS, count * self._concerned(cause) / MIN_BLOCKS)
-        blocks = np.split(stack, [self.begin])
-        inside, predicted = _predicted_gain(*blocks, len(prior) - len(cause.values), prior, length)
+        timeless, timed = stack[: self.begin], stack[self.begin :]
+        inside, predicted = _predicted_gain(timeless, timed, len(prior) - len(cause.values), prior, length)
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
