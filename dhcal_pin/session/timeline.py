@@ -71,7 +71,7 @@ class Timeline:
         return all(isinstance(item, PointContact) for item in self.of_robot)
 
     def touched_points(self, number: int | None) -> list[str]:
-        """Return the names of the touched points, of those touched before and after a step if it is given."""
+        """Return the names of the touched points, of those on both sides of a step if there are any."""
         touches: dict[str, list[Array]] = {}
         for item, numbers in zip(self.data, self.numbers, strict=True):
             for i, name in enumerate(item.names if isinstance(item, PointContact) else ()):
@@ -79,7 +79,8 @@ class Timeline:
         if number is None:
             return list(touches)
         sides = {name: np.concatenate(parts) < number for name, parts in touches.items()}
-        return [name for name, is_before in sides.items() if is_before.any() and not is_before.all()]
+        shown = [name for name, is_before in sides.items() if is_before.any() and not is_before.all()]
+        return shown or list(touches)
 
     @cached_property
     def _counted(self) -> Array:

@@ -113,6 +113,14 @@ def test_the_stated_motion_is_that_of_the_points_touched_before_and_after_it():
     assert event.size == pytest.approx(1e-3, abs=1e-4)
 
 
+def test_points_are_those_touched_before_and_after_a_step():
+    _, data = touches_of("ur5", 30, 3, 10)
+    timeline = order_samples(data, ())
+    # Three distances precede the touches.
+    assert timeline.touched_points(3 + 15) == ["p2"]
+    assert timeline.touched_points(3 + 10) == timeline.touched_points(None) == ["p1", "p2", "p3"]
+
+
 def test_distances_have_no_time():
     _, (contacts, distances) = touches_of("ur5", 30, 4, 1)
     assert can_have_session([contacts, distances])
