@@ -15,7 +15,15 @@ from robots import ARMS, nominal_arm, robot_file
 from scipy.interpolate import CubicSpline
 
 from dhcal_pin.calibration import Result
-from dhcal_pin.measurements import Measurement, MultiTargetPosition, Pose, Position, Wires
+from dhcal_pin.measurements import (
+    Measurement,
+    MultiTargetPosition,
+    PointContact,
+    PointDistance,
+    Pose,
+    Position,
+    Wires,
+)
 from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
 from dhcal_pin.session import Session
@@ -109,6 +117,15 @@ class Simulation:
 
         self.poses = with_errors
 
+    def add_compliance(self, size: float) -> None:
+        """Turn each joint by a compliance [rad/Nm] times its gravity torque."""
+        poses = self.poses
+
+        def bent(q: np.ndarray, model: pin.Model | None = None) -> list[pin.SE3]:
+            return poses(q - size * self.torques(q, np.zeros(len(q))), model)
+
+        self.poses = bent
+
     def direction(self) -> np.ndarray:
         """Draw a unit vector."""
         vector = self.rng.normal(size=3)
@@ -169,6 +186,61 @@ class Simulation:
         points += self.rng.normal(0, NOISE, points.shape)
         labels = ["a", "b", "c"] * self.count
         return MultiTargetPosition(np.repeat(self.q, 3, 0), points.reshape(-1, 3), labels)
+
+    def measure_contacts(
+        self, changes: Changes | None = None, n_points: int = 4, visit: int = 1, plate: float = 0.0
+    ) -> tuple[PointContact, PointDistance]:
+        """Return touches of points and the distances of all pairs of them.
+
+        The arm touches each point several times in a row, then the next one, and begins again. Base or tool
+        or the touched points move by `changes`; the latter, by a length `plate`, in the opposite direction.
+        """
+        changes = changes or Changes()
+        f = changes.shape(np.arange(self.count) / (self.count - 1))
+        along, about = self.direction(), self.direction()
+        zeros = np.zeros_like(self.q)
+        if changes.joint is not None:
+            zeros[:, changes.joint[0]] = changes.joint[1] * f
+        points = np.array(
+            [(self.base * pose * self.tool).translation for pose in self.poses(self.q[:n_points])]
+        )
+        label = np.arange(self.count) // visit % n_points
+        q = np.empty_like(self.q)
+        for i in range(self.count):
+            moved = _motion(changes.length * f[i] * along, changes.angle * f[i] * about)
+            tool = self.tool * moved if changes.of == "tool" else self.tool
+            base = self.base * moved if changes.of == "base" else self.base
+            target = points[label[i]] + plate * f[i] * along + self.rng.normal(0, NOISE, 3)
+            q[i] = self._touching(target, base, tool, zeros[i])
+        self.end_model, self.end_zeros = self.model, zeros[-1]
+        pairs = [(i, j) for i in range(n_points) for j in range(i + 1, n_points)]
+        distances = [np.linalg.norm(points[i] - points[j]) for i, j in pairs]
+        distances += self.rng.normal(0, NOISE / 2, len(pairs))
+        names = [(f"p{i + 1}", f"p{j + 1}") for i, j in pairs]
+        contacts = PointContact(q, [f"p{i + 1}" for i in label])
+        return contacts, PointDistance(q.shape[1], names, distances)
+
+    def _touching(self, target: np.ndarray, base: pin.SE3, tool: pin.SE3, zeros: np.ndarray) -> np.ndarray:
+        """Return joint values within the limits with which the tool point is at a target."""
+        low, high = np.maximum(self.chain.lower, -2.8), np.minimum(self.chain.upper, 2.8)
+        step = 1e-6
+
+        def points(q: np.ndarray) -> np.ndarray:
+            return np.array([(base * pose * tool).translation for pose in self.poses(q + zeros)])
+
+        for _ in range(200):
+            q, error = self.rng.uniform(low, high), np.full(3, np.inf)
+            for _ in range(60):
+                at, *moved = points(np.vstack([q, q + step * np.eye(len(q))]))
+                error = at - target
+                if np.linalg.norm(error) < 1e-9:
+                    break
+                jacobian = (np.array(moved) - at).T / step
+                move = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-6 * np.eye(3), error)
+                q = q - move * min(1.0, 0.5 / np.abs(move).max())
+            if np.linalg.norm(error) < 1e-9 and np.all((q >= low) & (q <= high)):
+                return q
+        raise AssertionError("no configuration touches the point")
 
     def _grown(self, growth: float) -> pin.Model:
         """Return the arm with longer links."""

@@ -220,17 +220,25 @@ class FittedModel:
         return sum(len(item.rows) for item in self.inliers)
 
     @cached_property
+    def _shown_system(self) -> TriangularSystem:
+        """Triangular system of what was measured; the uncertainty follows from it, see `Problem.shown`."""
+        problem = self.problem.shown
+        if problem is self.problem:
+            return self.solution.system
+        return linearize_and_factor(problem, self.solution.x, small_angle=False)
+
+    @cached_property
     def _system_at_x(self) -> TriangularSystem:
         """Triangular system of the data at x. Even a small last step rotates the null space."""
-        system = self.solution.system
+        system = self._shown_system
         if isinstance(system, UnfactoredSystem) and np.array_equal(system.x, self.x):
             return system
-        return linearize_and_factor(self.problem, self.x, small_angle=False)
+        return linearize_and_factor(self.problem.shown, self.x, small_angle=False)
 
     @cached_property
     def rank(self) -> int:
         """Number of observable directions in parameter space, without priors."""
-        return self.solution.system.rank
+        return self._shown_system.rank
 
     @property
     def condition(self) -> float:
@@ -263,7 +271,7 @@ class FittedModel:
     def degrees_of_freedom(self) -> float:
         """Number of weighted rows minus the effective number of parameters that the data determine."""
         count = sum(n_rows for _, _, n_rows in self._row_counts)
-        freedom = count - self.solution.system.predicted_variance(self._sqrt_covariance[0])
+        freedom = count - self._shown_system.predicted_variance(self._sqrt_covariance[0])
         return freedom if freedom > MIN_FREEDOM_RATIO * count else 0.0
 
     @cached_property
@@ -342,12 +350,12 @@ class FittedModel:
     @cached_property
     def _sqrt_covariance(self) -> tuple[Array, Array]:
         """Square root of the covariance (p, r) and unbounded directions (p, h), with sigmas as fitted."""
-        return self.solution.system.sqrt_covariance(self.problem.weights)
+        return self._shown_system.sqrt_covariance(self.problem.weights)
 
     @cached_property
     def _scaled_sqrt_covariance(self) -> tuple[Array, Array]:
         """As `_sqrt_covariance`, with the sigmas scaled and the error of shrinkage as a further column."""
-        root, unbounded = self._scaled_root(self.solution.system, self.problem.weights)
+        root, unbounded = self._scaled_root(self._shown_system, self.problem.weights)
         # The part of the correction that was not applied is an error of its own.
         not_applied = (self.solution.x - self.x)[:, None]
         return (np.concatenate([root, not_applied], 1) if self.shrinkage_factor < 1 else root), unbounded
@@ -356,7 +364,7 @@ class FittedModel:
         """Return the square root of the covariance with a system and priors, and unbounded directions."""
         scale = self._sigma_scale
         if np.isnan(scale) or scale == 1:
-            is_own = system is self.solution.system
+            is_own = system is self._shown_system
             root, unbounded = self._sqrt_covariance if is_own else system.sqrt_covariance(weights)
             root = root * scale
         else:
@@ -433,7 +441,7 @@ class FittedModel:
         same[:robot] = errors.priors[:, None] * imitated.of_parameters(errors, errors.priors)[0]
         # Priors that grew with the measurements contain these errors already.
         weights = np.append(self.problem.weights, [self._prior_weight_like(p) for p in alone.parameters])
-        rows = self.solution.system.rows
+        rows = self._shown_system.rows
         columns = np.concatenate([rows[:, :-1], rows[:, :-1] @ same, rows[:, -1:]], 1)
         system = TriangularSystem(merge_r_factors([columns, np.zeros((count, columns.shape[1]))]))
         parts = (part[:n] + same @ part[n:] for part in self._scaled_root(system, weights))
@@ -556,7 +564,7 @@ class FittedModel:
     @property
     def observable_fraction(self) -> Array:
         """Fraction of each parameter that lies in the observable directions, (p,), 0 to 1."""
-        return observability.observable_fraction(self.solution.system)
+        return observability.observable_fraction(self._shown_system)
 
     @property
     def parameters(self) -> tuple[ErrorParameter | InstrumentParameter, ...]:

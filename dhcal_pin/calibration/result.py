@@ -46,19 +46,19 @@ class Result(Evidence, ResultPlots):
     @cached_property
     def unobservable(self) -> list[str]:
         """One sentence per group of parameters that the data cannot distinguish, with the reason."""
-        return explanations.explain_unobservable(self._probe, self.solution.system)
+        return explanations.explain_unobservable(self._probe, self._shown_system)
 
     @cached_property
     def weakly_observable(self) -> list[str]:
         """One sentence per group of parameters that are hardly better known than before the measurement."""
         return explanations.explain_weakly_observable(
-            self._probe, self.solution.system, self.prior_std, self._sigma_scale
+            self._probe, self._shown_system, self.prior_std, self._sigma_scale
         )
 
     @cached_property
     def _probe(self) -> ObservabilityProbe:
         known_r = self._system_at_x.r if self.rank < len(self.x) else None
-        return ObservabilityProbe(self.problem, self.x, known_r)
+        return ObservabilityProbe(self.problem.shown, self.x, known_r)
 
     @cached_property
     def verdict(self) -> Verdict:

@@ -300,9 +300,8 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
     # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
     # families that the measurements support without the changes.
     changes = [cause for cause in session.causes if not cause.block.is_constant]
-    numbers = session.timeline.fitted_numbers
-    shares = [np.mean(numbers < c.shape.number) for c in changes if isinstance(c.shape, Step)]
-    share = float(min([1.0, *(min(each, 1 - each) for each in shares)]))
+    timeline = session.timeline
+    share = min([1.0, *(timeline.shorter_side(c.shape.number) for c in changes if isinstance(c.shape, Step))])
     # Half of the samples on the shorter side of a step have larger residuals.
     sizes = [_sizes(residuals_of(each), 1 - share / 2) for each in (without, fit)]
     if max(np.max(a / b) for a, b in zip(*sizes, strict=True)) > MIN_GROSS_RATIO:

@@ -677,7 +677,7 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
     """Advise caution if residuals do not show the errors of positions, and state their predicted size."""
     if not (fit.errors.has_arm and fit.shrinkage_factor):
         return []
-    unknown = explain_unknown_size(ObservabilityProbe(fit.problem, fit.x))
+    unknown = explain_unknown_size(ObservabilityProbe(fit.problem.shown, fit.x))
     std, shown = fit.position_std, _shown_position_error(fit)
     if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
         return []

@@ -146,6 +146,14 @@ class Problem:
             self.errors.chain, np.concatenate([item.q for item in scale_free])
         )
 
+    @cached_property
+    def shown(self) -> Problem:
+        """The problem whose rows show what was measured: without motions of base and tool beside contacts."""
+        # A motion that was estimated from contacts is no length: it grows with the robot, as their misses do.
+        data = [_unmoved(item) for item in self.data] if self.scale_gauge else self.data
+        is_same = all(new is old for new, old in zip(data, self.data, strict=True))
+        return self if is_same else self.with_data(data)
+
     def with_data(self, data: Sequence[Measurement]) -> Problem:
         """Return the problem with other samples or standard deviations of the same measurements."""
         out = replace(self, data=tuple(data))
@@ -328,6 +336,14 @@ class Linearization:
                     rows = block[:, group.rows]
                     normalize_by_scale(rows, self.arm_scale, self.gauge_rates, group is POSITION)
         return observation
+
+
+def _unmoved(item: Measurement) -> Measurement:
+    """Return samples without a length as if base and tool had not moved, others as they are."""
+    known = item.recorded
+    if item.has_length_scale or known is None or (known.base_motion is None and known.tool_motion is None):
+        return item
+    return item.replace(recorded=known.of_arm)
 
 
 @frozen(eq=False)

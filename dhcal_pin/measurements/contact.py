@@ -54,6 +54,7 @@ class PointContact(PointMeasurement):
 
     kind = "point"
     is_contact = True
+    shows_changes = True
     has_length_scale = False
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = text_column("points", "point") + length_columns("", "x", "y", "z", is_implied=True)

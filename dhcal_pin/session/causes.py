@@ -46,6 +46,8 @@ class Block:
     is_constant: bool = False  # Whether it is the same for all samples
     # Point whose motion is stated, in the frame of base or tool, (3,) [m].
     origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    # Touched points in the frame of the base, (k, 3) [m], whose motion is stated in place of that of a point.
+    touched: Array | None = None
 
     @property
     def levers(self) -> Array:

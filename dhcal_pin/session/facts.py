@@ -25,8 +25,8 @@ MIN_ANGLE_RATIO = 10.0
 MAX_SCALE_CHANGE = 0.5
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
-# Sentence about a zero that a motion of the base imitates.
-_LIKE_BASE = " A motion of the base has the same effect."
+# What a robot touches: its motion has the effect of one of the base.
+TOUCHED = "touched object"
 
 
 @frozen
@@ -40,7 +40,7 @@ class Event:
     size: float  # Size of the change, in `unit`
     std: float  # Standard deviation of the size
     unit: str  # "m" or "rad"
-    is_like_base: bool = False  # Whether a motion of the base has the same effect
+    rivals: tuple[str, ...] = ()  # Parts whose motion has the same effect
 
     def to_dict(self) -> dict[str, Any]:
         """Return the event for the JSON document."""
@@ -87,14 +87,15 @@ class Event:
         if self.kind == "robot":
             return "Calibrate each robot by itself."
         if self.kind == "joint":
-            return "The result is the arm after the change." + _LIKE_BASE * self.is_like_base
+            return "The result is the arm after the change." + _same_effect(self.rivals)
         if self.kind == "payload":
             return (
                 "The result is the arm with the load after the change. State the mass at the tip in each "
                 "row, in a column payload[kg]."
             )
         pose = f"{self.of or self.kind} pose"
-        return f"Both parts were fitted with their own {pose}; the result has that of the later part."
+        fitted = f"Both parts were fitted with their own {pose}; the result has that of the later part."
+        return fitted + _same_effect(self.rivals)
 
 
 @frozen
@@ -109,7 +110,7 @@ class SlowChange:
     shape: str  # "linear", "exponential" or "free"
     time_constant: float | None  # Time constant of an exponential; else None
     time_unit: str  # "row", "image" or "s"
-    is_like_base: bool = False  # Whether a motion of the base has the same effect
+    rivals: tuple[str, ...] = ()  # Parts whose motion has the same effect
 
     def to_dict(self) -> dict[str, Any]:
         """Return the drift for the JSON document."""
@@ -135,8 +136,8 @@ class SlowChange:
     def consequence(self) -> str:
         """What the calibration did."""
         if self.kind in ("base", "tool"):
-            return "It was fitted with a pose that changes smoothly."
-        return "The result is the arm at the end." + _LIKE_BASE * self.is_like_base
+            return "It was fitted with a pose that changes smoothly." + _same_effect(self.rivals)
+        return "The result is the arm at the end." + _same_effect(self.rivals)
 
 
 @frozen
@@ -277,8 +278,9 @@ class History:
 
 def histories(session: Session) -> Iterator[History]:
     """Yield the changes of base, tool, joint zeros and links over the samples."""
-    numbers = np.sort(np.concatenate(session.timeline.numbers))
-    by_number = np.argsort(np.concatenate(session.timeline.numbers))
+    begin = session.timeline.begin
+    by_number = np.argsort(np.concatenate(session.timeline.numbers))[begin:]
+    numbers = np.concatenate(session.timeline.numbers)[by_number]
     times = np.concatenate(session.timeline.times)[by_number]
     changes = [cause for cause in session.causes if not cause.block.is_constant]
     for of in dict.fromkeys(cause.block.of or cause.block.kind for cause in changes):
@@ -295,7 +297,7 @@ def histories(session: Session) -> Iterator[History]:
             spread = np.einsum("ni,ij,nj->n", at, cause.covariance, at)
             values += size * motion / max(float(motion[peak]), 1e-300)
             variance += std**2 * spread / max(float(spread[peak]), 1e-300)
-        yield History(of, unit, numbers, values, np.sqrt(variance))
+        yield History(of, unit, numbers - begin, values, np.sqrt(variance))
 
 
 def describe_events(
@@ -307,8 +309,8 @@ def describe_events(
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
         before, after = (timeline.place(shape.number + i) for i in (-1, 0))
-        is_like_base = _is_like_base(cause.block, chain)
-        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit, is_like_base))
+        rivals = _rivals(cause.block, chain, timeline)
+        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit, rivals))
     return tuple(events)
 
 
@@ -346,14 +348,11 @@ def cause_size(
 ) -> tuple[float, float, str]:
     """Return the size of a change, its standard deviation and its unit."""
     block, shape = cause.block, cause.shape
+    if block.touched is not None:
+        return *_touched_size(block.touched, cause, changes, chain, timeline), "m"
     if isinstance(shape, Step) and block.kind in ("base", "tool"):
         return _step_size(cause, shape, changes, chain)
-    numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
-    f = shape.values(numbers, times)
-    peak = f[np.argmax(np.linalg.norm(f @ cause.amplitudes * block.levers, axis=1))]
-    values = peak @ cause.amplitudes
-    by_values = np.kron(peak[None], np.eye(len(values)))
-    covariance = by_values @ cause.covariance @ by_values.T
+    values, covariance = _largest_change(cause, timeline)
     if block.kind == "joint":
         unit = "m" if chain.is_prismatic[block.index] else "rad"
         return abs(float(values[0])), float(np.sqrt(covariance[0, 0])), unit
@@ -363,6 +362,16 @@ def cause_size(
         return *_payload_size(values, covariance, chain, timeline), "m"
     origin = np.asarray(block.origin)
     return _motion_size(values[:3] + np.cross(values[3:], origin), values[3:], origin, block, covariance)
+
+
+def _largest_change(cause: Cause, timeline: Timeline) -> tuple[Array, Array]:
+    """Return the largest difference of the columns of a cause (c,) from the end, and its covariance."""
+    numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
+    f = cause.shape.values(numbers, times)
+    peak = f[np.argmax(np.linalg.norm(f @ cause.amplitudes * cause.block.levers, axis=1))]
+    values = peak @ cause.amplitudes
+    by_values = np.kron(peak[None], np.eye(len(values)))
+    return values, by_values @ cause.covariance @ by_values.T
 
 
 def describe_drifts(
@@ -381,20 +390,29 @@ def describe_drifts(
                 law if isinstance(shape, Drift) else "free",
                 None if np.isinf(constant) else constant,
                 timeline.unit,
-                _is_like_base(cause.block, chain),
+                _rivals(cause.block, chain, timeline),
             )
 
 
-def _is_like_base(block: Block, chain: Chain) -> bool:
-    """Return whether the zero of a joint moves the arm like its base: the first one, or the first rails."""
+def _rivals(block: Block, chain: Chain, timeline: Timeline) -> tuple[str, ...]:
+    """Return the parts whose motion moves the arm as a change does: the base, and what the arm touches."""
+    # The first joint, or the first rails.
     is_first = block.index == 0 or bool(chain.is_prismatic[: block.index + 1].all())
-    return block.kind == "joint" and is_first
+    like_base = ("base",) if block.kind == "joint" and is_first else ()
+    return (
+        *like_base,
+        *((TOUCHED,) if timeline.is_of_contacts and (like_base or block.kind == "base") else ()),
+    )
+
+
+def _same_effect(rivals: tuple[str, ...]) -> str:
+    """Return a sentence about parts whose motion has the same effect as a change; empty without any."""
+    return f" A motion of the {' or of the '.join(rivals)} has the same effect." if rivals else ""
 
 
 def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timeline) -> tuple[float, float]:
     """Return the RMS motion of the tool by a growth of the links, and its standard deviation [m]."""
-    q = np.concatenate([item.q for item in timeline.data])
-    motions = chain.growth_motions(chain.forward_kinematics(q))[:, :3]
+    motions = chain.growth_motions(chain.forward_kinematics(timeline.q))[:, :3]
     if len(values) == 1:
         motions = motions.sum(0, keepdims=True)
     else:
@@ -404,9 +422,24 @@ def _growth_size(values: Array, covariance: Array, chain: Chain, timeline: Timel
 
 def _payload_size(values: Array, covariance: Array, chain: Chain, timeline: Timeline) -> tuple[float, float]:
     """Return the RMS motion of the tool by a change of the payload, and its standard deviation [m]."""
-    q = np.concatenate([item.q for item in timeline.data])
-    torques = chain.loads.torques_per_kilogram(q.T)
-    motions = chain.joint_jacobian(chain.forward_kinematics(q))[:, :3] * torques[:, None]
+    torques = chain.loads.torques_per_kilogram(timeline.q.T)
+    motions = chain.joint_jacobian(chain.forward_kinematics(timeline.q))[:, :3] * torques[:, None]
+    return _rms_motion(motions, values, covariance)
+
+
+def _touched_size(
+    points: Array, cause: Cause, changes: RobotChanges, chain: Chain, timeline: Timeline
+) -> tuple[float, float]:
+    """Return the RMS motion of touched points by a change of the base, and its standard deviation [m]."""
+    # Few points do not show all turns of the base, which may move its origin far.
+    values, covariance = _largest_change(cause, timeline)
+    if isinstance(cause.shape, Step):
+        numbers = np.array([cause.shape.number - 1, cause.shape.number])
+        before, after = changes.base.poses[changes.base.segments(numbers)] @ chain.base
+        values = se3.log6(se3.inverse(after) @ before)
+    turns = np.cross(np.eye(3)[:, None], points)
+    moves = np.tile(np.eye(3)[:, None], (1, len(points), 1))
+    motions = np.concatenate([moves, turns]).transpose(0, 2, 1)
     return _rms_motion(motions, values, covariance)
 
 

@@ -20,7 +20,9 @@ from .._kernels import apply_observation_matrix
 from .._typing import Array
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
+from ..estimation.scale_gauge import normalize_by_scale
 from ..measurements.base import Measurement, instrument_values
+from ..measurements.groups import POSITION
 from ..robot.error_families import COMPLIANCE, JOINT_TERMS, MIN_TORQUE, growing_links
 from .causes import HELD_SIZE, Block
 
@@ -158,7 +160,10 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
     problem, full = layout.problem, layout.errors_at(x)
     errors = problem.errors
     chain, bodies, twists = errors.derivative(full[: len(errors.parameters)])
-    values = problem.instruments(full)
+    values, gauge = problem.instruments(full), problem.scale_gauge
+    size, gauge_rates = 1.0, np.zeros((len(bodies), 4))
+    if gauge:
+        size, gauge_rates = gauge.size(chain), gauge.rates(chain, bodies, twists)
     count, width = sum(len(item.rows) for item in data), max(item.residual_dim for item in data)
     out, start = np.zeros((layout.n_columns, width, count)), 0
     instrument_columns = {
@@ -193,6 +198,10 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         for parameter, part in parts:
             if parameter.name in instrument_columns:
                 block[instrument_columns[parameter.name]] = part
+        if gauge and not item.has_length_scale:
+            for group in item.residual_groups.values():
+                if group.unit == "m":  # the size of a robot does not change angles
+                    normalize_by_scale(block[:, group.rows], size, gauge_rates, group is POSITION)
     out[layout.lag] = np.einsum("nkm,mn->km", out[layout.joints], rates)
     return np.ascontiguousarray(out.transpose(2, 1, 0))
 

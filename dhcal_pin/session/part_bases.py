@@ -8,6 +8,7 @@ that are far from a fit of the others, and consecutive samples that fit by thems
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -40,12 +41,10 @@ def place_parts(
 ) -> tuple[Problem, Motion] | None:
     """Fit base and tool to each part of a session by itself; None for one part, and if no base turned far."""
     # The problem gets the base and the tool of the last part, and the base moves where a part begins.
-    is_base_free = any(p.error_frame == BASE_FRAME for p in problem.errors.parameters)
-    if not is_base_free or not starts:
+    if not _is_base_free(problem) or not starts:
         return None
-    numbers = timeline.numbers[: timeline.n_fitted]
-    of_part = [np.searchsorted(starts, each, side="right") for each in numbers]
-    parts = [_samples_of(problem.data, of_part, i) for i in range(len(starts) + 1)]
+    limits = (timeline.begin, *starts, np.inf)
+    parts = [_samples_between(problem.data, timeline, *pair) for pair in pairwise(limits)]
     if min(sum(len(item.rows) for item in part) for part in parts) < MIN_SAMPLES:
         return None
     errors = problem.errors
@@ -58,21 +57,31 @@ def place_parts(
     return replace(problem, errors=moved), Motion(starts, poses)
 
 
-def _samples_of(data: tuple[Measurement, ...], of_part: list[Array], part: int) -> tuple[Measurement, ...]:
-    """Return the samples of a part."""
-    taken = (item.take(each == part) for item, each in zip(data, of_part, strict=True))
+def _is_base_free(problem: Problem) -> bool:
+    """Return whether the pose of the base is unknown."""
+    return any(p.error_frame == BASE_FRAME for p in problem.errors.parameters)
+
+
+def _samples_between(
+    data: tuple[Measurement, ...], timeline: Timeline, first: float, end: float
+) -> tuple[Measurement, ...]:
+    """Return the fitted samples with numbers from a first one to the one before the end."""
+    pairs = zip(data, timeline.numbers[: timeline.n_fitted], strict=True)
+    taken = (item.take((first <= numbers) & (numbers < end)) for item, numbers in pairs)
     return tuple(item for item in taken if len(item.rows))
 
 
 def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int, ...]:
     """Return the first samples of parts but the first that fit by themselves, but not to one solution."""
+    if not _is_base_free(problem):
+        return ()
     numbers = np.sort(timeline.fitted_numbers)
+    numbers = numbers[numbers >= timeline.begin]
     of_solution = _mean_squares(problem, x, timeline)
     begin, starts = 0, []
     while len(numbers) - begin >= MIN_SAMPLES and len(starts) < MAX_PARTS:
-        first = numbers[begin : begin + N_FIRST]
-        is_first = [np.isin(each, first) for each in timeline.numbers[: timeline.n_fitted]]
-        part = _samples_of(problem.data, is_first, True)
+        last = numbers[begin : begin + N_FIRST][-1]
+        part = _samples_between(problem.data, timeline, numbers[begin], last + 1)
         chain = initialize_frames(problem.errors, part, problem.known, MAX_ITERATIONS).chain
         placed = replace(problem, errors=replace(problem.errors, chain=chain))
         sizes = _mean_squares(placed, np.zeros_like(x), timeline)[begin:]
@@ -87,6 +96,7 @@ def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int
 
 
 def _mean_squares(problem: Problem, x: Array, timeline: Timeline) -> Array:
-    """Return the mean squared residual of each fitted sample, in the order of measurement."""
+    """Return the mean squared residual of each fitted sample of the robot, in the order of measurement."""
     sizes = np.concatenate([np.mean(r**2, 0) for r in problem.residuals(x, problem.data)])
-    return sizes[np.argsort(timeline.fitted_numbers, kind="stable")]
+    order = np.argsort(timeline.fitted_numbers, kind="stable")
+    return sizes[order[timeline.fitted_numbers[order] >= timeline.begin]]

@@ -156,7 +156,7 @@ class JointPaths:
         order = np.argsort(numbers)
         q = np.concatenate([item.q for item in timeline.data])[order]
         times = times[order]
-        bounds = [0, *timeline.file_starts, len(q)]
+        bounds = [timeline.begin, *timeline.file_starts, len(q)]
         self._starts = np.array(bounds[:-1])
         self._splines = [joint_path(times[a:b], q[a:b]) for a, b in pairwise(bounds)]
 

@@ -38,6 +38,7 @@ from ..estimation.problem import Problem
 from ..estimation.robust import MAD_TO_STD
 from ..measurements.base import Measurement, residual_of
 from ..measurements.configurations import group_by_configuration
+from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
 from .linear_model import Layout, inverse, solve_information, whitened_rows
@@ -137,8 +138,10 @@ class _Search:
         self.order = np.argsort(self.part.fitted_numbers, kind="stable")
         self.numbers = self.part.fitted_numbers[self.order]
         self.times = self.part.fitted_times[self.order]
-        # First sample of each cell, and N.
-        self.edges = np.linspace(0, len(self.order), min(len(self.order), n_cells) + 1).astype(int)
+        # First sample of the robot, first sample of each cell, and N.
+        self.begin = int(np.searchsorted(self.numbers, timeline.begin))
+        n_cells = min(len(self.order) - self.begin, n_cells)
+        self.edges = np.linspace(self.begin, len(self.order), n_cells + 1).astype(int)
         self.x = x
         self.changes = RobotChanges()
         self.causes: list[Cause] = []
@@ -303,9 +306,14 @@ class _Search:
             for cause, step, covariance in zip(self.causes, steps, covariances, strict=True)
         ]
 
+    @property
+    def robot(self) -> Chain:
+        """The robot at the current unknowns."""
+        return self.layout.problem.chain(self.layout.errors_at(self.x))
+
     def _base(self) -> Array:
         """Return the pose of the base (4, 4) at the current unknowns [m]."""
-        return self.layout.problem.chain(self.layout.errors_at(self.x)).base
+        return self.robot.base
 
     # ------------------------------------------------------------------------------------------- test
     def best_cause(self, fit: LinearFit) -> Cause | None:
@@ -346,9 +354,17 @@ class _Search:
         # Gravity bends an arm in proportion to the direction of its links.
         rises = np.diff(np.concatenate(heights, 1)[:, self.order], axis=0)
         in_time = np.arange(len(q))
-        orders = [np.argsort(values, kind="stable") for values in (*q.T, *rises)]
+        # Samples without a time stay in front.
+        kept, free = in_time[: self.begin], in_time[self.begin :]
+        orders = [
+            np.append(kept, free[np.argsort(values[self.begin :], kind="stable")])
+            for values in (*q.T, *rises)
+        ]
         # A joint that moved one way during the session does not tell the order from its position.
-        others = [each for each in orders if abs(np.corrcoef(each, in_time)[0, 1]) < MAX_ORDER_CORRELATION]
+        correlations = [np.corrcoef(each[self.begin :], free)[0, 1] for each in orders]
+        others = [
+            each for each, c in zip(orders, correlations, strict=True) if abs(c) < MAX_ORDER_CORRELATION
+        ]
         needed = evidence(in_time) - MIN_ORDER_EVIDENCE
         return any(evidence(each) > needed for each in others)
 
@@ -361,10 +377,7 @@ class _Search:
 
     def _concerned(self, cause: Cause) -> float:
         """Return the share of the samples on the shorter side of a step; 1 for other causes."""
-        if not isinstance(cause.shape, Step):
-            return 1.0
-        share = float(np.mean(self.numbers < cause.shape.number))
-        return min(share, 1 - share)
+        return self.part.shorter_side(cause.shape.number) if isinstance(cause.shape, Step) else 1.0
 
     def _products(self, fit: LinearFit) -> Array:
         """Return the products of tested columns with those of the fit, tested ones and residuals, by cell."""
@@ -399,10 +412,10 @@ class _Search:
             inner = self.edges
             if not self.is_ordered:
                 inner = np.searchsorted(self.numbers, self.timeline.file_starts)
-            others = [0, len(self.numbers), *np.searchsorted(self.numbers, taken).tolist()]
+            others = [self.begin, len(self.numbers), *np.searchsorted(self.numbers, taken).tolist()]
             inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
             return [Step(number) for number in self.numbers[inner].tolist()]
-        begin, end = float(self.times[0]), float(self.times[-1])
+        begin, end = float(self.times[self.begin]), float(self.times[-1])
         if kind is FreeDrift:
             return [FreeDrift(begin, end)]
         return [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]
@@ -580,7 +593,7 @@ class _Search:
 
     def _best_place(self, fit: LinearFit, change: Array, number: int) -> int:
         """Return the number of a sample before which a step with a change (N, k) fits best."""
-        inner = np.arange(MIN_SIDE, len(self.numbers) - MIN_SIDE + 1)
+        inner = np.arange(self.begin + MIN_SIDE, len(self.numbers) - MIN_SIDE + 1)
         if not self.is_ordered or not inner.size:
             return number
         is_after = self.numbers >= number
@@ -617,9 +630,10 @@ class _Search:
         # The same noise and weights for both.
         stack = self._weighted_columns(full, cause, rows, [*others, cause])
         prior = self._prior([*others, cause])
-        side = len(rows) * self._concerned(cause)
-        length = min(len(rows) / N_BLOCKS, side / MIN_BLOCKS)
-        inside, predicted = _predicted_gain(stack, len(prior) - len(cause.values), prior, length)
+        count = len(rows) - self.begin
+        length = min(count / N_BLOCKS, count * self._concerned(cause) / MIN_BLOCKS)
+        timeless, timed = stack[: self.begin], stack[self.begin :]
+        inside, predicted = _predicted_gain(timeless, timed, len(prior) - len(cause.values), prior, length)
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
@@ -636,10 +650,10 @@ class _Search:
 
     def _outlier_share(self, fit: LinearFit, cause: Cause) -> float:
         """Return the share of outliers on the shorter side of a step, or among all samples."""
-        is_outlier = fit.weights < OUTLIER_WEIGHT
+        is_outlier = fit.weights[self.begin :] < OUTLIER_WEIGHT
         if not isinstance(cause.shape, Step):
             return float(np.mean(is_outlier))
-        is_before = self.numbers < cause.shape.number
+        is_before = self.numbers[self.begin :] < cause.shape.number
         side = is_before if 2 * is_before.sum() < len(is_before) else ~is_before
         return float(np.mean(is_outlier[side]))
 
@@ -680,10 +694,8 @@ class _Search:
 
     def place_steps(self) -> None:
         """Move steps between two fitted samples to where the held-out samples between them fit best."""
-        timeline, layout = self.timeline, self.layout
-        full = layout.errors_at(self.x)
-        chain = layout.problem.chain(full)
-        values = layout.problem.instruments(full)
+        timeline, chain = self.timeline, self.robot
+        values = self.layout.problem.instruments(self.layout.errors_at(self.x))
         held_out = timeline.numbers[timeline.n_fitted :]
         for i, cause in enumerate(self.causes):
             if not isinstance(cause.shape, Step):
@@ -703,6 +715,20 @@ class _Search:
             best = min(costs, key=lambda number: costs[number])
             self.changes = self.changes.with_step(cause.block.kind, cause.block.index, old, best)
             self.causes[i] = replace(cause, shape=Step(best))
+
+    def stated(self, cause: Cause) -> Cause:
+        """Return a cause with the points whose motion is stated, if it is a motion of the base."""
+        if cause.block.kind != "base" or not self.timeline.is_of_contacts:
+            return cause
+        number = cause.shape.number if isinstance(cause.shape, Step) else None
+        values = self.layout.problem.instruments(self.layout.errors_at(self.x))
+        points = [
+            [values[f"point_{name}.{axis}"] for axis in "xyz"]
+            for name in self.timeline.touched_points(number)
+        ]
+        base = self._base()
+        in_base = (np.array(points) - base[:3, 3]) @ base[:3, :3]
+        return replace(cause, block=replace(cause.block, touched=in_base))
 
     def _second_robot(
         self, rows: Array, others: Sequence[Cause], block: Block, number: int
@@ -767,12 +793,15 @@ def _information(columns: Array, root: Array) -> Array:
     return flat.T @ flat
 
 
-def _predicted_gain(stack: Array, p: int, prior: Array, length: float) -> tuple[float, float]:
+def _predicted_gain(
+    timeless: Array, stack: Array, p: int, prior: Array, length: float
+) -> tuple[float, float]:
     """Return how much the columns from p on reduce the cost: of all samples, and of left-out blocks."""
     count = int(np.clip(len(stack) / max(length, 1.0), 2, MAX_BLOCKS))
     edges = np.unique(np.linspace(0, len(stack), count + 1).astype(int))
     parts = _cell_products(stack, edges)
-    total = parts.sum(0)
+    flat = timeless.reshape(-1, timeless.shape[-1])
+    total = parts.sum(0) + flat.T @ flat
 
     without, with_all = np.arange(p), np.arange(len(prior))
     inside = _cost(total, total, prior, without) - _cost(total, total, prior, with_all)
@@ -798,8 +827,9 @@ def _bounded_cost(residual: Array) -> Array:
 
 
 def can_have_session(data: Sequence[Measurement]) -> bool:
-    """Return whether all samples show where base and tool are."""
-    return all(item.shows_changes for item in data)
+    """Return whether all samples of the robot show where base and tool are, and there are such samples."""
+    shown = [item.shows_changes for item in data if item.configurations_per_row]
+    return any(shown) and all(shown)
 
 
 def has_enough_rows(problem: Problem, timeline: Timeline) -> bool:
@@ -838,7 +868,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search = alone
     other_robot = search.other_robot()
     search.place_steps()
-    causes = tuple(cause for cause in search.causes if not _is_part_of_model(cause))
+    causes = tuple(search.stated(cause) for cause in search.causes if not _is_part_of_model(cause))
     constants = [
         (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
         for cause in causes
@@ -875,7 +905,7 @@ def _is_suspicious(problem: Problem, x: Array, timeline: Timeline, is_ordered: b
 def _cell_products(rows: Array, edges: Array, some: slice = np.s_[:]) -> Array:
     """Return the inner products of some columns of each cell with all columns, (K, ·, c)."""
     if np.ptp(np.diff(edges)) == 0:
-        cells = rows.reshape(len(edges) - 1, -1, rows.shape[-1])
+        cells = rows[edges[0] : edges[-1]].reshape(len(edges) - 1, -1, rows.shape[-1])
         return cells[..., some].swapaxes(1, 2) @ cells
     cells = (rows[a:b].reshape(-1, rows.shape[-1]) for a, b in pairwise(edges))
     return np.array([cell[:, some].T @ cell for cell in cells])
