@@ -62,6 +62,8 @@ _MAX_ZERO, _ZERO_STEPS, _FINE_ZERO_STEPS = 180.0, (20.0, 4.0, 1.0, 0.2), ((6.0, 
 # the robot, which the calibration corrects.
 _MAX_RATIO, _RATIO_STEPS, _FINE_RATIO_STEPS = 110.0, (5.0, 1.0, 0.2), ((1.5, 0.5), (0.3, 0.1))
 _MIN_RATIO = 4.0
+# Sizes of ratios one of which explains measurements without positions better, if others do.
+_PROBED_RATIOS = (-5.0, 5.0)
 # A ratio is refined if it brings the nominal robot nearer by this factor.
 _MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
@@ -202,12 +204,14 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
 
 
 def _measure_ratios(trial: Trial) -> list[_Measured]:
-    """Return the joint values that need a factor, of one joint or of all revolute ones, by positions."""
-    if not trial.misfit:
-        return []
+    """Return the joint values that need a factor, of one joint or of all revolute ones."""
     ratios, groups, revolute = [], [[j] for j in range(trial.chain.n_joints)], revolute_joints(trial.chain)
     for joints in [*groups, revolute] if len(revolute) > 1 else groups:
         of_logarithm = partial(_ratio_of_logarithm, trial.chain, joints)
+        # Without positions, each size needs a fit.
+        tried = [of_logarithm(size).apply(trial.samples) or trial.samples for size in _PROBED_RATIOS]
+        if not trial.misfit and -_costs(trial, tried).min() < trial.before.log + _MIN_LOG_RATIO:
+            continue
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
         if abs(best) >= _MIN_RATIO:
             ratios += _measured(trial, of_logarithm, best)

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from robots import nominal_arm
+from slow_cases import some_slow
 
 from dhcal_pin import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, PointContact, PointDistance
+from dhcal_pin.plausibility import diagnose_mixups
 
 
 def touched(distance_factor=1.0, zero=0.0):
@@ -62,3 +64,13 @@ def test_wrong_distances_between_sockets_are_named(factor):
     fit = calibrate(nominal, data)
     found = [scale.factor for scale in (fit.session.scales if fit.session else ())]
     assert found == ([] if factor == 1.0 else [pytest.approx(factor, abs=5e-3)])
+
+
+@pytest.mark.parametrize(("joint", "factor"), some_slow([(2, 1.1), (1, 0.95), (3, 1.05)], {0}))
+def test_a_wrong_gear_ratio_among_contacts_is_named(joint, factor):
+    nominal, contacts, distances = touched()
+    wrong = contacts.resample(contacts.q * np.where(np.arange(6) == joint, factor, 1.0))
+    (found,) = diagnose_mixups(nominal, [wrong, distances]).hypotheses
+    kind, name, ratio = found.key.split(":")
+    assert (kind, name) == ("ratio", nominal.joint_names[joint])
+    assert float(ratio) == pytest.approx(1 / factor, rel=0.003)
