@@ -23,6 +23,7 @@ from ..plausibility.deviating_lines import DeviatingLines, extend, find_deviatin
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
+from ..plausibility.labels import WrongLabel, find_wrong_labels
 from ..plausibility.mixups import diagnose_images, diagnose_mixups
 from ..plausibility.rounding import find_rounding
 from ..session import Session
@@ -219,6 +220,15 @@ class Evidence(FittedModel):
             [*fitted, *held_out],
             self.counted,
             _usual_errors(self),
+        )
+
+    @cached_property
+    def wrong_labels(self) -> tuple[WrongLabel, ...]:
+        """Outliers that fit another touched point or target than they state."""
+        return tuple(
+            found
+            for item, is_counted in zip(self.data, self.is_counted, strict=True)
+            for found in find_wrong_labels(item, is_counted, self.chain, self.instruments)
         )
 
     @property

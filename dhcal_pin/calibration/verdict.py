@@ -207,7 +207,7 @@ def judge(fit: Evidence) -> Verdict:
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
         hidden = _hidden_outliers(fit)
         found = [
-            *_deviating_lines(fit),
+            *(_wrong_labels(fit) or _deviating_lines(fit)),
             *([*errors, *correction] if explains_correction else [*correction, *errors]),
             *_session(fit),
             *_contradictions(fit),
@@ -917,6 +917,7 @@ def _outliers(fit: Evidence) -> list[Finding]:
         return []
     # Those of deviating lines are named with these.
     n_explained = 0 if is_refused or fit.deviating_lines is None else fit.deviating_lines.n_outliers
+    n_explained = max(n_explained, sum(len(found.rows) for found in fit.wrong_labels))
     if n_outliers - n_explained < MAX_OUTLIER_SHARE * fit.n_samples:
         return []
     share = f"{100 * n_outliers / fit.n_samples:.0f} %"
@@ -925,6 +926,14 @@ def _outliers(fit: Evidence) -> list[Finding]:
     if n_outliers > MIN_MIXED_SHARE * fit.n_samples:
         remedy = "They may be of another set-up, tool or robot: calibrate them by themselves, too."
     return [Finding("refused" if is_refused else "caution", f"{text}. {remedy}")]
+
+
+def _wrong_labels(fit: Evidence) -> list[Finding]:
+    """Advise caution if outliers fit another touched point or target than they state."""
+    if not fit.wrong_labels:
+        return []
+    text = " ".join(found.sentence for found in fit.wrong_labels)
+    return [Finding("caution", f"{text} The figures leave them out. Correct the names in these lines.")]
 
 
 def _deviating_lines(fit: Evidence) -> list[Finding]:

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 from robots import nominal_arm
+from sessions import Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
 from dhcal_pin.estimation import select_parameters
-from dhcal_pin.measurements import Noise, PointContact, PointDistance
+from dhcal_pin.measurements import MultiTargetPosition, Noise, PointContact, PointDistance
 from dhcal_pin.plausibility import diagnose_mixups
 
 
@@ -74,3 +75,45 @@ def test_a_wrong_gear_ratio_among_contacts_is_named(joint, factor):
     kind, name, ratio = found.key.split(":")
     assert (kind, name) == ("ratio", nominal.joint_names[joint])
     assert float(ratio) == pytest.approx(1 / factor, rel=0.003)
+
+
+@pytest.mark.parametrize("is_run", [False, True])
+def test_outliers_that_fit_another_name_are_named(is_run):
+    nominal, contacts, distances = touched()
+    names = np.array(contacts.text_values()["point"])
+    # Every row of a run, or four rows somewhere, with exchanged names.
+    changed = np.arange(60, 80) if is_run else np.array([5, 6, 40, 72])
+    other = {"p1": "p2", "p2": "p1", "p3": "p4", "p4": "p3"}
+    wrong = names.copy()
+    wrong[changed] = [other[name] for name in names[changed]]
+    fit = calibrate(nominal, [PointContact(contacts.q, wrong.tolist(), contacts.sigma), distances])
+    found = {row: (each.stated, each.fitting) for each in fit.wrong_labels for row in each.rows}
+    assert found == {i + 1: (wrong[i], names[i]) for i in changed}
+    (reason,) = [reason for reason in fit.verdict.reasons if "Correct the names" in reason]
+    assert reason.count(" state") == len(fit.wrong_labels)
+    # The remedy helps.
+    corrected = calibrate(nominal, [contacts, distances])
+    assert corrected.verdict.reasons == ()
+    assert corrected.n_outliers == 0
+
+
+def test_other_outliers_have_no_wrong_name():
+    nominal, contacts, distances = touched()
+    q = contacts.q.copy()
+    q[[3, 30, 55], 1] += [0.02, -0.05, 0.1]
+    fit = calibrate(nominal, [contacts.resample(q), distances])
+    assert fit.n_outliers >= 3
+    assert not fit.wrong_labels
+
+
+def test_targets_with_exchanged_names_are_named():
+    simulation = Simulation("ur10", 40, 2)
+    data = simulation.measure_targets()
+    names = list(data.text_values()["target"])
+    names[3], names[4] = names[4], names[3]
+    wrong = MultiTargetPosition(data.q, data.positions(), names)
+    fit = calibrate(simulation.chain, wrong, "minimal,base,tool")
+    assert [(each.column, each.stated, each.fitting, each.rows) for each in fit.wrong_labels] == [
+        ("target", "a", "b", (5,)),
+        ("target", "b", "a", (4,)),
+    ]
