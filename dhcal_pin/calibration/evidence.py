@@ -16,6 +16,7 @@ from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import CHUNK_SIZE
 from ..estimation.qr import TriangularSystem, rank
 from ..estimation.uncertainty import Uncertainty
+from ..identifiability.contact_bias import contact_bias
 from ..measurements.base import Measurement, residual_of
 from ..measurements.groups import error_group
 from ..measurements.measured_region import MeasuredRegion
@@ -49,7 +50,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, is_same_file, k_fold, of_same_files
+from .partition import configuration_groups, count_held_out, is_same_file, k_fold, of_same_files
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
@@ -317,7 +318,7 @@ class Evidence(FittedModel):
     def random_folds(self) -> FoldComparison | None:
         """Accuracy of samples that are held out in random folds; None with a single configuration."""
         inliers = self.inliers
-        n_configurations = len(np.unique(configuration_groups(inliers)))
+        n_configurations = count_held_out(inliers)
         if n_configurations < 2:
             return None
         n_folds = N_FOLDS if n_configurations > MAX_LEAVE_ONE_OUT else n_configurations
@@ -416,13 +417,25 @@ class Evidence(FittedModel):
     def position_std(self) -> float:
         """Predicted RMS position error in the measured region with the best base and tool [m].
 
-        The configurations are within the measured ranges of the joints.
+        The configurations are within the measured ranges of the joints. It contains the bias of contacts, see
+        `identifiability.contact_bias`.
         """
         q, _ = self._different_configurations
         if (region := self.measured_region) is not None:
             # The errors of joints grow beyond their measured ranges, whatever is measured.
             q = np.clip(region.draw(np.random.default_rng(0), N_PREDICTED), region.lower, region.upper)
-        return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
+        q = q[:: -(-len(q) // N_PREDICTED) or 1]
+        parts = [self._complete_uncertainty]
+        if any(item.is_contact for item in self.data):
+            parts.append(self._contact_bias)
+        return float(np.linalg.norm([best_frames_std(part, q) for part in parts]))
+
+    @property
+    def _contact_bias(self) -> Uncertainty:
+        """Bias of contacts as the only direction of an uncertainty."""
+        count = len(self.errors.parameters)
+        bias = contact_bias(self.problem, self.solution.x, self._sqrt_covariance[0])[:count, None]
+        return Uncertainty.from_errors(self.errors, self.x[:count], self.chain, bias, bias[:, :0])
 
     @cached_property
     def measured_region(self) -> MeasuredRegion | None:
