@@ -11,12 +11,12 @@ import numpy as np
 from .. import plausibility
 from .._frozen import frozen
 from .._typing import Array, Progress
+from ..estimation.contacts import contact_bias
 from ..estimation.folds import Fold
 from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import CHUNK_SIZE
 from ..estimation.qr import TriangularSystem, rank
 from ..estimation.uncertainty import Uncertainty
-from ..identifiability.contact_bias import contact_bias
 from ..measurements.base import Measurement, residual_of
 from ..measurements.groups import error_group
 from ..measurements.measured_region import MeasuredRegion
@@ -418,7 +418,7 @@ class Evidence(FittedModel):
         """Predicted RMS position error in the measured region with the best base and tool [m].
 
         The configurations are within the measured ranges of the joints. It contains the bias of contacts, see
-        `identifiability.contact_bias`.
+        `estimation.contacts`.
         """
         q, _ = self._different_configurations
         if (region := self.measured_region) is not None:

@@ -13,7 +13,7 @@ estimate differs from that of greatest likelihood by
     b = -C·∂V/∂x,    C the covariance of the estimate.
 
 The size of the robot is part of this bias: all misses of a smaller robot are smaller. Where misses are
-divided by the size s (`estimation.scale_gauge`), V has -k·log s for each sample with k misses. What remains is small
+divided by the size s (`scale_gauge`), V has -k·log s for each sample with k misses. What remains is small
 beside the standard deviations if the contacts determine the errors of the arm well, and can be some times as
 large if they do not.
 
@@ -26,10 +26,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._kernels import apply_observation_matrix
-from .._typing import Array
-from ..estimation.problem import Problem
-from ..measurements.base import Measurement
+from ..._kernels import apply_observation_matrix
+from ..._typing import Array
+from ...measurements.base import Measurement
+from ..problem import Problem
 
 # Largest number of samples of a measurement that the volume is computed from.
 _MAX_SAMPLES = 300
@@ -56,14 +56,16 @@ def contact_bias(problem: Problem, x: Array, root: Array) -> Array:
     shares = [len(item.rows) / len(part.rows) for item, part in zip(contacts, drawn, strict=True)]
     for i, step in enumerate(_STEP * np.eye(len(x))):
         volumes = [
-            sum(share * _log_volume(problem, x + side, part) for share, part in zip(shares, drawn, strict=True))
+            sum(
+                share * log_volume(problem, x + side, part) for share, part in zip(shares, drawn, strict=True)
+            )
             for side in (step, -step)
         ]
         slopes[i] = (volumes[0] - volumes[1]) / (2 * _STEP)
     return -root @ (root.T @ slopes)
 
 
-def _log_volume(problem: Problem, x: Array, item: Measurement) -> float:
+def log_volume(problem: Problem, x: Array, item: Measurement) -> float:
     """Compute the logarithm of the volume of the whitened misses per unit of the joint values."""
     chain, u = problem.chain(x), problem.instrument_values_of(item, x)
     frames = chain.forward_kinematics(item.conditions())
