@@ -213,7 +213,7 @@ class Evidence(FittedModel):
             return None
         fitted = [item for item in self.data if item.source == lines.source]
         held_out = of_same_files(self.holdout, fitted)
-        return find_mistake(
+        found = find_mistake(
             self.errors.chain,
             (self.chain, self.instruments),
             lines,
@@ -221,6 +221,7 @@ class Evidence(FittedModel):
             self.counted,
             _usual_errors(self),
         )
+        return _with_servos(self, found) if found else None
 
     @property
     def shrinkage_notes(self) -> list[str]:
@@ -404,7 +405,7 @@ class Evidence(FittedModel):
         found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self), holdout=others)
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
-        return replace(found, source=source) if found.hypotheses else None
+        return _with_servos(self, replace(found, source=source)) if found.hypotheses else None
 
     @cached_property
     def generalization(self) -> Generalization:
@@ -470,18 +471,31 @@ def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
     if fit.earlier_diagnosis:
         return fit.earlier_diagnosis
     held_out = of_same_files(fit.holdout, fit.data)
-    return diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
+    found = diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
+    return _with_servos(fit, found)
 
 
 def diagnose_joint_values(fit: Evidence) -> Diagnosis:
     """Look for mistakes in the joint values of images without other measurements."""
     images = fit.data if all(item.n_images for item in fit.data) else ()
-    return diagnose_images(fit.errors.chain, images, _usual_errors(fit))
+    return _with_servos(fit, diagnose_images(fit.errors.chain, images, _usual_errors(fit)))
+
+
+def _with_servos(fit: Evidence, found: Diagnosis) -> Diagnosis:
+    """Return a diagnosis whose remedies are those of a servo file if joint values come from counts."""
+    if not _has_counts(fit):
+        return found
+    return found.for_servos(fit.signs.turned if fit.signs else ())
+
+
+def _has_counts(fit: Evidence) -> bool:
+    """Return whether joint values come from counts of servos."""
+    return any(item.has_counts for item in fit.data)
 
 
 def _usual_errors(fit: Evidence) -> str:
     """Return the parameter sets of the errors that such a robot usually has."""
-    return HAND_BUILT if fit.signs else MANUFACTURED
+    return HAND_BUILT if fit.signs or _has_counts(fit) else MANUFACTURED
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, bool, str], float]:
