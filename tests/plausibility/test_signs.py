@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from paper_arms import photograph
 from servo_arms import JOINTS, RANGES, SO101, TIP, ServoArm, lerobot_degrees
+from slow_cases import some_slow
+from touching_arms import NOMINAL as TOUCHING
+from touching_arms import TouchingArm
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.exceptions import InvalidArgumentError
@@ -136,6 +139,30 @@ def test_images_and_few_samples_leave_all_signs_open():
     signs = decide_signs(NOMINAL, [measured(arm, rng, 5, "position")])
     assert not signs.is_compared
     assert "--turned" in signs.questions[0]
+
+
+@pytest.mark.parametrize("seed", some_slow(range(6), {1}))
+def test_signs_from_touched_points_are_right_or_open(seed):
+    turned = [(), ("shoulder",), ("elbow", "roll")][seed % 3]
+    arm = TouchingArm.random(seed, 100, 4, turned)
+    signs = decide_signs(TOUCHING, arm.data)
+    assert signs.is_compared
+    # The base turns little while the arm touches one point, and nobody sees where it stands.
+    free = {"yaw", "roll"}
+    assert {*signs.turned} ^ {*turned} <= free
+    assert {name for each in signs.open for name in each.joints} <= free
+    for each, question in zip(signs.open, signs.questions, strict=False):
+        assert each.distance is None
+        assert "measurement at" not in question
+        assert "right-hand rule" in question
+
+
+def test_touched_points_without_known_distances_decide_no_sign():
+    arm = TouchingArm.random(1, 100, 4, ("shoulder",))
+    signs = decide_signs(TOUCHING, arm.data[:1])
+    assert not signs.is_compared
+    assert "known distances" in signs.questions[0]
+    assert decide_signs(TOUCHING, arm.data).is_compared
 
 
 def test_a_urdf_with_other_zeros_is_named():
