@@ -74,6 +74,7 @@ def touched_by_low_cost_arm(seed, n_points):
     """Return an arm that touched points, its calibration, and the true error in the measured region [m]."""
     arm = TouchingArm.random(seed, 200, n_points, ("shoulder",))
     fit = calibrate(NOMINAL, arm.data, "low-cost,base,tool", turned=("shoulder",), session="off")
+    assert fit.measured_region is not None
     return fit, arm.error(fit.chain, fit.measured_region.draw(np.random.default_rng(1), 300))
 
 
@@ -108,7 +109,7 @@ def test_known_distances_are_not_held_out():
     """Without some of few distances, nothing else states the size of the arm."""
     nominal, *data = touched()
     fit = calibrate(nominal, data)
-    held_out, fitted = fit.comparisons
+    held_out = fit.comparisons[0]
     assert held_out.title == "cross-validated"
     assert "length" not in held_out.after.groups
     assert any(item.kind == "point_distance" for item in fit.data)
