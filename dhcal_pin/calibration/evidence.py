@@ -11,6 +11,7 @@ import numpy as np
 from .. import plausibility
 from .._frozen import frozen
 from .._typing import Array, Progress
+from ..estimation.contacts import contact_bias
 from ..estimation.folds import Fold
 from ..estimation.frame_gauge import best_frames_std
 from ..estimation.problem import CHUNK_SIZE
@@ -50,7 +51,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, is_same_file, k_fold, of_same_files
+from .partition import configuration_groups, count_held_out, is_same_file, k_fold, of_same_files
 
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
@@ -213,7 +214,7 @@ class Evidence(FittedModel):
             return None
         fitted = [item for item in self.data if item.source == lines.source]
         held_out = of_same_files(self.holdout, fitted)
-        return find_mistake(
+        found = find_mistake(
             self.errors.chain,
             (self.chain, self.instruments),
             lines,
@@ -221,6 +222,7 @@ class Evidence(FittedModel):
             self.counted,
             _usual_errors(self),
         )
+        return _with_servos(self, found) if found else None
 
     @cached_property
     def wrong_labels(self) -> tuple[WrongLabel, ...]:
@@ -327,7 +329,7 @@ class Evidence(FittedModel):
     def random_folds(self) -> FoldComparison | None:
         """Accuracy of samples that are held out in random folds; None with a single configuration."""
         inliers = self.inliers
-        n_configurations = len(np.unique(configuration_groups(inliers)))
+        n_configurations = count_held_out(inliers)
         if n_configurations < 2:
             return None
         n_folds = N_FOLDS if n_configurations > MAX_LEAVE_ONE_OUT else n_configurations
@@ -413,7 +415,7 @@ class Evidence(FittedModel):
         found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self), holdout=others)
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
-        return replace(found, source=source) if found.hypotheses else None
+        return _with_servos(self, replace(found, source=source)) if found.hypotheses else None
 
     @cached_property
     def generalization(self) -> Generalization:
@@ -426,13 +428,25 @@ class Evidence(FittedModel):
     def position_std(self) -> float:
         """Predicted RMS position error in the measured region with the best base and tool [m].
 
-        The configurations are within the measured ranges of the joints.
+        The configurations are within the measured ranges of the joints. It contains the bias of contacts, see
+        `estimation.contacts`.
         """
         q, _ = self._different_configurations
         if (region := self.measured_region) is not None:
             # The errors of joints grow beyond their measured ranges, whatever is measured.
             q = np.clip(region.draw(np.random.default_rng(0), N_PREDICTED), region.lower, region.upper)
-        return best_frames_std(self._complete_uncertainty, q[:: -(-len(q) // N_PREDICTED) or 1])
+        q = q[:: -(-len(q) // N_PREDICTED) or 1]
+        parts = [self._complete_uncertainty]
+        if any(item.is_contact for item in self.data):
+            parts.append(self._contact_bias)
+        return float(np.linalg.norm([best_frames_std(part, q) for part in parts]))
+
+    @property
+    def _contact_bias(self) -> Uncertainty:
+        """Bias of contacts as the only direction of an uncertainty."""
+        count = len(self.errors.parameters)
+        bias = contact_bias(self.problem, self.solution.x, self._sqrt_covariance[0])[:count, None]
+        return Uncertainty.from_errors(self.errors, self.x[:count], self.chain, bias, bias[:, :0])
 
     @cached_property
     def measured_region(self) -> MeasuredRegion | None:
@@ -467,18 +481,31 @@ def diagnose(fit: Evidence, progress: Progress | None) -> Diagnosis:
     if fit.earlier_diagnosis:
         return fit.earlier_diagnosis
     held_out = of_same_files(fit.holdout, fit.data)
-    return diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
+    found = diagnose_mixups(fit.errors.chain, fit.data, _usual_errors(fit), progress, held_out)
+    return _with_servos(fit, found)
 
 
 def diagnose_joint_values(fit: Evidence) -> Diagnosis:
     """Look for mistakes in the joint values of images without other measurements."""
     images = fit.data if all(item.n_images for item in fit.data) else ()
-    return diagnose_images(fit.errors.chain, images, _usual_errors(fit))
+    return _with_servos(fit, diagnose_images(fit.errors.chain, images, _usual_errors(fit)))
+
+
+def _with_servos(fit: Evidence, found: Diagnosis) -> Diagnosis:
+    """Return a diagnosis whose remedies are those of a servo file if joint values come from counts."""
+    if not _has_counts(fit):
+        return found
+    return found.for_servos(fit.signs.turned if fit.signs else ())
+
+
+def _has_counts(fit: Evidence) -> bool:
+    """Return whether joint values come from counts of servos."""
+    return any(item.has_counts for item in fit.data)
 
 
 def _usual_errors(fit: Evidence) -> str:
     """Return the parameter sets of the errors that such a robot usually has."""
-    return HAND_BUILT if fit.signs else MANUFACTURED
+    return HAND_BUILT if fit.signs or _has_counts(fit) else MANUFACTURED
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, bool, str], float]:

@@ -137,20 +137,40 @@ def k_fold(data: Measurement | Sequence[Measurement], count: int, seed: int = 0)
         seed: Seed of the random numbers.
 
     Returns:
-        The folds; each sample is held out in exactly one of them.
+        The folds; each sample is held out in exactly one of them. Samples without a configuration, known
+        distances, are always fitted, unless there are no others.
 
     Raises:
         InvalidArgumentError: If there are fewer than two folds or more folds than configurations.
     """
     data = as_measurements(data)
-    labels = configuration_groups(data)
-    n_configurations = int(labels.max(initial=-1)) + 1
+    labels, n_configurations = _label_held_out(data)
     if not 2 <= count <= n_configurations:
         raise InvalidArgumentError(
             f"{count} folds: choose from 2 to {n_configurations}, the number of different configurations"
         )
-    fold_of = np.random.default_rng(seed).permutation(n_configurations) % count
+    # The last entry is that of label -1.
+    fold_of = np.append(np.random.default_rng(seed).permutation(n_configurations) % count, -1)
     return tuple(_by_measurement(data, fold_of[labels] == fold) for fold in range(count))
+
+
+def count_held_out(data: Sequence[Measurement]) -> int:
+    """Count the configurations that folds can hold out."""
+    return _label_held_out(data)[1]
+
+
+def _label_held_out(data: Sequence[Measurement]) -> tuple[Array, int]:
+    """Label the configurations that folds can hold out, and count them; -1 for what is always fitted."""
+    labels = configuration_groups(data)
+    has_none = [np.full(len(item.rows), not item.configurations_per_row) for item in data]
+    is_fitted = np.concatenate([np.empty(0, bool), *has_none])
+    if is_fitted.all():
+        return labels, int(labels.max(initial=-1)) + 1
+    # Few distances state the size of a robot: without some of them, the others would have to.
+    names, numbers = np.unique(labels[~is_fitted], return_inverse=True)
+    held_out = np.full(len(labels), -1)
+    held_out[~is_fitted] = numbers
+    return held_out, len(names)
 
 
 def leave_one_group_out(data: Measurement | Sequence[Measurement], labels: Array) -> tuple[Fold, ...]:

@@ -30,7 +30,8 @@ from ..formatting import capitalized, format_below, format_count, format_quantit
 from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, residual_of
+from ..measurements.contact import PointContact
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
@@ -87,6 +88,15 @@ PART_OF_POSITION = (
 FEW_CONFIGURATIONS = (
     "the measured configurations do not determine the errors between them",
     "measure more poses, in random configurations",
+)
+FEW_POINTS = (
+    "the measured configurations do not determine the errors between them",
+    "touch more points, at known distances from each other",
+)
+# The placeholder of unstated standard deviations of distances limits the size of the robot.
+UNSTATED_DISTANCES = (
+    "the standard deviations of the known distances are not stated",
+    "state them (column sigma_distance), or touch more points, at known distances from each other",
 )
 SAME_ORIENTATION = (
     "the tool kept its orientation, so that the measured point on it is hardly determined",
@@ -572,6 +582,8 @@ def _contradicting_files(fit: Evidence) -> list[str]:
         name, after = next(iter(comparison.after.groups.items()))
         if after.rms <= MIN_CONTRADICTION * comparison.before.groups[name].rms:
             continue
+        if item.has_stated_sigma and np.mean(residual_of(item, fit.chain, fit.instruments) ** 2) <= 1:
+            continue  # The stated noise explains the residuals.
         ratio = own_fit_ratio(fit.inlier_problem, fit.solution.x, item)
         if ratio < MIN_RATIO:
             continue
@@ -681,12 +693,21 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
     std, shown = fit.position_std, _shown_position_error(fit)
     if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
         return []
-    is_measured = all(len(item.positions()) == len(item.rows) for item in fit.data)
-    of_positions = SAME_ORIENTATION if _keeps_orientation(fit) else FEW_CONFIGURATIONS
-    statement, advice = unknown or (of_positions if is_measured else PART_OF_POSITION)
+    statement, advice = unknown or _hidden_cause(fit)
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]
+
+
+def _hidden_cause(fit: Evidence) -> tuple[str, str]:
+    """Return why residuals do not show the errors of positions, and what to measure."""
+    of_arm = [item for item in fit.data if item.configurations_per_row]
+    if all(isinstance(item, PointContact) for item in of_arm):
+        is_stated = all(item.has_stated_sigma for item in fit.data if not item.configurations_per_row)
+        return FEW_POINTS if is_stated else UNSTATED_DISTANCES
+    if not all(len(item.positions()) == len(item.rows) for item in fit.data):
+        return PART_OF_POSITION
+    return SAME_ORIENTATION if _keeps_orientation(fit) else FEW_CONFIGURATIONS
 
 
 def _keeps_orientation(fit: Evidence) -> bool:

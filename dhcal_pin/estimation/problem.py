@@ -41,6 +41,7 @@ from ..measurements.groups import POSITION
 from ..parallel import SERIAL, TaskExecutor
 from ..robot.chain import Chain
 from ..robot.conditions import SampleState
+from .contacts.scale_gauge import ScaleGauge, normalize_by_scale
 from .error_model import ErrorModel, ErrorParameter
 from .normal_equations import NormalEquations
 from .qr import (
@@ -51,7 +52,6 @@ from .qr import (
     right_singular_vectors,
     sum_of_squares,
 )
-from .scale_gauge import ScaleGauge, normalize_by_scale
 
 # Largest number of samples in a chunk.
 CHUNK_SIZE = 2000

@@ -31,8 +31,8 @@ from .. import se3
 from .._frozen import frozen
 from .._typing import Array
 from ..estimation import qr
+from ..estimation.contacts.scale_gauge import ScaleGauge
 from ..estimation.problem import Problem, linear_system, linearize_and_factor
-from ..estimation.scale_gauge import ScaleGauge
 from ..measurements.base import Measurement
 from ..measurements.pose import Pose
 from ..measurements.position import Position

@@ -99,6 +99,7 @@ class Measurement(ABC):
     #: Whether the joint positions were measured. Otherwise they only reproduce measured poses of the tip, and
     #: say nothing about the joint space of a robot.
     has_joint_values: bool
+    has_counts: bool  #: Whether the joint positions come from counts of servos, through a servo file
     rig: MountedRig | None  #: Cameras and boards of image coordinates; None for all other kinds
     recorded: Conditions | None  #: Conditions that were recorded with the samples; None without
 
@@ -143,7 +144,9 @@ class Measurement(ABC):
 
     def _initialize(self, **values: Any) -> None:
         """Set attributes of an immutable object; for constructors only."""
-        self.__dict__.update({"has_joint_values": True, "rig": None, "recorded": None} | values)
+        self.__dict__.update(
+            {"has_joint_values": True, "has_counts": False, "rig": None, "recorded": None} | values
+        )
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from .._frozen import frozen
-from ..formatting import format_quantity
+from ..formatting import format_quantity, join_names
 from .evidence import Evidence
-
-if TYPE_CHECKING:
-    from .hypotheses import Hypothesis
+from .hypotheses import ALL, Hypothesis
 
 # Evidence of too few measurements: nothing is known about them.
 NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.nan)
@@ -39,6 +38,8 @@ class Diagnosis:
     zero: Diagnosis | None = None
     #: Evidence of a part of the samples with the first hypothesis, if all of them leave residuals with it.
     part: Evidence | None = None
+    #: Joints that are turned around already if joint values come from counts of servos; None if they do not.
+    of_servos: tuple[str, ...] | None = None
     gain: float = 0.0  #: Logarithm of the ratio of the evidence with the first hypothesis to that before.
 
     @property
@@ -89,8 +90,26 @@ class Diagnosis:
             if not self.source:
                 return "Correct these lines."
             where += f":{self.lines[0]}-{self.lines[1]}"
+        if self.of_servos is not None and any(each.changes_joints for each in self.hypotheses):
+            return self._remedy_of_servos(self.of_servos)
         keys = [f"--mend {hypothesis.key}{where}" for hypothesis in self.hypotheses]
         return f"Correct the measurements, or add {' or '.join(keys)}."
+
+    def for_servos(self, turned: tuple[str, ...]) -> Diagnosis:
+        """Return the diagnosis of joint values from counts of servos, of which some were turned around."""
+        return replace(self, of_servos=turned, zero=self.zero and self.zero.for_servos(turned))
+
+    def _remedy_of_servos(self, turned: Sequence[str]) -> str:
+        """Say what to do about joint values that follow from counts: signs and zeros are those of servos."""
+        parts = self.hypotheses[0].parts
+        kinds, names = ({part.key.split(":")[i] for part in parts} for i in (0, 1))
+        if self.lines:
+            return "Correct these lines."
+        if kinds == {"sign"} and not self.source and ALL not in names:
+            return f"Add --turned {','.join(sorted({*turned} ^ names)) or 'none'}."
+        if kinds <= {"zero", "ratio"} and not self.source:
+            return f"Correct the motors of {join_names(sorted(names))} in the servo file."
+        return "Correct the measurements."
 
 
 def is_suspicious(evidence: Evidence) -> bool:

@@ -31,7 +31,8 @@ import numpy as np
 
 from .._frozen import frozen
 from .._typing import Array
-from ..estimation.initialization import initialize_frames, make_problem
+from ..estimation.contacts import log_volume
+from ..estimation.initialization import compare_tools, initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, left_singular_vectors
@@ -125,6 +126,8 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Eviden
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
     errors = initialize_frames(select_parameters(chain, sets), equal, {}, _N_FRAME_ITERATIONS)
+    if any(item.is_contact for item in equal):
+        errors = compare_tools(errors, equal, {}, _N_FRAME_ITERATIONS)
     equal = tuple(item.initialized(errors.chain) for item in equal)
     is_robot = errors.is_of_arm
     n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
@@ -147,6 +150,8 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Eviden
         n_rows,
         noise.min_factor,
     )
+    # The joint values of contacts contain the noise.
+    log += sum(log_volume(problem, solution.x, item) for item in problem.data if item.is_contact)
     return Evidence(
         log - noise.log_determinant,
         width,

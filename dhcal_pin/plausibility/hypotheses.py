@@ -383,6 +383,18 @@ class Hypothesis:
             return self.change.first.concerns_joints and self.change.second.concerns_joints
         return isinstance(self.change, JointChange | RowShift)
 
+    @property
+    def parts(self) -> tuple[Hypothesis, ...]:
+        """Single mistakes that it consists of."""
+        if isinstance(self.change, BothChanges):
+            return (*self.change.first.parts, *self.change.second.parts)
+        return (self,)
+
+    @property
+    def changes_joints(self) -> bool:
+        """Whether one of its mistakes is about the joint columns."""
+        return any(isinstance(part.change, JointChange) for part in self.parts)
+
     def log_jacobian(self, chain: Chain, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""
         if isinstance(self.change, BothChanges):
@@ -619,8 +631,10 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
     """Yield wrong units of joints, lengths, and rotation vectors or Euler angles."""
     n, revolute = chain.n_joints, revolute_joints(chain)
+    # A servo file states the unit of counts.
+    has_units = not any(item.has_counts for item in data)
     for members, kind, large, small, factor in (
-        (revolute, "revolute", "deg", "rad", ANGLES["deg"]),
+        (revolute if has_units else [], "revolute", "deg", "rad", ANGLES["deg"]),
         ([j for j in range(n) if j not in revolute], "prismatic", "mm", "m", LENGTHS["mm"]),
     ):
         groups = [members, *([j] for j in members if len(members) > 1)] if members else []

@@ -2,11 +2,14 @@
 
 A servo that is mounted the other way round has the wrong sign. Each hypothesis turns around no joint, one or
 two joints, or all joints but these, as a mirrored arm does. Its evidence is that of an arm with the zeros,
-lengths and axis directions of a low-cost arm (`evidence`). The signs as they were read are kept unless
-another hypothesis explains the measurements better by the factor exp(`MIN_LOG_RATIO`). All hypotheses within
-this factor of the best one are open questions. The configuration that decides an open question is the one at
-which the arms of the two hypotheses, each with its own base and tool, place the tool farthest from each
-other.
+lengths and axis directions of a low-cost arm (`evidence`). All hypotheses within the factor
+exp(`MIN_LOG_RATIO`) of the best one are possible. The one that turns around the fewest joints is taken, so
+that signs are kept as they were read unless the measurements contradict; the others are open questions.
+
+The configuration that decides an open question is the one at which the arms of the two hypotheses, each with
+its own base and tool, place the tool farthest from each other. Touched points, whose places are unknown, show
+no position of the tool. They are compared only with known distances between them: an arm of another size and
+shape can touch unknown points with any signs.
 """
 
 from __future__ import annotations
@@ -56,7 +59,8 @@ class OpenSigns:
     joints: tuple[str, ...]  #: Joints that may all turn the other way.
     #: Value of each joint of the arm at which the two arms differ most [rad or m], as the file states them.
     configuration: tuple[float, ...]
-    distance: float  #: Distance of the tools of the two arms there [m].
+    #: Distance of the tools of the two arms there [m]; None if the measurements show no positions.
+    distance: float | None
 
 
 @frozen
@@ -98,8 +102,8 @@ class SignDecision:
         if not self.is_compared:
             return [
                 "The signs of the joints were not compared, which needs positions or poses of the tool, at "
-                "least 8. Look which joints turn the other way than in the URDF, and name them: --turned "
-                "NAME[,NAME] or --turned none."
+                "least 8, or touched points with known distances. Look which joints turn the other way than "
+                "in the URDF, and name them: --turned NAME[,NAME] or --turned none."
             ]
         return [self._question(each) for each in self.open[:_MAX_LISTED]]
 
@@ -112,7 +116,9 @@ class SignDecision:
             f"other way{' all together,' if several else ''} with other zeros, the arm fits the measurements "
             "about as well. "
         )
-        if open_signs.distance > _MIN_DISTANCE:
+        if open_signs.distance is None:
+            text += "Look"
+        elif open_signs.distance > _MIN_DISTANCE:
             values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
             pose = ", ".join(
                 f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values
@@ -156,13 +162,15 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
     if fits[ranked[0]].length_scale > _MIN_EXCHANGED:
         _require_right_links(chain, data, fits[ranked[0]])
     limit = fits[ranked[0]].log - MIN_LOG_RATIO
-    chosen = () if fits[()].log >= limit else ranked[0]
-    others = [turned for turned in ranked if turned != chosen and fits[turned].log >= limit]
+    possible = [turned for turned in ranked if fits[turned].log >= limit]
+    chosen = min(possible, key=len)
+    others = [turned for turned in possible if turned != chosen]
+    shows_positions = any(len(item.positions()) for item in samples)
     return replace(
         undecided,
         is_compared=True,
         turned=_names(chain, chosen),
-        open=tuple(_open_signs(chain, chosen, other, fits) for other in others),
+        open=tuple(_open_signs(chain, chosen, other, fits, shows_positions) for other in others),
     )
 
 
@@ -213,8 +221,10 @@ def _samples(data: Sequence[Measurement]) -> list[Measurement]:
     if data and all(item.rig is not None for item in data):
         # Images show poses of the tool, one by one. Those of another camera have another base and tool.
         data = [max((item.tool_poses() for item in data), key=lambda item: len(item.rows))]
-    samples = draw_samples(comparable_items(data))[0]
-    return samples if has_enough_rows(samples) else []
+    lengths = [item for item in data if not item.configurations_per_row]
+    samples = [*draw_samples(comparable_items(data))[0], *lengths]
+    has_length = any(item.has_length_scale for item in samples)
+    return samples if has_length and has_enough_rows(samples) else []
 
 
 def _hypotheses(chain: Chain) -> list[tuple[int, ...]]:
@@ -241,7 +251,11 @@ def _names(chain: Chain, numbers: Sequence[int]) -> tuple[str, ...]:
 
 
 def _open_signs(
-    chain: Chain, chosen: tuple[int, ...], other: tuple[int, ...], fits: dict[tuple[int, ...], Evidence]
+    chain: Chain,
+    chosen: tuple[int, ...],
+    other: tuple[int, ...],
+    fits: dict[tuple[int, ...], Evidence],
+    shows_positions: bool,
 ) -> OpenSigns:
     """Find the configuration at which the arms of two hypotheses differ most."""
     q = random_configurations(chain, _N_CONFIGURATIONS)
@@ -255,7 +269,8 @@ def _open_signs(
     best = int(np.argmax(distances))
     read = q[best] * _signs(chain, chosen)
     different = sorted({*chosen} ^ {*other})
-    return OpenSigns(_names(chain, different), tuple(read.tolist()), float(distances[best]))
+    distance = float(distances[best]) if shows_positions else None
+    return OpenSigns(_names(chain, different), tuple(read.tolist()), distance)
 
 
 def turn_joints(chain: Chain, names: Sequence[str]) -> Chain:

@@ -102,6 +102,9 @@ class Trial(NamedTuple):
 
     def find_pair(self) -> Diagnosis:
         """Look for two mistakes in measurements with positions, by which pairs are compared."""
+        if not any(item.has_length_scale for item in self.samples):
+            # An arm with large errors can touch unknown points after a wrong change, too.
+            return Diagnosis(self.before)
         is_plausible = self.misfit <= _LARGEST_MISFITS[self.sets] and not leaves_residuals(self.before)
         if not self.misfit or (is_plausible and not self.single.hypotheses):
             return self.single

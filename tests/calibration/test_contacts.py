@@ -5,6 +5,7 @@ import pytest
 from robots import nominal_arm
 from sessions import Simulation
 from slow_cases import some_slow
+from touching_arms import NOMINAL, TouchingArm
 
 from dhcal_pin import calibrate
 from dhcal_pin.estimation import select_parameters
@@ -12,7 +13,7 @@ from dhcal_pin.measurements import MultiTargetPosition, Noise, PointContact, Poi
 from dhcal_pin.plausibility import diagnose_mixups
 
 
-def touched(distance_factor=1.0, zero=0.0):
+def touched(distance_factor=1.0, zero=0.0, sigma=None):
     """Return a nominal arm, contacts of a true one with four points, and distances between them.
 
     The values of the second joint are larger than the true ones by `zero` [rad].
@@ -26,7 +27,7 @@ def touched(distance_factor=1.0, zero=0.0):
     pairs = [(i, (i + 1) % 4) for i in range(4)]
     lengths = [distance_factor * np.linalg.norm(points[i] - points[j]) for i, j in pairs]
     names = contacts.names
-    distances = PointDistance(6, [(names[i], names[j]) for i, j in pairs], lengths)
+    distances = PointDistance(6, [(names[i], names[j]) for i, j in pairs], lengths, sigma)
     return nominal, contacts.resample(contacts.q + zero * np.eye(6)[1]), distances
 
 
@@ -117,3 +118,52 @@ def test_targets_with_exchanged_names_are_named():
         ("target", "a", "b", (5,)),
         ("target", "b", "a", (4,)),
     ]
+
+
+# Seeds of arms whose touches of four points leave a combination of zeros and lengths nearly free.
+WEAK = (4, 5, 6)
+
+
+def touched_by_low_cost_arm(seed, n_points):
+    """Return an arm that touched points, its calibration, and the true error in the measured region [m]."""
+    arm = TouchingArm.random(seed, 200, n_points, ("shoulder",))
+    fit = calibrate(NOMINAL, arm.data, "low-cost,base,tool", turned=("shoulder",), session="off")
+    assert fit.measured_region is not None
+    return fit, arm.error(fit.chain, fit.measured_region.draw(np.random.default_rng(1), 300))
+
+
+@pytest.mark.parametrize("seed", some_slow(WEAK, {0}))
+def test_errors_that_few_points_do_not_show_are_stated_and_more_points_determine_them(seed):
+    """The cross-validated error was 0.9 mm with verdict ok beside a true error of 3 to 4 mm."""
+    fit, true = touched_by_low_cost_arm(seed, 4)
+    (reason,) = fit.verdict.reasons
+    assert fit.verdict.status == "caution"
+    assert reason.startswith("The measured configurations do not determine the errors between them")
+    assert reason.endswith("Touch more points, at known distances from each other.")
+    assert fit.comparisons[0].after.groups["position"].rms < 0.5 * true
+    assert 0.7 < fit.position_std / true < 3
+    # The advice helps.
+    fit, less = touched_by_low_cost_arm(seed, 8)
+    assert (fit.verdict.status, fit.verdict.reasons) == ("ok", ())
+    assert less < 1e-3 < true
+
+
+def test_touches_that_determine_an_arm_are_ok():
+    """Without the standard deviations of the distances, the size of the arm is not known as well."""
+    nominal, *data = touched()
+    (reason,) = calibrate(nominal, data).verdict.reasons
+    assert reason.startswith("The standard deviations of the known distances are not stated")
+    assert "column sigma_distance" in reason
+    fit = calibrate(nominal, touched(sigma=1e-4)[1:])
+    assert (fit.verdict.status, fit.verdict.reasons) == ("ok", ())
+    assert fit.position_std < 2e-4
+
+
+def test_known_distances_are_not_held_out():
+    """Without some of few distances, nothing else states the size of the arm."""
+    nominal, *data = touched()
+    fit = calibrate(nominal, data)
+    held_out = fit.comparisons[0]
+    assert held_out.title == "cross-validated"
+    assert "length" not in held_out.after.groups
+    assert any(item.kind == "point_distance" for item in fit.data)

@@ -19,6 +19,8 @@ from servo_arms import (
     lerobot_degrees,
     lerobot_text,
 )
+from touching_arms import JOINTS as TOUCHING_JOINTS
+from touching_arms import TouchingArm, urdf
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.io import read_measurements, read_robot, read_servos
@@ -196,3 +198,27 @@ def test_outputs_that_are_impossible_are_refused(arm, run, options, words):
     status, _, err = run(*CALIBRATE, *options)
     assert (status, err.count("\n")) == (2, 1)
     assert all(word in err for word in words), err
+
+
+def test_remedies_for_touches_by_servos_can_be_followed(tmp_path, monkeypatch, run):
+    """`--mend sign:shoulder` was advised, and refused beside --servos."""
+    monkeypatch.chdir(tmp_path)
+    arm = TouchingArm.random(1, 60, 4, ("shoulder",))
+    Path("hobby.urdf").write_text(urdf())
+    Path("servos.toml").write_text("".join(f"[motor.{name}]\n" for name in TOUCHING_JOINTS))
+    counts = np.round(2048 + arm.data[0].q * 4096 / (2 * np.pi)).astype(int)
+    points = arm.data[0].text_values()["point"]
+    rows = [",".join([f"{name}[ticks]" for name in TOUCHING_JOINTS] + ["point"])]
+    rows += [",".join([*map(str, row), point]) for row, point in zip(counts, points, strict=True)]
+    Path("touches.csv").write_text("\n".join([*rows, ""]))
+    command = ("calibrate", "hobby.urdf", "touches.csv", "--tip", "l6", "--servos", "servos.toml")
+    command = (*command, "--parameters", "placement,tool", "-o", "z.urdf")
+    status, *streams = run(*command)
+    text = " ".join("".join(streams).split())
+    assert status
+    assert "The sign of joint shoulder is wrong" in text
+    assert "Add --turned shoulder." in text
+    assert "--mend" not in text
+    status, *streams = run(*command, "--turned", "shoulder")
+    assert not status
+    assert "refused" not in "".join(streams)

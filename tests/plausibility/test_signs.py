@@ -7,11 +7,16 @@ import numpy as np
 import pytest
 from paper_arms import photograph
 from servo_arms import JOINTS, RANGES, SO101, TIP, ServoArm, lerobot_degrees
+from slow_cases import some_slow
+from touching_arms import NOMINAL as TOUCHING
+from touching_arms import TouchingArm
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import Pose, Position
 from dhcal_pin.plausibility import decide_signs
+from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
+from dhcal_pin.plausibility.hypotheses import list_hypotheses
 from dhcal_pin.plausibility.signs import known_signs
 from dhcal_pin.robot import Chain, parse_urdf
 
@@ -138,6 +143,30 @@ def test_images_and_few_samples_leave_all_signs_open():
     assert "--turned" in signs.questions[0]
 
 
+@pytest.mark.parametrize("seed", some_slow(range(6), {1}))
+def test_signs_from_touched_points_are_right_or_open(seed):
+    turned = [(), ("shoulder",), ("elbow", "roll")][seed % 3]
+    arm = TouchingArm.random(seed, 100, 4, turned)
+    signs = decide_signs(TOUCHING, arm.data)
+    assert signs.is_compared
+    # The base turns little while the arm touches one point, and nobody sees where it stands.
+    free = {"yaw", "roll"}
+    assert {*signs.turned} ^ {*turned} <= free
+    assert {name for each in signs.open for name in each.joints} <= free
+    for each, question in zip(signs.open, signs.questions, strict=False):
+        assert each.distance is None
+        assert "measurement at" not in question
+        assert "right-hand rule" in question
+
+
+def test_touched_points_without_known_distances_decide_no_sign():
+    arm = TouchingArm.random(1, 100, 4, ("shoulder",))
+    signs = decide_signs(TOUCHING, arm.data[:1])
+    assert not signs.is_compared
+    assert "known distances" in signs.questions[0]
+    assert decide_signs(TOUCHING, arm.data).is_compared
+
+
 def test_a_urdf_with_other_zeros_is_named():
     """Followed advice helps: with the zeros of the servos in the URDF nothing is said."""
     rng = np.random.default_rng(4)
@@ -181,3 +210,30 @@ def test_turned_joints_turn_the_other_way_in_the_urdf():
     np.testing.assert_allclose(arm.poses(q), chain.poses(q * signs), atol=1e-14)
     np.testing.assert_array_equal(read_back.lower, [*chain.lower[:3], *-chain.upper[3:]])
     np.testing.assert_array_equal(read_back.upper, [*chain.upper[:3], *-chain.lower[3:]])
+
+
+@pytest.mark.parametrize(
+    ("key", "remedy"),
+    [
+        ("sign:shoulder_lift", "Add --turned elbow_flex,shoulder_lift."),
+        ("sign:elbow_flex", "Add --turned none."),
+        ("zero:elbow_flex:+90deg", "Correct the motors of elbow_flex in the servo file."),
+        ("swap:elbow_flex:wrist_flex", "Correct the measurements."),
+        ("lengths:mm-not-m", "Correct the measurements, or add --mend lengths:mm-not-m."),
+    ],
+)
+def test_remedies_of_servos_are_allowed_beside_their_file(key, remedy):
+    data = Position(np.zeros((2, 5)), np.zeros((2, 3)))
+    hypothesis = next(each for each in list_hypotheses(NOMINAL, [data]) if each.key == key)
+    found = Diagnosis(NO_EVIDENCE, (hypothesis,))
+    assert found.for_servos(("elbow_flex",)).remedy == remedy
+    assert f"--mend {key}" in found.remedy
+
+
+def test_counts_of_servos_have_no_wrong_unit():
+    data = Position(np.zeros((2, 5)), np.zeros((2, 3)))
+    keys = [
+        [each.key for each in list_hypotheses(NOMINAL, [item])]
+        for item in (data, data.replace(has_counts=True))
+    ]
+    assert {key.partition(":")[0] for key in {*keys[0]} - {*keys[1]}} == {"joint", "joints"}

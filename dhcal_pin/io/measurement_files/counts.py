@@ -35,7 +35,8 @@ def with_joint_values(table: DataTable, chain: Chain, servos: ServoFile | None) 
         prefix = column.name[: len(column.name) - len(name)]
         headers[column.index] = f"{prefix}{servo.joint}[rad]"
         numbers[column.index] = servo.angles(_checked_counts(table, column, servo))
-    return replace(table, headers=tuple(headers), numbers=numbers, file_headers=table.written_headers)
+    written = table.written_headers
+    return replace(table, headers=tuple(headers), numbers=numbers, file_headers=written, has_counts=True)
 
 
 def _find_servo(table: DataTable, chain: Chain, servos: ServoFile | None, column: Column, name: str) -> Servo:

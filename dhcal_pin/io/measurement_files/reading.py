@@ -394,7 +394,7 @@ def build_measurement(
         raise FileFormatError(f"{table.source}:{line}: {error.problem}") from None
     except DhcalError as error:
         raise FileFormatError(f"{table.source}: {error}") from None
-    return data.replace(rows=np.array(table.lines), source=table.source)
+    return data.replace(rows=np.array(table.lines), source=table.source, has_counts=table.has_counts)
 
 
 def parse_joint_positions(table: DataTable, chain: Chain, prefix: str = "") -> Array:

@@ -95,6 +95,7 @@ class DataTable:
     header_example: str = MEASUREMENT_HEADER  # Header that is expected, for messages
     euler_angles: EulerAngles | None = None  # Angles that columns of rotation vectors were computed from
     file_headers: tuple[str, ...] = ()  # Header cells of the file if `headers` differ from them
+    has_counts: bool = False  # Whether columns of joint values were counts of servos
     # Function that reads the table below lines of titles; None if the first line looks like the header.
     read_below_titles: Callable[[], DataTable] | None = None
 

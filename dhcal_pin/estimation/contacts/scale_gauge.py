@@ -33,9 +33,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._frozen import frozen
-from .._typing import Array
-from ..robot.chain import Chain
+from ..._frozen import frozen
+from ..._typing import Array
+from ...robot.chain import Chain
 
 # Number of configurations at which size and rotation are evaluated.
 _N_SAMPLES = 100
