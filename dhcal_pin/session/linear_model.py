@@ -18,9 +18,9 @@ import numpy as np
 from .._frozen import frozen
 from .._kernels import apply_observation_matrix
 from .._typing import Array
+from ..estimation.contacts.scale_gauge import normalize_by_scale
 from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
-from ..estimation.contacts.scale_gauge import normalize_by_scale
 from ..measurements.base import Measurement, instrument_values
 from ..measurements.groups import POSITION
 from ..robot.error_families import COMPLIANCE, JOINT_TERMS, MIN_TORQUE, growing_links
