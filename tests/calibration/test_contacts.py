@@ -80,7 +80,7 @@ def test_a_wrong_gear_ratio_among_contacts_is_named(joint, factor):
 
 @pytest.mark.parametrize("is_run", [False, True])
 def test_outliers_that_fit_another_name_are_named(is_run):
-    nominal, contacts, distances = touched()
+    nominal, contacts, distances = touched(sigma=1e-4)
     names = np.array(contacts.text_values()["point"])
     # Every row of a run, or four rows somewhere, with exchanged names.
     changed = np.arange(60, 80) if is_run else np.array([5, 6, 40, 72])
