@@ -185,7 +185,7 @@ DATA: dict[str, Any] = {
 }
 TIP: dict[str, Any] = {
     "metavar": "LINK",
-    "help": "tip link of a URDF, or body or site of an MJCF (default: the deepest leaf link)",
+    "help": "tip link of a URDF, or body or site of an MJCF (default: that of a sidecar, else the deepest)",
 }
 ROOT: dict[str, Any] = {
     "metavar": "LINK",

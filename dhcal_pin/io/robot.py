@@ -208,14 +208,9 @@ def _read(
 
 
 def _default_tip(urdf: Urdf, sidecar: PathLike | None) -> str:
-    """Return the deepest leaf; of several equally deep ones, the link that the sidecar states."""
-    try:
-        return default_tip(urdf)
-    except DhcalError:
-        stated = read_tip(sidecar) if sidecar else None
-        if stated not in urdf.links:
-            raise
-        return stated
+    """Return the link that the sidecar states, or else the deepest leaf."""
+    stated = read_tip(sidecar) if sidecar else None
+    return stated if stated is not None and stated in urdf.links else default_tip(urdf)
 
 
 def read_robot(
@@ -230,7 +225,7 @@ def read_robot(
     Args:
         path: File in one of `FORMATS`; a file with another ending is read as a URDF. `example:NAME` is a
             robot of example-robot-data, and `flange.urdf` a flange at any pose that ships with the package.
-        tip: Tip link of a URDF; the deepest leaf if None, or that of the sidecar if several are equally deep.
+        tip: Tip link of a URDF; that of the sidecar if None, or else the deepest leaf.
         sidecar: Sidecar to read in place of the one beside the robot.
         package_dirs: Folders in which packages with meshes are searched first.
         root: Link of a URDF where the chain begins; the root of the URDF if None.

@@ -92,15 +92,17 @@ def test_a_robot_has_the_name_of_its_file():
     assert robot_name(".urdf") == "arm"
 
 
-def test_a_sidecar_chooses_among_equally_deep_tips(tmp_path):
-    """Without it, the last joints of the gripper are the deepest ones."""
-    links = ("base", "hand", "ball", "left", "right")
-    joints = (
+@pytest.mark.parametrize("is_deeper", [False, True])
+def test_the_tip_of_the_sidecar_is_the_default(tmp_path, is_deeper):
+    """Without it, the last joints of the gripper are the deepest ones, or a nail of a finger."""
+    joints = [
         ("revolute", "base", "hand"),
         ("fixed", "hand", "ball"),
         ("prismatic", "hand", "left"),
         ("prismatic", "hand", "right"),
-    )
+    ]
+    joints += [("revolute", "left", "nail")] * is_deeper
+    links = ["base", *(child for _, _, child in joints)]
     lines = [f'<link name="{name}"/>' for name in links]
     lines += [
         f'<joint name="to_{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
@@ -109,8 +111,11 @@ def test_a_sidecar_chooses_among_equally_deep_tips(tmp_path):
     ]
     path = tmp_path / "arm.urdf"
     path.write_text(f'<robot name="arm">{"".join(lines)}</robot>')
-    with pytest.raises(DhcalError, match="several tips are equally deep"):
-        read_robot(path)
+    if is_deeper:
+        assert read_robot(path).tip == "nail"
+    else:
+        with pytest.raises(DhcalError, match="several tips are equally deep"):
+            read_robot(path)
     (tmp_path / "arm.calibration.toml").write_text('tip = "ball"\n')
     assert read_robot(path).tip == "ball"
     assert read_robot(path, "left").tip == "left"
