@@ -427,13 +427,18 @@ def test_chains_with_different_joints_are_refused(place, run):
         said = error_of(run("compensate", "ur5.urdf", second, "targets.csv", "-o", "out.csv", *tips))
         for word in words:
             assert word in said
-    # A frame behind the tip makes another default tip.
+    # A frame behind the tip makes another default tip, unless the sidecar states the tip.
     text = Path("true.urdf").read_text()
     more = (
         '<link name="probe"/><joint name="p" type="fixed"><parent link="tool0"/><child link="probe"/></joint>'
     )
     Path("true.urdf").write_text(text.replace("</robot>", f"{more}</robot>"))
-    assert "--tip" in error_of(run("compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"))
+    without_tip = "compensate", "ur5.urdf", "true.urdf", "targets.csv", "-o", "out.csv"
+    assert "tool0" in stderr_of(run(*without_tip))
+    Path("true.calibration.toml").unlink()
+    said = error_of(run(*without_tip))
+    assert "ur5.urdf" in said
+    assert "probe" in said
     assert "is an input" in error_of(run(*BASE[:-1], "targets.csv"))
 
 
@@ -593,6 +598,14 @@ def test_exchanged_robots_are_noticed(place, capsys):
     text = Path("true.urdf").read_text()
     Path("true.urdf").write_text(re.sub(r"-?\d+\.\d{7,}", lambda number: f"{float(number[0]):.6f}", text))
     assert warning([*BASE]) == []
+
+
+def test_the_same_robot_twice_is_noticed(place, run):
+    nominal, _ = place
+    write_targets(nominal.poses(draw(nominal, 2, np.random.default_rng(5))))
+    said = stderr_of(run("compensate", "ur5.urdf", "ur5.urdf", *BASE[3:]))
+    assert "both robots have the same joint origins" in said
+    assert "same joint origins" not in stderr_of(run(*BASE))
 
 
 def test_joint_positions_in_degrees(place):

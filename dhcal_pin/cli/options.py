@@ -316,11 +316,11 @@ def read_one_robot(path: str, args: argparse.Namespace, sidecar: str | None = No
     return read_robot(path, args.tip, sidecar, args.package_dir, args.root)
 
 
-def read_robot_or_table(path: str, args: argparse.Namespace) -> Chain:
-    """Read one of several robots; the options of a URDF do not concern a DH table."""
+def read_robot_or_table(path: str, args: argparse.Namespace, tip: str | None = None) -> Chain:
+    """Read one of several robots, to a tip unless --tip names one; a DH table has no such options."""
     from ..io.robot import has_dh_table, read_robot  # lazy import: loads Pinocchio
 
-    tip, root = (None, None) if has_dh_table(path) else (args.tip, args.root)
+    tip, root = (None, None) if has_dh_table(path) else (args.tip or tip, args.root)
     return read_robot(path, tip, package_dirs=args.package_dir, root=root)
 
 

@@ -111,11 +111,12 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
     from ... import se3
     from ...compensation import nominal_root_pose
 
-    nominal, calibrated = (read_robot_or_table(path, args) for path in (args.nominal, args.calibrated))
+    calibrated = read_robot_or_table(args.calibrated, args)
+    nominal = read_robot_or_table(args.nominal, args, calibrated.tip)
     if nominal.tip != calibrated.tip and args.tip is None:
         raise InvalidArgumentError(
-            f"{args.calibrated}: its tip is {calibrated.tip!r}, but the tip of {args.nominal} is "
-            f"{nominal.tip!r}; choose one with --tip"
+            f"{args.calibrated}: its tip is {calibrated.tip!r}; expected {nominal.tip!r}, the tip of "
+            f"{args.nominal}"
         )
     chains = nominal, calibrated
     if args.frame == BASE:
@@ -194,13 +195,20 @@ def _fitting_unit(nominal: robot.Chain, calibrated: robot.Chain, targets: io.Tar
 def exchange_warning(
     nominal_path: str, calibrated_path: str, nominal: robot.Chain, calibrated: robot.Chain
 ) -> str:
-    """Return a warning if the nominal and the calibrated robot look exchanged.
+    """Return a warning if the nominal and the calibrated robot are the same, or look exchanged.
 
-    They do in two cases. Only the nominal robot has a sidecar, which a calibration writes. Or both or none
-    have one, and of the numbers that differ between the URDFs most are computed in the nominal file and most
-    are not in the calibrated one. A number is computed if it has at least 15 significant digits and is not a
-    multiple of 15 degrees: a calibration writes all digits, and people do not.
+    They look exchanged in two cases. Only the nominal robot has a sidecar, which a calibration writes. Or
+    both or none have one, and of the numbers that differ between the URDFs most are computed in the nominal
+    file and most are not in the calibrated one. A number is computed if it has at least 15 significant digits
+    and is not a multiple of 15 degrees: a calibration writes all digits, and people do not.
     """
+    import numpy as np  # lazy import: it is slow to load
+
+    is_known = nominal.origins.shape == calibrated.origins.shape and calibrated.transmission is None
+    if is_known and np.array_equal(nominal.origins, calibrated.origins):
+        return (
+            "both robots have the same joint origins, so that nothing is corrected; state the calibrated one"
+        )
     has_sidecar = [io.existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
     if has_sidecar == [True, False]:
         reason = f"it has a sidecar, and {calibrated_path} has none"
