@@ -135,6 +135,20 @@ def test_large_changes_have_the_right_size():
     assert result.reasons[0].endswith(", as after a new set-up of the instrument.")
 
 
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_an_instrument_at_any_place_is_no_changed_robot(kind):
+    """Where the instrument stands and how it is turned does not matter, also if the turn is nearly 180°."""
+    sim, fit, q = calibrated("ur10", 3, kind)
+    rng = np.random.default_rng(1)
+    for angle in (60, 120, 150, 165, 172, 176, 178, 179.5):
+        axis = rng.standard_normal(3)
+        turn = pin.exp3(np.deg2rad(angle) * axis / np.linalg.norm(axis))
+        data = measured(sim, q[:8], kind, True, base=pin.SE3(turn, rng.normal(0, 2, 3)))
+        result = recheck(fit.accepted.chain, [data], fit.uncertainty)
+        assert (result.verdict, result.what) == ("changed", "base"), angle
+        assert "The arm itself did not change" in result.reasons[1]
+
+
 def test_a_turn_about_the_first_axis_names_joint_and_base():
     sim, fit, q = calibrated("ur10", 7, Position)
     zeros = np.zeros(6)
