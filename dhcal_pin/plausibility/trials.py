@@ -208,13 +208,16 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
 
 def _measure_ratios(trial: Trial) -> list[_Measured]:
     """Return the joint values that need a factor, of one joint or of all revolute ones."""
-    ratios, groups, revolute = [], [[j] for j in range(trial.chain.n_joints)], revolute_joints(trial.chain)
-    for joints in [*groups, revolute] if len(revolute) > 1 else groups:
-        of_logarithm = partial(_ratio_of_logarithm, trial.chain, joints)
-        # Without positions, each size needs a fit.
-        tried = [of_logarithm(size).apply(trial.samples) or trial.samples for size in _PROBED_RATIOS]
-        if not trial.misfit and -_costs(trial, tried).min() < trial.before.log + _MIN_LOG_RATIO:
-            continue
+    groups, revolute = [[j] for j in range(trial.chain.n_joints)], revolute_joints(trial.chain)
+    groups = [*groups, revolute] if len(revolute) > 1 else groups
+    kinds = [partial(_ratio_of_logarithm, trial.chain, joints) for joints in groups]
+    if not trial.misfit:
+        # Without positions, each size needs a fit: only the kind is measured that explains most.
+        costs = [_costs(trial, _with_sizes(trial, kind, _PROBED_RATIOS)).min() for kind in kinds]
+        is_explaining = -min(costs) >= trial.before.log + _MIN_LOG_RATIO
+        kinds = [kinds[int(np.argmin(costs))]] if is_explaining else []
+    ratios = []
+    for of_logarithm in kinds:
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
         if abs(best) >= _MIN_RATIO:
             ratios += _measured(trial, of_logarithm, best)
@@ -227,6 +230,13 @@ def _ratio_of_logarithm(chain: Chain, joints: Sequence[int], size: float) -> Hyp
     return ratio_hypothesis(chain, joints, float(f"{np.exp(size / 100):.4g}"))
 
 
+def _with_sizes(
+    trial: Trial, of_size: Callable[[float], Hypothesis], sizes: Sequence[float]
+) -> list[Sequence[Measurement]]:
+    """Return the samples after the change of a mistake of each size."""
+    return [of_size(size).apply(trial.samples) or trial.samples for size in sizes]
+
+
 def _closest(
     trial: Trial, of_size: Callable[[float], Hypothesis], reach: float, steps: Sequence[float]
 ) -> float:
@@ -234,7 +244,7 @@ def _closest(
     best = 0.0
     for step in steps:
         sizes = np.arange(best - reach, best + reach, step).round(1).tolist()
-        costs = _costs(trial, [of_size(size).apply(trial.samples) or trial.samples for size in sizes])
+        costs = _costs(trial, _with_sizes(trial, of_size, sizes))
         best, reach = sizes[int(np.argmin(costs))], step
     return best
 
@@ -250,7 +260,7 @@ def _refine(
             continue
         for reach, step in steps:
             sizes = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
-            changed = [of_size(size).apply(trial.samples) or trial.samples for size in sizes]
+            changed = _with_sizes(trial, of_size, sizes)
             evidence = [fit_evidence(trial.chain, each, trial.sets).log for each in changed]
             best = sizes[int(np.argmax(evidence))]
         if abs(best) >= smallest:
