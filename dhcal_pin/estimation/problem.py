@@ -34,7 +34,7 @@ from scipy.linalg import block_diag
 from .._frozen import frozen
 from .._kernels import apply_observation_matrix, factor_jacobian
 from .._kernels.types import FrameBatch, ObservationMatrix, twists_before
-from .._kernels.work_arrays import UnbufferedRows, work_array
+from .._kernels.work_arrays import work_array
 from .._typing import Array
 from ..measurements.base import InstrumentParameter, Measurement, instrument_values, residual_of
 from ..measurements.groups import POSITION
@@ -309,7 +309,6 @@ class Linearization:
         """Number of columns of [J | r]."""
         return len(self.bodies) + len(self.instrument_columns) + 1
 
-    @UnbufferedRows()
     def _fill(self, block: Array, chunk: Chunk, frames: FrameBatch, small_angle: bool) -> ObservationMatrix:
         """Fill a block (c, k, m) with the last c columns of [J | r]; return the observation matrix."""
         data, u = chunk.data, instrument_values(chunk.data, self.instruments)
