@@ -45,6 +45,8 @@ QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
 JOINT_CHANGES = ("sign", "zero", "ratio", "swap", "columns", "joint", "joints")
+# Kinds of changes that the controller may keep: the robot is then for joint values with the change.
+LASTING_CHANGES = ("sign", "zero", "ratio", "swap", "columns")
 # Sign between the keys of two mistakes.
 _AND = "+"
 # Name of all joints in a key.
