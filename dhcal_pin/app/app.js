@@ -51,7 +51,7 @@ function showError(id, text) {
 
 // Controls of the page by the options of the command line.
 const CONTROLS = {
-  "--skip-bad-rows": "“Skip rows that lack a number or a name”", "--tip": "“Tip link”", "--columns": "a column map among the files",
+  "--skip-bad-rows": "“Skip rows that lack a number, a name or a rotation”", "--tip": "“Tip link”", "--columns": "a column map among the files",
   "--rig": "a rig file among the files", "--robot": "a robot among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--sheet": "“Sheet of Excel files”", "--force": "“Write the robot all the same”",
 };
 

@@ -415,7 +415,10 @@ class Evidence(FittedModel):
         found = diagnose_mixups(self.errors.chain, self.holdout, _usual_errors(self), holdout=others)
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
-        return _with_servos(self, replace(found, source=source)) if found.hypotheses else None
+        # The fitted samples show that the robot file is right.
+        hypotheses = tuple(replace(each, instead="", is_instead=False) for each in found.hypotheses)
+        found = replace(found, source=source, hypotheses=hypotheses)
+        return _with_servos(self, found) if hypotheses else None
 
     @cached_property
     def generalization(self) -> Generalization:

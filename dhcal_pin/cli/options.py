@@ -219,7 +219,7 @@ ARM: dict[str, Any] = {
 }
 SKIP_BAD_ROWS: dict[str, Any] = {
     "action": "store_true",
-    "help": "skip rows that lack a number or a name, instead of an error that lists them",
+    "help": "skip rows that lack a number, a name or a rotation, instead of an error that lists them",
 }
 FIT_FRAMES: dict[str, Any] = {
     "action": "store_true",

@@ -97,6 +97,7 @@ class JobData:
     unreachable: dict[str, list[UnreachableRow]]
     warnings: dict[str, list[str]]  # Warnings about the input, by file
     notes: dict[str, list[str]]  # What of the input is not used, by file
+    changes: dict[str, list[str]]  # What --mend changed, by file
 
 
 @frozen(eq=False)
@@ -137,7 +138,7 @@ class CalibrationOutcome:
             "outliers_by_file": rows,
             "warnings": [
                 f"{path}: {text}"
-                for by_file in (data.notes, data.warnings)
+                for by_file in (data.changes, data.notes, data.warnings)
                 for path, texts in by_file.items()
                 for text in texts
             ],
@@ -258,9 +259,12 @@ def _without(data: Measurement, unreachable: Sequence[UnreachableRow]) -> Measur
     return data.take(~np.isin(data.rows, [item.row for item in unreachable]))
 
 
-def _mended(chain: Chain, files: list[MeasurementFile], changes: Sequence[str]) -> list[MeasurementFile]:
-    """Return measurement files after the changes of --mend."""
+def _mended(
+    chain: Chain, files: list[MeasurementFile], changes: Sequence[str]
+) -> tuple[list[MeasurementFile], list[list[str]]]:
+    """Return measurement files after the changes of --mend, and what these changed in each of them."""
     data = [file.data for file in files]
+    texts: list[list[str]] = [[] for _ in files]
     known = dict.fromkeys(file.source for file in files)
     for key, _, target in (change.partition("@") for change in changes):
         # `KEY@FILE` changes one file only, `KEY@FILE:FIRST-LAST` some of its lines, other keys all files to
@@ -278,10 +282,24 @@ def _mended(chain: Chain, files: list[MeasurementFile], changes: Sequence[str]) 
             else plausibility.mend_lines(chain, chosen_data, key, lines)
         )
         for i, item in zip(chosen, mended, strict=True):
+            if item is not data[i]:
+                texts[i].append(_describe_change(data[i], item, key, target))
             data[i] = item
-    return [
+    files = [
         file if item is file.data else _with_data(file, item) for file, item in zip(files, data, strict=True)
     ]
+    return files, texts
+
+
+def _describe_change(before: Measurement, after: Measurement, key: str, target: str) -> str:
+    """Describe what a change of --mend changed in a file, or in a target that is a part of the files."""
+    has_same_joints = np.array_equal(before.configurations(), after.configurations())
+    what = "measured values" if has_same_joints else "joint values"
+    option = f"--mend {key}@{target}" if target else f"--mend {key}"
+    kinds = {part.partition(":")[0] for part in key.split("+")}
+    is_lasting = not kinds.isdisjoint(plausibility.LASTING_CHANGES) and not target
+    lasting = "; the robot is for joint values with this change" if is_lasting else ""
+    return f"{what} changed by {option}{lasting}"
 
 
 def _with_data(file: MeasurementFile, data: Measurement) -> MeasurementFile:
@@ -315,7 +333,8 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
         )
         for path in paths
     ]
-    for path, measured in zip(paths, _mended(chain, files, job.mend), strict=True):
+    files, changes = _mended(chain, files, job.mend)
+    for path, measured in zip(paths, files, strict=True):
         if not job.mend:
             require_joint_units(chain, measured)
         by_file[path] = measured.data
@@ -353,7 +372,8 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
         )
     held_out = [(path, item) for path, item in holdout if len(item.rows)]
     n_rows = {path: len(item.rows) for path, item in by_file.items()}
-    return JobData(fitted, held_out, n_rows, unreachable, warnings, notes)
+    changed = dict(zip(paths, changes, strict=True))
+    return JobData(fitted, held_out, n_rows, unreachable, warnings, notes, changed)
 
 
 def _require_both_parts(
@@ -560,5 +580,6 @@ def _provenance(
         },
         warnings={names[path]: texts for path, texts in data.warnings.items()},
         notes={names[path]: texts for path, texts in data.notes.items()},
+        remarks=[f"{names[path]}: {text}." for path, texts in data.changes.items() for text in texts],
         hint=hint,
     )

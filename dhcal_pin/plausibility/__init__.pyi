@@ -6,6 +6,7 @@ from .displacement import measure_correction as measure_correction
 from .evidence import Evidence as Evidence
 from .evidence import fit_evidence as fit_evidence
 from .hypotheses import JOINT_CHANGES as JOINT_CHANGES
+from .hypotheses import LASTING_CHANGES as LASTING_CHANGES
 from .hypotheses import Hypothesis as Hypothesis
 from .hypotheses import list_hypotheses as list_hypotheses
 from .hypotheses import mend as mend

@@ -72,6 +72,8 @@ class Diagnosis:
         text = f"In {' of '.join(where)}, {first}" if where else f"{first[0].upper()}{first[1:]}"
         if others:
             text += f" (or {' or '.join(others)})"
+        if self.hypotheses[0].is_instead:
+            return f"{text}."
         for before, after, unit in (
             (self.before.length_scale, self.after.length_scale, "m"),
             (self.before.angle_scale, self.after.angle_scale, "rad"),
@@ -84,7 +86,11 @@ class Diagnosis:
 
     @property
     def remedy(self) -> str:
-        """What to do about it; only with a hypothesis."""
+        """What to do about it; only with a hypothesis.
+
+        A mistake in the robot file has the same effect as one in all measurements. If only some of them have
+        it, the others fit the robot file.
+        """
         where = f"@{self.source}" if self.source else ""
         if self.lines:
             if not self.source:
@@ -92,8 +98,18 @@ class Diagnosis:
             where += f":{self.lines[0]}-{self.lines[1]}"
         if self.of_servos is not None and any(each.changes_joints for each in self.hypotheses):
             return self._remedy_of_servos(self.of_servos)
-        keys = [f"--mend {hypothesis.key}{where}" for hypothesis in self.hypotheses]
-        return f"Correct the measurements, or add {' or '.join(keys)}."
+        add = f"add {' or '.join(f'--mend {each.key}{where}' for each in self.hypotheses)}."
+        instead = ", or ".join(dict.fromkeys(each.instead for each in self.hypotheses if each.instead))
+        if where or not instead:
+            return f"Correct the measurements, or {add}"
+        if self.hypotheses[0].is_instead:
+            return f"Correct {instead}. If they are right, correct the measurements, or {add}"
+        values = "joint values" if all(each.concerns_joints for each in self.hypotheses) else "measurements"
+        aim = "To keep the robot's lengths"
+        if any(each.changes_joints for each in self.hypotheses):
+            aim = "To get a robot for joint values with this change"
+        cause = f"Correct the {values}, or {instead}: the data do not show which of them is wrong."
+        return f"{cause} {aim}, {add}"
 
     def for_servos(self, turned: tuple[str, ...]) -> Diagnosis:
         """Return the diagnosis of joint values from counts of servos, of which some were turned around."""

@@ -13,6 +13,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property
 from itertools import combinations, permutations, product
 from typing import Literal, Protocol
@@ -38,15 +39,22 @@ from ..robot.inverse_kinematics import tool_pose_and_jacobian
 from ..robot.joint_path import joint_path
 from ..session.facts import MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
+from .displacement import workspace_radius
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
 JOINT_CHANGES = ("sign", "zero", "ratio", "swap", "columns", "joint", "joints")
+# Kinds of changes that the controller may keep: the robot is then for joint values with the change.
+LASTING_CHANGES = ("sign", "zero", "ratio", "swap", "columns")
 # Sign between the keys of two mistakes.
 _AND = "+"
 # Name of all joints in a key.
 ALL = "all"
+# Place of what may be wrong in place of the measurements.
+_IN_ROBOT = " in the robot file"
+# RMS distances of the flange from its mean position beyond which the unit of a robot is wrong [m].
+_SMALLEST_ARM, _LARGEST_ARM = 0.01, 50.0
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Motion of the tool per unit of a joint that counts as none [m].
@@ -362,6 +370,9 @@ class Hypothesis:
     key: str  #: Short name, by which users select the change.
     description: str  #: What was mixed up, as a clause.
     change: Change  #: Change that undoes it.
+    #: What may be wrong instead of the measurements, with the same effect; empty if nothing may.
+    instead: str = ""
+    is_instead: bool = False  #: Whether the robot by itself shows that this is wrong.
 
     @property
     def offsets(self) -> dict[int, float]:
@@ -456,6 +467,9 @@ def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
         f"{first.key}{_AND}{second.key}",
         f"{first.description}, and {second.description}",
         BothChanges(first, second),
+        # If only one of them may be elsewhere, the measurements have to be corrected all the same.
+        f"{first.instead} and {second.instead}" if first.instead and second.instead else "",
+        first.is_instead and second.is_instead,
     )
 
 
@@ -575,7 +589,8 @@ def zero_hypothesis(chain: Chain, joint: int, wrong: float) -> Hypothesis:
     name, n = chain.joint_names[joint], chain.n_joints
     offsets = [np.deg2rad(-wrong) if i == joint else 0.0 for i in range(n)]
     text = f"the zero of joint {name} is off by {wrong:g} deg"
-    return Hypothesis(f"zero:{name}:{-wrong:+g}deg", text, JointChange.of(n, offsets=offsets))
+    change = JointChange.of(n, offsets=offsets)
+    return Hypothesis(f"zero:{name}:{-wrong:+g}deg", text, change, f"the zero of joint {name}{_IN_ROBOT}")
 
 
 def ratio_hypothesis(chain: Chain, joints: Sequence[int], factor: float) -> Hypothesis:
@@ -584,7 +599,9 @@ def ratio_hypothesis(chain: Chain, joints: Sequence[int], factor: float) -> Hypo
     of_joints = f"joint {name}" if len(joints) == 1 else "all revolute joints"
     text = f"the values of {of_joints} are {_times(factor)}, as with a wrong gear ratio"
     factors = [factor if j in joints else 1.0 for j in range(chain.n_joints)]
-    return Hypothesis(f"ratio:{name}:{factor:.4g}", text, JointChange.of(chain.n_joints, factors=factors))
+    change = JointChange.of(chain.n_joints, factors=factors)
+    instead = f"the gear ratio of {of_joints} in the controller"
+    return Hypothesis(f"ratio:{name}:{factor:.4g}", text, change, instead)
 
 
 def revolute_joints(chain: Chain) -> list[int]:
@@ -603,8 +620,11 @@ def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
     for j, name in enumerate(chain.joint_names):
         signs = [-1 if i == j else 1 for i in range(n)]
         text = f"the sign of joint {name} is wrong"
-        yield Hypothesis(f"sign:{name}", text, JointChange.of(n, signs=signs))
-    yield Hypothesis(f"sign:{ALL}", "the signs of all joints are wrong", JointChange.of(n, signs=[-1] * n))
+        change = JointChange.of(n, signs=signs)
+        yield Hypothesis(f"sign:{name}", text, change, f"the axis of joint {name}{_IN_ROBOT}")
+    change = JointChange.of(n, signs=[-1] * n)
+    text = "the signs of all joints are wrong"
+    yield Hypothesis(f"sign:{ALL}", text, change, f"the axes of all joints{_IN_ROBOT}")
     for j, wrong in product(inner_revolute_joints(chain), (90, -90, 180)):
         yield zero_hypothesis(chain, j, wrong)
 
@@ -617,7 +637,9 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
             sources = list(range(n))
             sources[i], sources[j] = j, i
             text = f"the columns of joints {names[i]} and {names[j]} are exchanged"
-            yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, JointChange.of(n, sources=sources))
+            change = JointChange.of(n, sources=sources)
+            instead = f"the order of joints {names[i]} and {names[j]}{_IN_ROBOT}"
+            yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, change, instead)
     if n < 3:
         return
     for key, sources, text in (
@@ -625,7 +647,8 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         ("columns:+1", (n - 1, *range(n - 1)), "shifted by one"),
         ("columns:reversed", tuple(range(n))[::-1], "in reverse order"),
     ):
-        yield Hypothesis(key, f"the joint columns are {text}", JointChange.of(n, sources=sources))
+        change = JointChange.of(n, sources=sources)
+        yield Hypothesis(key, f"the joint columns are {text}", change, f"the order of the joints{_IN_ROBOT}")
 
 
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:
@@ -646,10 +669,18 @@ def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypo
                 factors = [value if i in group else 1.0 for i in range(n)]
                 text = f"the values of {label} are {_misread(true, read, value)}"
                 yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
+    # The tool may be a first estimate, from measurements with a wrong unit.
+    radius = workspace_radius(replace(chain, tool=np.eye(4)))
     for true, read in (*permutations(("m", "mm", "in"), 2), *permutations(("mm", "cm"), 2)):
         factor = LENGTHS[read] / LENGTHS[true]
-        text = f"measured lengths are {_misread(true, read, factor)}"
-        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(factor))
+        is_robot = radius < _SMALLEST_ARM if factor < 1 else radius > _LARGEST_ARM
+        text = (
+            f"the lengths of the robot are {_misread(read, true, 1 / factor)}"
+            if is_robot
+            else f"measured lengths are {_misread(true, read, factor)}"
+        )
+        key, instead = f"lengths:{true}-not-{read}", f"the lengths{_IN_ROBOT}"
+        yield Hypothesis(key, text, LengthChange(factor), instead, is_robot)
     numbers = "rotation vectors" if _notations(data) & _COMPUTED else "Euler angles"
     text = f"measured {numbers} are {_misread('rad', 'deg', ANGLES['deg'])}"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())

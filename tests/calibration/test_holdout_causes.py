@@ -103,6 +103,17 @@ def test_a_mistake_in_the_hold_out_samples_is_named_and_the_correction_is_applie
     assert calibrate(sim.chain, fitted, holdout=mended).verdict.status == "ok"
 
 
+def test_a_mistake_in_all_hold_out_files_is_none_of_the_robot():
+    """The fitted samples show that the robot file is right."""
+    sim = Simulation("ur10", 160, 0)
+    fitted, holdout = halves(sim.measure())
+    turned = holdout.resample(holdout.q * [1, 1, -1, 1, 1, 1])
+    files = [turned.take(np.arange(i, len(turned.rows), 2)).replace(source=f"{i}.csv") for i in range(2)]
+    text = text_of(calibrate(sim.chain, fitted, holdout=files, extend="none"))
+    assert "Correct the measurements, or add --mend sign:elbow_joint." in text
+    assert "robot file" not in text
+
+
 @pytest.mark.parametrize("seed", some_slow(range(20), [0]))
 def test_random_hold_out_samples_of_one_session_show_no_change(seed):
     sim = Simulation("ur10", 160, seed)

@@ -289,6 +289,28 @@ def test_bad_rows_are_skipped_on_request(run, robot_folder):
     assert skipped["samples"] == 15
 
 
+def test_occlusions_as_zeros_are_bad_rows(assert_refused, run, robot_folder):
+    """A tracker that loses its target may write zeros, of which none is a rotation."""
+    good = [f"{HEADER},qw,qx,qy,qz", *(f"{row},1,0,0,0" for row in ROWS)]
+    lost = [",".join([*row.split(",")[:3], *(["0"] * 7)]) for row in ROWS]
+    write("data.csv", "\n".join([*good[:5], *lost[4:12], *good[13:]]))
+    words = ["data.csv:6: the quaternion's norm is 0, not 1 within a thousandth; 8 rows", "lines 6-13;"]
+    assert_refused([*words, "or use --skip-bad-rows"], *CALIBRATE)
+    arm = dh.read_robot("arm.dh.toml")
+    data = dh.read_measurements("data.csv", arm, skip_bad_rows=True)
+    assert data.rows.tolist() == [*range(2, 6), *range(14, 22)]
+    write("good.csv", "\n".join([*good[:5], *good[13:]]))
+    assert data.q.tolist() == dh.read_measurements("good.csv", arm).q.tolist()
+
+
+def test_columns_without_rotations_are_no_bad_rows(assert_refused, run, robot_folder):
+    """Most rows that are wrong point at the columns."""
+    rows = [f"{row},{'1,0,0,0' if i < 9 else '3,0,0,0'}" for i, row in enumerate(ROWS)]
+    write("data.csv", "\n".join([f"{HEADER},qw,qx,qy,qz", *rows]))
+    words = ["data.csv:11: the quaternion's norm is 3; it must be 1", "(order qw,qx,qy,qz)\n"]
+    assert_refused(words, *CALIBRATE, "--skip-bad-rows")
+
+
 def test_bad_rows_of_excel_and_of_a_mapped_file(assert_refused, run, robot_folder):
     table = pd.DataFrame(NUMBERS, columns=pd.Index(GERMAN[1:])).astype(object)
     table.loc[3, GERMAN[2]] = "?"

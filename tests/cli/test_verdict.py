@@ -221,6 +221,29 @@ def test_mistakes_are_refused_with_the_remedy(run, robot_folder, mistake, column
 
 
 @pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (
+            ["sign:joint_2"],
+            "joint values changed by --mend sign:joint_2; the robot is for joint values with this change",
+        ),
+        (["sign:joint_2@data.csv:2-9"], "joint values changed by --mend sign:joint_2@data.csv:2-9"),
+        (["rows:above"], "joint values changed by --mend rows:above"),
+        (["scale:x:1.001"], "measured values changed by --mend scale:x:1.001"),
+    ],
+)
+def test_changes_of_the_measurements_are_beside_the_verdict(run, robot_folder, undrawn, words, text):
+    outputs = ("--json", "r.json", "--report", "r.html", "--report", "r.md", "--certificate", "c.html")
+    _, _, err = run(*CALIBRATE, *outputs, "--force", "--mend", *words)
+    assert f"data.csv: {text} verdict: " in unfolded(err)
+    assert f"data.csv: {text}" in parse_json(Path("r.json").read_text())["warnings"]
+    for name in ("r.html", "r.md", "c.html"):
+        assert f"data.csv: {text}." in Path(name).read_text().replace("\\", ""), name
+    certificate = Path("c.html").read_text()
+    assert certificate.index("Verdict:") < certificate.index(text) < certificate.index("</section>")
+
+
+@pytest.mark.parametrize(
     ("moving", "reason"),
     [
         ([], "No joint ever moved"),

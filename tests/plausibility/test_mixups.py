@@ -1,6 +1,8 @@
 """Diagnosis of mixed-up joints, frames, rows and notations."""
 
 import re
+from dataclasses import replace
+from functools import reduce
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +20,10 @@ from dhcal_pin.io import read_robot
 from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups, trials
+from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
+from dhcal_pin.plausibility.hypotheses import both, ratio_hypothesis
 from dhcal_pin.plausibility.misfit import nominal_misfits
+from dhcal_pin.plausibility.signs import known_signs
 from dhcal_pin.robot import Chain, DHTable
 
 
@@ -84,6 +89,79 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
     assert f"--mend {key}" in found.remedy
     np.testing.assert_allclose(mend(ur10, wrong, key).q, data.q, atol=1e-12)
     assert not diagnose_mixups(ur10, [data]).is_suspicious
+
+
+def test_a_reversed_axis_of_the_robot_has_the_effect_of_a_wrong_sign(ur10):
+    """The remedies give a robot for the joint values, or one for those with the change."""
+    data = measured(Position)
+    wrong = known_signs(ur10, ["elbow_joint"]).apply(ur10)
+    found = diagnose_mixups(wrong, [data])
+    assert found.hypotheses[0].key == "sign:elbow_joint"
+    assert found.remedy == (
+        "Correct the joint values, or the axis of joint elbow_joint in the robot file: the data do not show "
+        "which of them is wrong. To get a robot for joint values with this change, add "
+        "--mend sign:elbow_joint."
+    )
+    assert not diagnose_mixups(ur10, [data]).is_suspicious
+    changed = mend(wrong, data, "sign:elbow_joint")
+    fit = calibrate(wrong, changed, "minimal,base,tool", extend="none")
+    errors = [
+        np.linalg.norm(fit.chain.poses(q)[:, :3, 3] - data.positions(), axis=1).max()
+        for q in (changed.q, data.q)
+    ]
+    assert errors[0] < 1e-3
+    assert errors[1] > 0.1
+
+
+def test_a_robot_of_a_few_millimetres_has_a_wrong_unit(ur10):
+    """The table of a UR10 in metres that says mm; a UR10 of the usual size is not to blame."""
+    data = measured(Position)
+    origins = ur10.origins.copy()
+    origins[:, :3, 3] /= 1e3
+    found = diagnose_mixups(replace(ur10, origins=origins), [data])
+    assert found.sentence == "The lengths of the robot are 1000 times too small, as if m had been read as mm."
+    assert found.remedy == (
+        "Correct the lengths in the robot file. If they are right, correct the measurements, or add --mend "
+        "lengths:mm-not-m."
+    )
+    assert not diagnose_mixups(ur10, [data]).is_suspicious
+    found = diagnose_mixups(ur10, [data.replace(values=1e3 * data.values)])
+    assert found.sentence.startswith("Measured lengths are 1000 times too large, as if mm had been read as m")
+    assert found.remedy == (
+        "Correct the measurements, or the lengths in the robot file: the data do not show which of them is "
+        "wrong. To keep the robot's lengths, add --mend lengths:mm-not-m."
+    )
+
+
+VALUES = "To get a robot for joint values with this change, add --mend"
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        (["sign:all"], ["or the axes of all joints in the robot file:", VALUES]),
+        (["swap:elbow_joint:wrist_1_joint"], ["the order of joints elbow_joint and wrist_1_joint", VALUES]),
+        (["columns:reversed"], ["or the order of the joints in the robot file:", VALUES]),
+        (["zero:elbow_joint:+90deg"], ["or the zero of joint elbow_joint in the robot file:", VALUES]),
+        (["sign:elbow_joint", "lengths:mm-not-m"], ["in the robot file and the lengths in", VALUES]),
+        (["sign:elbow_joint", "rows:above"], ["Correct the measurements, or add --mend sign:elbow_joint+"]),
+        (["joints:deg-not-rad"], ["Correct the measurements, or add --mend joints:deg-not-rad."]),
+        (["quaternions:xyzw"], ["Correct the measurements, or add --mend quaternions:xyzw."]),
+    ],
+)  # fmt: skip
+def test_the_remedy_names_what_may_be_wrong_instead(ur10, keys, words):
+    known = {each.key: each for each in list_hypotheses(ur10, [measured(Pose)])}
+    found = Diagnosis(NO_EVIDENCE, (reduce(both, [known[key] for key in keys]),))
+    assert all(text in found.remedy for text in words)
+    # Measurements without the mistake fit the robot.
+    in_lines = replace(found, source="a.csv", lines=(3, 9)).remedy
+    assert in_lines == f"Correct the measurements, or add --mend {'+'.join(keys)}@a.csv:3-9."
+
+
+def test_the_remedy_of_a_ratio_names_the_controller(ur10):
+    found = Diagnosis(NO_EVIDENCE, (ratio_hypothesis(ur10, [2], 1.1),))
+    assert "or the gear ratio of joint elbow_joint in the controller: the data do not show" in found.remedy
+    assert found.remedy.endswith(f"{VALUES} ratio:elbow_joint:1.1.")
 
 
 @pytest.mark.parametrize(

@@ -219,7 +219,7 @@ def test_turned_joints_turn_the_other_way_in_the_urdf():
         ("sign:elbow_flex", "Add --turned none."),
         ("zero:elbow_flex:+90deg", "Correct the motors of elbow_flex in the servo file."),
         ("swap:elbow_flex:wrist_flex", "Correct the measurements."),
-        ("lengths:mm-not-m", "Correct the measurements, or add --mend lengths:mm-not-m."),
+        ("rows:above", "Correct the measurements, or add --mend rows:above."),
     ],
 )
 def test_remedies_of_servos_are_allowed_beside_their_file(key, remedy):

@@ -24,8 +24,8 @@ ARGUMENTS: Options = {
     "--robot": {**ROBOT, "help": f"compare with the joints and limits of this {ROBOT['help']}"},
     **TABLE_OPTIONS,
     "--rig": RIG,
-    "--skip-bad-rows": "as in other commands: rows that lack a number or a name are always skipped here, "
-    "and listed",
+    "--skip-bad-rows": "as in other commands: rows that lack a number, a name or a rotation are always "
+    "skipped here, and listed",
     **URDF_OPTIONS,
     "--json": JSON,
 }

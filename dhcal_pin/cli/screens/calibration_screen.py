@@ -50,6 +50,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         for text in texts
         if text not in outcome.moved_zeros
     ]
+    changes = [f"{names[p]}: {text}" for p, texts in data.changes.items() for text in texts]
     hints = [f"hint: {source.hint}"] if source.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
     by_file = summary.file_table([names[path] for path in data.fitted], fit.file_comparisons)
@@ -75,6 +76,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(warnings, "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
         Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),
+        Block(changes, "yellow", is_verdict=True, has_space=is_refused),
         *verdict_blocks(fit.verdict, job.force),
     ]
     return Screen(blocks, partial(_details, fit))

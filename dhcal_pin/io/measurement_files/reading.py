@@ -109,8 +109,8 @@ def read_measurements(
         source: Text file, Excel workbook, Parquet file, or a data frame such as one of pandas.
         chain: Robot that was measured.
         columns: Column map for a file of another maker.
-        skip_bad_rows: Whether rows without a number or a name in a column are skipped; otherwise they are an
-            error.
+        skip_bad_rows: Whether rows without a number or a name in a column, or with a quaternion that is no
+            rotation, are skipped; otherwise they are an error.
         rig: Cameras and boards of image coordinates, on the chain.
         servos: Servos whose counts are in columns `NAME[ticks]`, see `dhcal_pin.io.read_servos`.
         sheet: Sheet of an Excel workbook; by default the one with the most known columns.
@@ -293,7 +293,7 @@ def skipped_rows_note(table: DataTable) -> list[str]:
 def _usable_rows(
     table: DataTable, chain: Chain, kind: type[Measurement], prefixes: Sequence[str], skip_bad_rows: bool
 ) -> DataTable:
-    """Return the table without the rows that lack a number or a name, or raise an error that names them."""
+    """Return the table without rows that lack a number, a name or a rotation, or raise an error on them."""
     joints = [prefix + name for prefix in prefixes for name in chain.joint_names]
     quantities = {
         **kind.columns,
@@ -308,6 +308,7 @@ def _usable_rows(
         [table.columns[name].index for name in used if name not in texts],
         [table.columns[name].index for name in used if name in texts],
     )
+    table = table.without_rows(_wrong_quaternions(table))
     if not skip_bad_rows:
         table.require_good_rows(", or use --skip-bad-rows")
     if not len(table.lines):
@@ -316,6 +317,23 @@ def _usable_rows(
             f"{table.source}: no row has all numbers (line {line}: {reason}); correct the file or its columns"
         )
     return table
+
+
+def _wrong_quaternions(table: DataTable) -> dict[int, str]:
+    """Return why rows have no rotation; none if most rows do, as with columns that are no quaternion."""
+    if not set(QUATERNION) <= table.columns.keys():
+        return {}
+    norm = _norms(np.stack([table.values(table.columns[name].index) for name in QUATERNION], -1))
+    wrong = np.flatnonzero(np.abs(norm - 1) > _MAX_NORM_ERROR).tolist()
+    if 2 * len(wrong) > len(norm):
+        return {}
+    return {row: f"the quaternion's norm is {norm[row]:.4g}, not 1 within a thousandth" for row in wrong}
+
+
+def _norms(quaternion: Array) -> Array:
+    """Return the norms of quaternions, shape (m,)."""
+    with np.errstate(over="ignore"):
+        return np.linalg.norm(quaternion, axis=1)
 
 
 def _present_conditions(table: DataTable, chain: Chain) -> dict[str, list[Column]]:
@@ -446,8 +464,7 @@ def _parse_quaternion(table: DataTable) -> Array:
     """Parse the quaternion columns to rotation matrices, shape (m, 3, 3)."""
     quaternion = _parse_group(table, QUATERNION, None)
     assert quaternion is not None
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(quaternion, axis=1)
+    norm = _norms(quaternion)
     wrong = np.flatnonzero(np.abs(norm - 1) > _MAX_NORM_ERROR)
     if wrong.size:
         raise FileFormatError(

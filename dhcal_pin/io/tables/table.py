@@ -279,13 +279,15 @@ class DataTable:
             for row, cells in enumerate(self.cells):
                 if not cells[index].strip():
                     reasons.setdefault(row, f"{self.column_label(index)} is empty")
-        table = replace(self, numbers={**self.numbers, **values})
+        return replace(self, numbers={**self.numbers, **values}).without_rows(reasons)
+
+    def without_rows(self, reasons: Mapping[int, str]) -> DataTable:
+        """Move rows to `bad_rows`, each with the reason why it cannot be used."""
         if not reasons:
-            return table
-        bad = {self.lines[row]: reasons[row] for row in sorted(reasons)}
+            return self
+        bad = {self.lines[row]: reason for row, reason in reasons.items()}
         rows = [row for row in range(len(self.lines)) if row not in reasons]
-        bad_rows = dict(sorted({**self.bad_rows, **bad}.items()))
-        return replace(table._with_rows(rows), bad_rows=bad_rows)
+        return replace(self._with_rows(rows), bad_rows=dict(sorted({**self.bad_rows, **bad}.items())))
 
     def require_good_rows(self, alternative: str = "") -> None:
         """Require that no row was left out."""
