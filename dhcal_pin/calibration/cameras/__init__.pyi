@@ -18,6 +18,7 @@ from .image_checks import second_rotation as second_rotation
 from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .image_checks import small_ranges as small_ranges
 from .image_session import fit_image_session as fit_image_session
+from .lens_priors import describe_far_lenses as describe_far_lenses
 from .lens_priors import with_stated_distortion as with_stated_distortion
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images

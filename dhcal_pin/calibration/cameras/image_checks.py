@@ -76,7 +76,7 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
         f"The boards in the images do not move as the {stated} say: the rotations between images differ by "
         f"{np.degrees(min(differences)):.0f}° (median) from those of the robot, wherever camera and board "
         f"are. Use the {stated} of the same images with right units, signs and order, and the URDF of the "
-        "robot in the images."
+        "robot in the images, and check the resolution and the lens that the rig states."
     )
 
 
