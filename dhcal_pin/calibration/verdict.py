@@ -217,7 +217,7 @@ def judge(fit: Evidence) -> Verdict:
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
         hidden = _hidden_outliers(fit)
         found = [
-            *(_wrong_labels(fit) or _deviating_lines(fit)),
+            *(_wrong_labels(fit) or _deviating_lines(fit) or _outlying_end(fit)),
             *([*errors, *correction] if explains_correction else [*correction, *errors]),
             *_session(fit),
             *_contradictions(fit),
@@ -1002,6 +1002,15 @@ def _deviating_lines(fit: Evidence) -> list[Finding]:
         "set-up, the units, or signs and order of the joints, and correct them or measure them again."
     )
     return [Finding(status, text)]
+
+
+def _outlying_end(fit: Evidence) -> list[Finding]:
+    """Advise caution if all images from some image on, or up to one, are outliers."""
+    parts = [
+        *zip(fit.data, fit.is_counted, strict=True),
+        *zip(fit.holdout, fit.is_holdout_counted, strict=True),
+    ]
+    return [Finding("caution", text) for text in cameras.describe_outlying_end(parts, bool(fit.holdout))]
 
 
 def _outlying_images(fit: Evidence) -> str:
