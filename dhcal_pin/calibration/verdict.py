@@ -217,12 +217,13 @@ def judge(fit: Evidence) -> Verdict:
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
         hidden = _hidden_outliers(fit)
         found = [
-            *(_wrong_labels(fit) or _deviating_lines(fit)),
+            *(_wrong_labels(fit) or _deviating_lines(fit) or _outlying_end(fit)),
             *([*errors, *correction] if explains_correction else [*correction, *errors]),
             *_session(fit),
             *_contradictions(fit),
             *_convergence(fit, [each for each in (*correction, *errors) if each.has_cause]),
             *_hand_eye_images(fit),
+            *([] if is_wrong else _far_lenses(fit)),
             *([] if is_wrong else _weak_positions(fit) or _hidden_position_errors(fit)),
             *_fitted_holdout(fit),
             *_held_out_errors(fit),
@@ -503,12 +504,29 @@ def _implausible_errors(fit: Evidence) -> list[Finding]:
         is_restricted = not fit.camera_stages and _lacks_parameters(fit) and not _missing_frames(fit)
         # Distances alone have no joint values, and say nothing about a robot.
         is_restricted = is_restricted or not any(item.configurations_per_row for item in fit.data)
-        status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
-        if fit.hand_eye is not None and fit.hand_eye.causes:
+        has_cause = fit.hand_eye is not None and bool(fit.hand_eye.causes)
+        if fit.hand_eye is not None and has_cause:
             text = f"{fit.hand_eye.error_sentence}{fit.hand_eye.likely}"
-            return [Finding(status, text, has_cause=True)]
-        return [Finding(status, f"{text}. {_plausible_cause(fit)}")]
+        else:
+            text = f"{text}. {_plausible_cause(fit)}"
+        if after.unit == "px":
+            error, note = _largest_image_error(fit, error)
+            text = f"{note}{text}"
+        status: Status = "refused" if error > MAX_ERROR[after.unit] and not is_restricted else "caution"
+        return [Finding(status, text, has_cause=has_cause)]
     return []
+
+
+def _largest_image_error(fit: Evidence, error: float) -> tuple[float, str]:
+    """Return the largest error of fitted, left-out and hold-out images [px], and a note on the last ones."""
+    if fit.hand_eye is not None and fit.hand_eye.causes:
+        error = max(error, fit.hand_eye.error.pixels)
+    judged = fit.comparisons[0]
+    held_out = judged.after.groups.get("pixels") if judged.title == "hold-out" else None
+    if held_out is None or held_out.rms <= max(error, MAX_ERROR["px"]) or fit.holdout_mistake:
+        return error, ""
+    size = format_quantity(held_out.rms, "px", held_out.rms_std, small=True)
+    return held_out.rms, f"Hold-out images have an error of {size}. "
 
 
 def _workspace_size(fit: Evidence) -> float:
@@ -540,6 +558,11 @@ def _hand_eye_images(fit: Evidence) -> list[Finding]:
         f"Take images at {cameras.MIN_CONFIGURATIONS} or more."
     )
     return [Finding("caution", text)]
+
+
+def _far_lenses(fit: Evidence) -> list[Finding]:
+    """Advise caution if the lens of a camera is far from the stated one, as in another resolution."""
+    return [Finding("caution", text) for text in cameras.describe_far_lenses(fit.data, fit.instruments)]
 
 
 def _contradictions(fit: Evidence) -> list[Finding]:
@@ -979,6 +1002,15 @@ def _deviating_lines(fit: Evidence) -> list[Finding]:
         "set-up, the units, or signs and order of the joints, and correct them or measure them again."
     )
     return [Finding(status, text)]
+
+
+def _outlying_end(fit: Evidence) -> list[Finding]:
+    """Advise caution if all images from some image on, or up to one, are outliers."""
+    parts = [
+        *zip(fit.data, fit.is_counted, strict=True),
+        *zip(fit.holdout, fit.is_holdout_counted, strict=True),
+    ]
+    return [Finding("caution", text) for text in cameras.describe_outlying_end(parts, bool(fit.holdout))]
 
 
 def _outlying_images(fit: Evidence) -> str:

@@ -10,6 +10,7 @@ from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import describe_contradiction as describe_contradiction
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
+from .image_checks import describe_outlying_end as describe_outlying_end
 from .image_checks import describe_weak_positions as describe_weak_positions
 from .image_checks import largest_fixed_std as largest_fixed_std
 from .image_checks import largest_position_std as largest_position_std
@@ -18,6 +19,7 @@ from .image_checks import second_rotation as second_rotation
 from .image_checks import seen_ranges_warning as seen_ranges_warning
 from .image_checks import small_ranges as small_ranges
 from .image_session import fit_image_session as fit_image_session
+from .lens_priors import describe_far_lenses as describe_far_lenses
 from .lens_priors import with_stated_distortion as with_stated_distortion
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images

@@ -24,6 +24,7 @@ import numpy as np
 from ... import se3
 from ..._frozen import frozen
 from ..._typing import Array
+from ...cameras.resolution import describe_resolution
 from ...cameras.rig import Camera
 from ...estimation.robust import ZERO_WEIGHT
 from ...exceptions import DhcalError
@@ -56,6 +57,7 @@ from .causes import (
 )
 from .gate import residual_jitter
 from .image_checks import MIN_ROTATION, MORE_ROTATIONS, NO_ROTATION, describe_rotation, second_rotation
+from .lens_priors import find_image_resolution, lens_values
 from .sets import MAX_POINTS, count_corners, describe_configurations, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
@@ -578,7 +580,12 @@ def _lens_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     values, texts = state.values, []
     item = _images(hand_eye.data)
     for number, camera in enumerate(item.rig.cameras):
-        found = np.array([values[f"camera_{camera.name}.{name}"] for name in camera.lens.names])
+        if factor := find_image_resolution(hand_eye.data, camera, values):
+            return (
+                f"the resolution: {describe_resolution(camera, factor)} (camera {camera.name!r})",
+                "Correct width, height, fx, fy, cx and cy of the camera.",
+            )
+        found = lens_values(camera, values)
         if not camera.has_intrinsics or found[:2].min() <= 0:
             continue
         rays = camera.lens.normalize(item.values[item.camera == number].T, found)

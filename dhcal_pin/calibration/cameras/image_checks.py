@@ -16,6 +16,7 @@ of their covariance is that of the priors (`tool_gauge_covariance`), and is subt
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import comb
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from ...estimation.uncertainty import Uncertainty
 from ...formatting import Quantity
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners, select_images
+from ...measurements.images.names import whole_images
 from ...measurements.mounting import Mount, MountedRig
 from ...robot.chain import Chain
 from ..partition import different_configurations
@@ -40,6 +42,9 @@ from .stages import fitted_error
 MIN_DIFFERENCE, MIN_IMAGES, MAX_IMAGES = np.deg2rad(10.0), 6, 200
 # Shifts of the joint values by rows that are a mistake of their own, and are named as such.
 SHIFTS = (-2, -1, 1, 2)
+# Outlying images at an end of a file are named if images that are wrong at random are there with a lower
+# probability.
+MAX_CHANCE = 1e-3
 # Share of outliers above which a fit says nothing.
 MAX_IMAGE_OUTLIER_SHARE = 0.5
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
@@ -76,7 +81,7 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
         f"The boards in the images do not move as the {stated} say: the rotations between images differ by "
         f"{np.degrees(min(differences)):.0f}° (median) from those of the robot, wherever camera and board "
         f"are. Use the {stated} of the same images with right units, signs and order, and the URDF of the "
-        "robot in the images."
+        "robot in the images, and check the resolution and the lens that the rig states."
     )
 
 
@@ -222,3 +227,44 @@ def describe_weak_positions(std: float, error: float, rotation: float) -> str:
     if rotation >= MIN_ROTATION:
         return f"Too few images. {found} Take more images."
     return f"Too few rotations: {describe_rotation(rotation)}. {found} {MORE_ROTATIONS}"
+
+
+def describe_outlying_end(parts: Sequence[tuple[Measurement, Array]], has_holdout: bool) -> list[str]:
+    """Say that all images of a camera from some image on, or up to one, are outliers, as after a motion.
+
+    Each part of a file, fitted or held out, has a mask (m,) of the samples that are no outliers.
+    """
+    texts = []
+    for (_, camera), images in _images_of_cameras(parts).items():
+        ordered = sorted(images)
+        for which, motion, each in (("last", "before", ordered[::-1]), ("first", "after", ordered)):
+            is_outlying = [outlying for _, _, outlying in each]
+            count = is_outlying.index(False) if False in is_outlying else 0
+            if count < 2 or comb(sum(is_outlying), count) > MAX_CHANCE * comb(len(each), count):
+                continue
+            labels = sorted(each[:count])
+            name = f" ({labels[0][1]} to {labels[-1][1]})" if labels[0][1] and labels[-1][1] else ""
+            remedy = "Check both, and take the images again."
+            if has_holdout:
+                remedy = "Calibrate without hold-out images: a motion that enough images show is estimated."
+            texts.append(
+                f"All corners of the {which} {count} images of camera {camera!r}{name} are outliers: camera "
+                f"or board may have moved {motion} them. The result holds for the other images. {remedy}"
+            )
+    return texts
+
+
+def _images_of_cameras(
+    parts: Sequence[tuple[Measurement, Array]],
+) -> dict[tuple[str, str], list[tuple[int, str, bool]]]:
+    """Return first line, label and whether all corners are outliers of each image, by file and camera."""
+    out: dict[tuple[str, str], list[tuple[int, str, bool]]] = {}
+    for item, is_counted in parts:
+        if not isinstance(item, CameraCorners):
+            continue
+        outlying = set(whole_images(item.image, ~is_counted))
+        for number, first in enumerate(np.unique(item.image, return_index=True)[1]):
+            camera = item.rig.cameras[item.camera[first]].name
+            image = int(item.rows[first]), item.image_labels[number], number in outlying
+            out.setdefault((item.source, camera), []).append(image)
+    return out

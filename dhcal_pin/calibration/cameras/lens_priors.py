@@ -4,13 +4,20 @@ The prior of stated intrinsics is wide, so that a lens that is wrong by 5 % is f
 right, so wide a prior lets the lens imitate other errors, above all through the distortion near the border of
 the image, where few corners are. The widths are therefore those of greatest evidence, see
 `estimation.priors`: one for focal lengths and image centre of a camera, and one for its distortion.
+
+An estimated lens that is far from the stated one is rather that of another resolution or of another camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ..._typing import Array
+from ...cameras.resolution import describe_resolution, find_resolution, is_far
+from ...cameras.rig import Camera
 from ...estimation.priors import PriorGroup, PriorGroups
 from ...estimation.problem import Problem
 from ...measurements.base import Measurement
@@ -78,3 +85,45 @@ def with_lens_priors(fit: Fit) -> Fit:
         return item.replace(instrument_parameters=tuple(parameters))
 
     return replace(fit, data=change_images(fit.data, with_priors))
+
+
+def lens_values(camera: Camera, values: Mapping[str, float]) -> Array:
+    """Return the values of the lens of a camera: those that are known by name, else the stated ones."""
+    names = [f"camera_{camera.name}.{name}" for name in camera.lens.names]
+    return np.array([values.get(name, v) for name, v in zip(names, camera.values, strict=True)])
+
+
+def find_image_resolution(
+    data: Sequence[Measurement], camera: Camera, values: Mapping[str, float]
+) -> float | None:
+    """Find the factor between the resolution of the images of a camera and the stated one; None without."""
+    corners = [
+        item.values[item.camera == number]
+        for item in select_images(data)
+        for number, each in enumerate(item.rig.cameras)
+        if each.name == camera.name
+    ]
+    return find_resolution(camera, lens_values(camera, values), np.concatenate(corners))
+
+
+def describe_far_lenses(data: Sequence[Measurement], values: Mapping[str, float]) -> list[str]:
+    """Describe each camera whose estimated lens is far from the stated one, and say what to do."""
+    cameras = {camera.name: camera for item in select_images(data) for camera in item.rig.cameras}
+    texts = []
+    for camera in cameras.values():
+        found = lens_values(camera, values)
+        if factor := find_image_resolution(data, camera, values):
+            texts.append(
+                f"The focal length of camera {camera.name!r} is {np.mean(found[:2] / camera.values[:2]):.2f} "
+                f"times the stated one, and its image centre as well: {describe_resolution(camera, factor)}. "
+                "Correct width, height, fx, fy, cx and cy of the camera."
+            )
+        elif is_far(camera, found):
+            before, after = ([f"{v:.0f}" for v in each[:4]] for each in (camera.values, found))
+            texts.append(
+                f"The lens of camera {camera.name!r} is far from the stated one: fx, fy "
+                f"{', '.join(after[:2])} px, not {', '.join(before[:2])} px, and cx, cy "
+                f"{', '.join(after[2:])} px, not {', '.join(before[2:])} px. Check that the rig states the "
+                "camera, its zoom and focus, and the resolution of these images."
+            )
+    return texts
