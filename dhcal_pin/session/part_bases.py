@@ -1,8 +1,8 @@
 """First values of the poses of the base in the parts of a session, which may differ by large rotations.
 
 The search for changes is linear. It does not find a base that turned by more than about 20°, such as that
-of a tracker which was set up anew. Parts of a session are its files, the longest run of consecutive samples
-that are far from a fit of the others, and consecutive samples that fit by themselves only.
+of a tracker which was set up anew. Parts of a session are its files, or consecutive samples that fit by
+themselves only.
 """
 
 from __future__ import annotations
