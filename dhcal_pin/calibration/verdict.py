@@ -886,11 +886,9 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
     is_image = bool(fit.camera_stages or fit.hand_eye)
     if is_image or not fit.shrinkage_factor:
         return []
-    is_stated = all(item.has_stated_sigma for item in fit.data)
-    is_known = is_stated and not fit.contradicts_sigma
     limit = _min_rows_per_direction(fit)
     if fit.rows_per_direction >= limit:
-        is_searched = not is_known and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
+        is_searched = not _is_noise_known(fit) and fit.rows_per_direction < MAX_ROWS_PER_DIRECTION
         hidden = fit.hidden_majority if is_searched else None
         if hidden is None:
             return []
@@ -901,7 +899,8 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
         return [
             Finding("caution", f"{text} the others, which may be outliers. Measure more poses to see it.")
         ]
-    found = "The residuals contradict the stated standard deviations. " * (is_stated and not is_known)
+    is_contradicted = all(item.has_stated_sigma for item in fit.data) and fit.contradicts_sigma
+    found = "The residuals contradict the stated standard deviations. " if is_contradicted else ""
     text = (
         f"{found}So few samples do not reveal outliers: {format_below(fit.rows_per_direction, limit)} "
         f"independent values for each unknown that they determine, {limit:g} are needed. "
@@ -912,10 +911,15 @@ def _hidden_outliers(fit: Evidence) -> list[Finding]:
 
 def _min_rows_per_direction(fit: Evidence) -> float:
     """Return the number of independent rows per direction with which outliers show."""
-    is_known = all(item.has_stated_sigma for item in fit.data) and not fit.contradicts_sigma
     # Joint errors can explain outliers, too.
     has_families = bool(fit.extension and fit.extension.families)
-    return MIN_STATED_ROWS_PER_DIRECTION if is_known and not has_families else MIN_ROWS_PER_DIRECTION
+    is_known = _is_noise_known(fit) and not has_families
+    return MIN_STATED_ROWS_PER_DIRECTION if is_known else MIN_ROWS_PER_DIRECTION
+
+
+def _is_noise_known(fit: Evidence) -> bool:
+    """Return whether the standard deviations are stated, and the residuals do not contradict them."""
+    return all(item.has_stated_sigma for item in fit.data) and not fit.contradicts_sigma
 
 
 def _poses_advice(fit: Evidence) -> str:

@@ -34,10 +34,12 @@ class WrongLabel:
         """State the lines and both labels."""
         listed = ", ".join(map(str, self.rows[:MAX_LISTED]))
         more = f" and {len(self.rows) - MAX_LISTED} more" if len(self.rows) > MAX_LISTED else ""
-        lines = f"Line {listed}" if len(self.rows) == 1 else f"Lines {listed}{more}"
         of_file = f" of {self.source}" if self.source else ""
-        verbs = "states" if len(self.rows) == 1 else "state", "fits" if len(self.rows) == 1 else "fit"
-        return f"{lines}{of_file} {verbs[0]} {self.column} {self.stated} and {verbs[1]} {self.fitting}."
+        subject, states, fits = (
+            ("Lines", "state", "fit") if len(self.rows) > 1 else ("Line", "states", "fits")
+        )
+        where = f"{subject} {listed}{more}{of_file}"
+        return f"{where} {states} {self.column} {self.stated} and {fits} {self.fitting}."
 
 
 def find_wrong_labels(

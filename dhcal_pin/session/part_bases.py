@@ -26,8 +26,8 @@ from .timeline import Timeline
 MIN_ROTATION = np.deg2rad(10.0)
 # Smallest number of samples of a part in which the base is placed.
 MIN_SAMPLES = 6
-# Number of samples at the begin of a part to which base and tool are fitted, of consecutive samples far from
-# this fit with which the next part begins, and of parts at most.
+# Number of samples at the beginning of a part to which base and tool are fitted, of consecutive samples far
+# from this fit with which the next part begins, and of parts at most.
 N_FIRST, N_FAR, MAX_PARTS = 16, 3, 12
 # Residual of a far sample as a multiple of the median of the first ones, and smallest share of samples that
 # are as far from a solution for all.

@@ -77,7 +77,7 @@ def run(args: Namespace) -> int:
         contents[path] = program_text(_program(result, nominal), path)
     frame = f"the root link {nominal.root}" if args.frame == BASE else "the measuring frame"
     notes = [f"{targets.source}: {text}" for text in _unstated_conditions(args, calibrated, targets)]
-    warning = exchange_warning(args.nominal, args.calibrated, nominal, calibrated)
+    warning = robots_warning(args.nominal, args.calibrated, nominal, calibrated)
     write_with_json(
         contents,
         args.json,
@@ -192,7 +192,7 @@ def _fitting_unit(nominal: robot.Chain, calibrated: robot.Chain, targets: io.Tar
     return ""
 
 
-def exchange_warning(
+def robots_warning(
     nominal_path: str, calibrated_path: str, nominal: robot.Chain, calibrated: robot.Chain
 ) -> str:
     """Return a warning if the nominal and the calibrated robot are the same, or look exchanged.
@@ -206,9 +206,7 @@ def exchange_warning(
 
     is_known = nominal.origins.shape == calibrated.origins.shape and calibrated.transmission is None
     if is_known and np.array_equal(nominal.origins, calibrated.origins):
-        return (
-            "both robots have the same joint origins, so that nothing is corrected; state the calibrated one"
-        )
+        return "both robots have the same joint origins, so that no error of the arm is corrected"
     has_sidecar = [io.existing_sidecar(path) is not None for path in (nominal_path, calibrated_path)]
     if has_sidecar == [True, False]:
         reason = f"it has a sidecar, and {calibrated_path} has none"
