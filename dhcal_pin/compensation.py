@@ -10,6 +10,10 @@ The solver starts from the given joint positions and from the nearest of a fixed
 found by a k-d tree of their tool poses. Unsolved targets are tried again with more starts. Among several
 solutions the one nearest to the given joint positions is chosen.
 
+An arm with fewer than six joints cannot reach every orientation, and the errors of its links tilt its tool.
+It reaches the position of a pose exactly, and the orientation as nearly as its joints allow: the rotation
+vector has a small weight, and the position is corrected at the end.
+
 Shapes: m targets, n joints, c starts of a target.
 """
 
@@ -60,6 +64,10 @@ _NEAR_SINGULAR_TOL = 5e-3
 # the characteristic length [1] or as an angle [rad]: a hundredth of the accuracy of calibrated arms.
 _NEGLIGIBLE_MISS = 1e-5
 
+# If an arm has fewer than six joints, a radian counts as this fraction of the characteristic length. The
+# largest angle between the tool of such an arm and a target that counts as reached [rad].
+_MINOR_WEIGHT, _MAX_TILT = 1e-2, np.deg2rad(10.0)
+
 # Number of random configurations, and of the best solutions of a round that are starts of the next one.
 _N_CONFIGURATIONS, _N_BEST = 8192, 4
 
@@ -88,7 +96,8 @@ class Compensation:
             given for this target), "joint limits" (reached only beyond the limits) or "out of reach", for
             each target.
         residual_error: Distance and angle between the calibrated tool and the target, shape (m, 2) [m, rad];
-            of the nearest solution if the target is not reached. The angle is 0 for position targets.
+            of the nearest solution if the target is not reached. The angle is 0 for position targets, and
+            up to 10° at poses that an arm with fewer than six joints reaches.
     """
 
     q: Array
@@ -113,7 +122,8 @@ def compensate(
     """Solve targets on the calibrated robot and correct them for a controller with the nominal model.
 
     Each solution is checked by forward kinematics to 1e-9 m and 1e-9 rad. On the edge of the workspace it
-    may miss the target by 1e-5 rad and 1e-5 of a length typical of the arm, some micrometres. A target is
+    may miss the target by 1e-5 rad and 1e-5 of a length typical of the arm, some micrometres. An arm with
+    fewer than six joints reaches the position, and the orientation as nearly as it can. A target is
     also "near singular" if the inverse solution of the nominal model, continued from the target to the
     corrected target, ends in another configuration. This check is omitted for redundant arms.
 
@@ -154,13 +164,11 @@ def compensate(
             progress(min(first + _CHUNK_SIZE, len(targets)))
     q, status, residual_error = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     if conditions is not None:
-        q, status, residual_error = _with_conditions(
-            calibrated, targets, q, status, residual_error, conditions
-        )
+        q, status, residual_error = _with_conditions(search, targets, q, status, residual_error, conditions)
     reached = np.flatnonzero(status == OK)
     poses = np.full((len(q), 4, 4), np.nan)
     poses[reached] = nominal.poses(q[reached])
-    is_singular = _is_near_singular(nominal, calibrated, targets[reached], q[reached])
+    is_singular = _is_near_singular(nominal, search, targets[reached], q[reached])
     status[reached[is_singular]] = SINGULAR
     if is_near_each_target:
         rotations = np.where(calibrated.is_prismatic, 0.0, np.abs(q - near))
@@ -181,18 +189,19 @@ def nominal_root_pose(nominal: Chain, calibrated: Chain) -> Array:
 
 
 def _with_conditions(
-    chain: Chain, targets: Array, q: Array, status: Array, residual_error: Array, conditions: Conditions
+    search: _Search, targets: Array, q: Array, status: Array, residual_error: Array, conditions: Conditions
 ) -> tuple[Array, Array, Array]:
     """Correct the solved targets for their conditions; return q, status and errors of all targets."""
-    solved = np.flatnonzero(status == OK)
+    solved, chain = np.flatnonzero(status == OK), search.chain
     goals = targets[solved]
-    task = _task_error(chain, goals)
-    corrected, poses = correct_for_conditions(chain, task, q[solved], conditions[solved])
+    corrected, poses = q[solved], np.empty((0, 4, 4))
+    for task in search.tasks(goals):
+        corrected, poses = correct_for_conditions(chain, task, corrected, conditions[solved])
     q, status, residual_error = q.copy(), status.copy(), residual_error.copy()
     q[solved], residual_error[solved] = corrected, _pose_error(poses, goals)
     within_limits = np.all((corrected >= chain.lower) & (corrected <= chain.upper), 1)
     status[solved[~within_limits]] = LIMITS
-    status[solved[~_is_negligible(chain, residual_error[solved])]] = OUT
+    status[solved[~search.is_negligible(residual_error[solved])]] = OUT
     return q, status, residual_error
 
 
@@ -229,6 +238,7 @@ class _Search:
     q: Array  # Random configurations within the limits
     tree: cKDTree  # Nearest-neighbour search of their tool poses
     with_rotations: bool  # Whether targets are poses
+    is_exact: bool  # Whether the arm can reach targets exactly
 
     @classmethod
     def from_chain(cls, chain: Chain, with_rotations: bool) -> _Search:
@@ -240,7 +250,34 @@ class _Search:
         from scipy.spatial import cKDTree  # lazy import: scipy.spatial is slow to import
 
         points = _search_points(chain.poses(q), with_rotations, characteristic_length(chain))
-        return cls(chain, q, cKDTree(points), with_rotations)
+        is_exact = not with_rotations or chain.n_joints >= 6
+        return cls(chain, q, cKDTree(points), with_rotations, is_exact)
+
+    def tasks(self, targets: Array) -> list[TaskError]:
+        """Return the task errors of positions or poses that are minimized one after the other."""
+        if not self.with_rotations:
+            return [position_task(targets)]
+        of_poses = pose_task(targets, self._rotation_length)
+        return [of_poses] if self.is_exact else [of_poses, position_task(targets[:, :3, 3])]
+
+    @property
+    def _rotation_length(self) -> float:
+        """Length that a radian counts as in the task error of a pose [m]."""
+        return characteristic_length(self.chain) * (1.0 if self.is_exact else _MINOR_WEIGHT)
+
+    @property
+    def _max_norm(self) -> float:
+        """Largest norm of the task error of a target that is reached [m]."""
+        return REACHED_TOL if self.is_exact else self._rotation_length * _MAX_TILT
+
+    def is_reached(self, errors: Array) -> Array:
+        """Return whether targets with errors (m, 2) [m, rad] are reached, shape (m,)."""
+        return np.all(errors <= (REACHED_TOL, REACHED_TOL if self.is_exact else _MAX_TILT), 1)
+
+    def is_negligible(self, errors: Array) -> Array:
+        """Return whether errors (m, 2) [m, rad] of targets are negligible, shape (m,)."""
+        limits = _NEGLIGIBLE_MISS * np.array([characteristic_length(self.chain), 1.0])
+        return np.all(errors <= limits, 1) if self.is_exact else self.is_reached(errors)
 
     def starts(self, targets: Array, count: int) -> Array:
         """Return configurations whose tools are nearest to the targets, shape (m, count, n)."""
@@ -255,7 +292,10 @@ class _Search:
         """Solve targets from several starts; return q, shape (m, c, n), and error norms, shape (m, c)."""
         m, count, n = starts.shape
         samples = np.repeat(np.arange(m), count)
-        q, norms = solve_ik(chain, _task_error(chain, targets), starts.reshape(-1, n), steps, samples)
+        first, *others = self.tasks(targets)
+        q, norms = solve_ik(chain, first, starts.reshape(-1, n), steps, samples)
+        for task in others:
+            q, _ = solve_ik(chain, task, q, steps, samples)
         return q.reshape(m, count, n), norms.reshape(m, count)
 
     def find(self, targets: Array, near: Array) -> tuple[Array, Array, Array]:
@@ -279,28 +319,23 @@ class _Search:
             distance = np.linalg.norm((tried - near[open_targets, None]) / scale, axis=2)
             # Solutions come first, then those with a negligible miss, both ordered by distance; then the
             # others, ordered by error.
-            is_missed = norms > _NEGLIGIBLE_MISS * length
-            grade = is_missed.astype(int) + (norms > REACHED_TOL)
+            is_missed = norms > max(_NEGLIGIBLE_MISS * length, self._max_norm)
+            grade = is_missed.astype(int) + (norms > self._max_norm)
             order = np.lexsort([np.where(is_missed, norms, distance), grade])[:, :_N_BEST]
             best[open_targets] = np.take_along_axis(tried, order[..., None], 1)
             best_norm[open_targets] = norms.min(1)
             chosen = best[open_targets, 0]
             residual_error[open_targets] = _tool_error(self.chain, chosen, goals)
             within_limits = np.all((chosen >= self.chain.lower) & (chosen <= self.chain.upper), 1)
-            accepted = np.all(residual_error[open_targets] <= REACHED_TOL, 1) & within_limits
+            accepted = self.is_reached(residual_error[open_targets]) & within_limits
             q[open_targets[accepted]], status[open_targets[accepted]] = chosen[accepted], OK
-        on_edge = (status == OUT) & _is_negligible(self.chain, residual_error)
+        on_edge = (status == OUT) & self.is_negligible(residual_error)
         q[on_edge], status[on_edge] = best[on_edge, 0], OK
         open_targets = np.flatnonzero(status == OUT)
         unlimited = without_rotary_limits(self.chain)
         _, norms = self.solve(unlimited, targets[open_targets], best[open_targets], _ROUNDS[-1][1])
-        status[open_targets[np.any(norms <= REACHED_TOL, 1)]] = LIMITS
+        status[open_targets[np.any(norms <= self._max_norm, 1)]] = LIMITS
         return q, status, residual_error
-
-
-def _task_error(chain: Chain, targets: Array) -> TaskError:
-    """Return the task error of positions or poses."""
-    return position_task(targets) if targets.ndim == 2 else pose_task(targets, characteristic_length(chain))
 
 
 def _search_points(poses: Array, with_rotations: bool, length: float) -> Array:
@@ -309,11 +344,6 @@ def _search_points(poses: Array, with_rotations: bool, length: float) -> Array:
         return poses[:, :3, 3]
     # A small rotation by an angle changes a rotation matrix by √2 times the angle (Frobenius norm).
     return np.concatenate([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9) * length / np.sqrt(2)], 1)
-
-
-def _is_negligible(chain: Chain, errors: Array) -> Array:
-    """Return whether distances and angles (m, 2) of tools from targets are negligible, shape (m,)."""
-    return np.all(errors <= _NEGLIGIBLE_MISS * np.array([characteristic_length(chain), 1.0]), 1)
 
 
 def _tool_error(chain: Chain, q: Array, targets: Array) -> Array:
@@ -331,8 +361,9 @@ def _pose_error(poses: Array, targets: Array) -> Array:
     )
 
 
-def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Array) -> Array:
+def _is_near_singular(nominal: Chain, search: _Search, targets: Array, q: Array) -> Array:
     """Return whether solutions are at a singularity, or whether the correction crosses one, shape (m,)."""
+    calibrated = search.chain
     # The corrected target of the controller is always a pose.
     components = slice(6 if targets.ndim == 3 else 3)
     out = (
@@ -344,7 +375,7 @@ def _is_near_singular(nominal: Chain, calibrated: Chain, targets: Array, q: Arra
     # A controller that moves from the uncorrected target must end in the same joint positions.
     base = calibrated.base @ nominal_root_pose(nominal, calibrated)
     uncorrected = replace(nominal, base=base, tool=calibrated.tool)
-    before, _ = solve_ik(uncorrected, _task_error(uncorrected, targets), q)
+    before = search.solve(uncorrected, targets, q[:, None], _ROUNDS[-1][1])[0][:, 0]
     commanded, _ = solve_ik(nominal, pose_task(nominal.poses(q), characteristic_length(nominal)), before)
     reached = calibrated.poses(q) if targets.ndim == 3 else calibrated.poses(q)[:, :3, 3]
     return out | np.any(_tool_error(calibrated, commanded, reached) > REACHED_TOL, 1)

@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 from command_line import error_of, stderr_of
 from robots import URDF, nominal_arm, paper
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from dhcal_pin import se3
@@ -22,6 +23,7 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_targets, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import Chain, DHTable
+from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.robot.urdf_edit import with_world
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
@@ -143,6 +145,60 @@ def test_true_robot_reaches_positions(name):
     for i in np.flatnonzero(~beyond):
         there = pinocchio_pose(true, found.q[i]).translation
         assert np.linalg.norm(there - targets[i, :3, 3]) <= 1e-9
+
+
+def short_arm(name: str) -> Chain:
+    """A SCARA of four joints, or an arm of five joints."""
+    turn = np.pi / 2
+    scara = ([0.4, 0, 0, -0.05], [0.325, 0.275, 0, 0], [0, np.pi, 0, 0], [2.2, 2.5, 0.2, 6.2])
+    five = ([0.1, 0, 0, 0, 0.1], [0, 0.12, 0.13, 0, 0], [turn, 0, 0, turn, 0], [2.8] * 5)
+    d, a, alpha, upper = map(np.array, scara if name == "scara" else five)
+    is_prismatic = np.arange(len(d)) == (2 if name == "scara" else len(d))
+    names, zero = tuple(f"j{i + 1}" for i in range(len(d))), np.zeros(len(d))
+    lower = np.where(is_prismatic, 0.0, -upper)
+    return Chain.from_dh(DHTable("standard", names, is_prismatic, zero, d, a, alpha, zero, lower, upper))
+
+
+@pytest.mark.parametrize("name", ["scara", "five"])
+def test_arms_with_fewer_than_six_joints_reach_positions_and_the_nearest_orientations(name):
+    """The nearest orientation is that of a constrained minimization by scipy."""
+    rng, nominal = np.random.default_rng(3), short_arm(name)
+    true = wrong(nominal, rng)
+    # Inside the limits, so that the true arm reaches the positions.
+    q = draw(nominal, 40, rng) * 0.8 + 0.1 * (nominal.lower + nominal.upper)
+    targets = nominal.poses(q)
+    found = compensate(nominal, true, targets, q)
+    assert found.reached.mean() >= 0.85
+    for i in np.flatnonzero(found.reached):
+        there, goal = pinocchio_pose(true, found.q[i]), pin.SE3(targets[i])
+        assert np.linalg.norm(there.translation - goal.translation) <= 1e-9
+        angle = np.linalg.norm(pin.log3(there.rotation @ goal.rotation.T))
+        assert found.residual_error[i, 1] == pytest.approx(angle, abs=1e-9)
+        assert np.abs(pinocchio_pose(nominal, found.q[i]).homogeneous - found.poses[i]).max() <= 1e-12
+    for i in np.flatnonzero(np.array(found.status) == "ok")[:6]:
+
+        def turn(x, goal=targets[i]):
+            return np.sum(pin.log3(pinocchio_pose(true, x).rotation @ goal[:3, :3].T) ** 2)
+
+        def miss(x, goal=targets[i]):
+            return 1e3 * (pinocchio_pose(true, x).translation - goal[:3, 3])
+
+        best = minimize(turn, found.q[i], constraints=[{"type": "eq", "fun": miss}], options={"ftol": 1e-16})
+        assert found.residual_error[i, 1] <= np.sqrt(best.fun) + 1e-5
+
+
+def test_position_of_an_arm_with_few_joints_is_exact_at_another_temperature():
+    nominal = short_arm("scara")
+    errors = select_parameters(nominal, "thermal")
+    true = wrong(errors.at(np.full(len(errors.parameters), 2e-5)), np.random.default_rng(4))
+    q = np.array([[0.3, 0.9, 0.1, 0.4], [-0.5, 1.2, 0.05, -1.0]])
+    warm = Conditions(q, temperature=np.full(2, 45.0))
+    targets = nominal.poses(q)
+    found = compensate(nominal, true, targets, q, conditions=warm)
+    assert found.status == ("ok", "ok")
+    there = true.poses(replace(warm, q=found.q))[:, :3, 3]
+    np.testing.assert_allclose(there, targets[:, :3, 3], rtol=0, atol=1e-9)
+    assert np.abs(true.poses(found.q)[:, :3, 3] - there).max() > 1e-5
 
 
 def test_robot_with_correction_curves_reaches_its_targets():

@@ -452,8 +452,6 @@ def compensation_screen(
     files: Iterable[object],
 ) -> Screen:
     """Describe how many targets have which status, and the lines of those that are not corrected exactly."""
-    from ...robot.inverse_kinematics import REACHED_TOL  # lazy import: only this command needs it
-
     counts, lines = [], []
     for status in dict.fromkeys(result.status):
         rows = [row for row, other in enumerate(result.status) if other == status]
@@ -468,7 +466,7 @@ def compensation_screen(
             continue
         items = [
             f"  line {targets.lines[row]}"
-            if np.all(result.residual_error[row] <= REACHED_TOL)
+            if result.reached[row]
             else f"  line {targets.lines[row]} ({_distance(result.residual_error[row])} away)"
             for row in rows
         ]
@@ -479,9 +477,11 @@ def compensation_screen(
             f"{chain.n_joints} joints reach a target in many ways, and the corrected targets hold only "
             "for these joint values; send the joint values to the controller"
         )
-    elif chain.n_joints < 6 and targets.values.ndim == 3 and not result.reached.all():
+    elif chain.n_joints < 6 and targets.values.ndim == 3 and result.reached.any():
+        angle = np.rad2deg(result.residual_error[result.reached, 1].max())
         notes.append(
-            f"{chain.n_joints} joints cannot reach every orientation; omit the orientation from the targets"
+            f"{chain.n_joints} joints cannot reach every orientation: positions are exact, and orientations "
+            f"as near as possible, within {angle:.2g}°; see miss_rotation"
         )
     hints = [f"hint: {hint}"] if hint else []
     return Screen(
