@@ -18,6 +18,8 @@ from dhcal_pin.io import read_measurement_file, read_measurements
 from dhcal_pin.measurements import Noise, PointDistance
 from dhcal_pin.planning import plan
 from dhcal_pin.robot import joint_coverage
+from dhcal_pin.session.search import _Search
+from dhcal_pin.session.timeline import order_samples
 
 SERIES = {
     "B": DATA / "ipa_ur10/Series_B/measurements_joint_configurations.csv",
@@ -261,6 +263,20 @@ def test_known_distances_in_another_unit_are_refused():
     fit = calibrate(chain, [contacts.take(np.s_[::3]), distances], "placement,tool")
     assert max(group.rms for group in fit.comparisons[-1].after.groups.values()) > 10
     assert fit.verdict.status == "refused"
+
+
+def test_no_change_explains_more_than_the_residuals_of_touches():
+    """The points take nearly all of a motion of the base: evidence of 1e5 came from rounding errors."""
+    (panda,) = (series for series in PUBLIC_SERIES if series.robot.startswith("mukca_panda"))
+    found = panda.read(DATA)
+    assert found
+    chain, contacts = found
+    fit = calibrate(chain, contacts, session="off", extend="none")
+    timeline = order_samples(fit.data, ())
+    search = _Search(fit.problem, fit.x, timeline, True, len(contacts.rows), len(contacts.rows))
+    cause = search.best_cause(search.first_fit)
+    assert cause
+    assert cause.log_evidence < 0.5 * np.sum(search.first_fit.residual**2)
 
 
 @pytest.mark.parametrize("left", some_slow(["front_center", "mid_left"], {0}))

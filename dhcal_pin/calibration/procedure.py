@@ -182,7 +182,6 @@ def calibrate(
     setup = _set_up(_at_measured_temperature(chain, data), data, holdout, turned, options, progress)
     settings: dict[str, Any] = {
         "with_auto": None if method == "lm" and loss == "auto" else partial(again, method="lm", loss="auto"),
-        "with_full_set": partial(again, **_full_set(setup)) if _suggests_full_set(setup) else None,
         "has_default_sets": parameters is None,
         "signs": setup.signs,
     }
@@ -213,6 +212,11 @@ def calibrate(
             HAND_BUILT if setup.signs else MANUFACTURED,
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
+    if _suggests_full_set(setup):
+        # Nothing is looked for a second time where nothing happened.
+        has_changes = begun.session is not None and not begun.session.changes.is_empty
+        looked_for = {"session": session if has_changes else "off"}
+        settings["with_full_set"] = partial(again, **looked_for, **_full_set(setup))
     if method != "lm":
         result = make_result(begun.fit, 1.0, begun.holdout, method)
     elif has_images(setup.data) and setup.priors != "none":

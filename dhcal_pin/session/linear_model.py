@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._frozen import frozen
-from .._kernels import apply_observation_matrix
+from .._kernels import apply_observation_matrix, r_factor, solve_triangular
 from .._typing import Array
 from ..estimation.contacts.scale_gauge import normalize_by_scale
 from ..estimation.parameters import base, tool
@@ -34,6 +34,8 @@ MIN_OBSERVED = 1e-9
 MAX_UNEXPLAINED = 1e-3
 # Added to the unit diagonal of information for directions that nothing determines.
 MIN_INFORMATION = 1e-12
+# The same for the singular values of rows with columns of unit length.
+MIN_SINGULAR_VALUE = 1e-9
 # Axes of a scale; empty for all axes.
 SCALE_AXES = ("", "x", "y", "z")
 
@@ -230,6 +232,22 @@ def inverse(information: Array) -> Array:
     """Return the inverse of a matrix of information, some directions of which may be undetermined."""
     unit, scale = _with_unit_diagonal(information)
     return np.linalg.inv(unit) / scale / scale[:, None]
+
+
+def covariance_root(rows: Array, prior: Array) -> Array:
+    """Return a square root C (p, p) of a covariance CCᵀ from rows (n, p) and weights of priors (p,).
+
+    The R factor of the rows keeps the digits that a matrix of information loses where the rows hardly show a
+    direction: the squares of its singular values are the eigenvalues of that matrix.
+    """
+    p = len(prior)
+    stacked = np.zeros((p, len(rows) + p))
+    stacked[:, : len(rows)] = rows.T
+    sizes = np.sqrt(np.einsum("pn,pn->p", stacked, stacked) + prior**2)
+    sizes[sizes == 0] = 1.0
+    # Nothing determines some directions.
+    stacked.flat[len(rows) :: stacked.shape[1] + 1] = np.hypot(prior, MIN_SINGULAR_VALUE * sizes)
+    return solve_triangular(r_factor(stacked[:, None])[None], np.eye(p)[None])[0]
 
 
 def solve_information(information: Array, right: Array) -> Array:

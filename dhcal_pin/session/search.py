@@ -27,6 +27,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -41,7 +42,7 @@ from ..measurements.configurations import group_by_configuration
 from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
-from .linear_model import Layout, inverse, solve_information, whitened_rows
+from .linear_model import Layout, covariance_root, inverse, solve_information, whitened_rows
 from .part_bases import place_parts, starts_of_parts
 from .robot_changes import JointPaths, Motion, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
@@ -117,11 +118,26 @@ class LinearFit:
     columns: Array  # Columns of the unknowns and causes of the fit, (N, k, p)
     residual: Array  # Residual after the fit, divided by the noise, (N, k)
     step: Array  # Step of the unknowns and causes, (p,)
-    covariance: Array  # Covariance of them with the weights of the samples, (p, p)
-    test_covariance: Array  # Covariance of them with equal weights, (p, p)
+    prior: Array  # Weights of their priors, (p,)
     score: Array  # Remaining derivative of the cost with equal weights and bounded residuals, (p,)
     weights: Array  # Weights of the samples, (N,)
     noise: Array  # Noise of each row in whitened units, (N, k)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of the unknowns and causes with the weights of the samples, (p, p)."""
+        root = self._covariance_root(np.sqrt(self.weights))
+        return root @ root.T
+
+    @cached_property
+    def test_root(self) -> Array:
+        """Square root C of their covariance CCᵀ with equal weights, (p, p)."""
+        return self._covariance_root(np.ones(len(self.weights)))
+
+    def _covariance_root(self, roots: Array) -> Array:
+        """Return a square root of the covariance with given square roots of the weights, (p, p)."""
+        scaled = self.columns * (roots[:, None] / self.noise)[..., None]
+        return covariance_root(scaled.reshape(-1, len(self.prior)), self.prior)
 
 
 class _Search:
@@ -267,12 +283,9 @@ class _Search:
         bounded = (after / noise) * weights[:, None]
         variance = np.sum(bounded**2 * is_row) / (np.sum(is_row) * freedom)
         noise = np.maximum(noise * np.sqrt(variance), MIN_NOISE)
-        equal, weighted = (
-            inverse(information_with(each) + np.diag(prior**2)) for each in (np.ones(len(rows)), weights)
-        )
         residual = after / noise
         score = np.tensordot(residual * weights[:, None] / noise, columns, 2) - prior**2 * (value + step)
-        return LinearFit(rows, columns, residual, step, weighted, equal, score, weights, noise)
+        return LinearFit(rows, columns, residual, step, prior, score, weights, noise)
 
     def iterate(self, fit: LinearFit) -> LinearFit:
         """Fit unknowns and causes until the steps are negligible, from a fit at their current values."""
@@ -340,11 +353,14 @@ class _Search:
         without = copy.copy(self)
         without.causes = [*self.causes[:i], *self.causes[i + 1 :]]
         fit = self.solve(self._undone(rows, self.causes[i]), without.causes)
+        # The order of the samples does not change it.
+        root = fit.test_root
 
         def evidence(order: Array) -> float:
             """Return the greatest evidence of a change over the samples in an order."""
             names = ("rows", "columns", "residual", "weights", "noise")
             ordered = replace(fit, **{name: getattr(fit, name)[order] for name in names})
+            vars(ordered)["test_root"] = root
             changes = (c for c in without._candidates(ordered) if not c.block.is_constant)
             return max((c.log_evidence for c in changes), default=-np.inf)
 
@@ -372,7 +388,7 @@ class _Search:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
         own = cause.columns_of(fit.rows, self.numbers, self.times) @ cause.values
         others = np.tensordot(own / fit.noise**2, fit.columns, 2)
-        effect = (own - fit.columns @ (fit.test_covariance @ others)) / fit.noise
+        effect = (own - fit.columns @ (fit.test_root @ (fit.test_root.T @ others))) / fit.noise
         return float(np.sqrt(np.sum(effect**2) / (np.sum(self.groups >= 0) * self._concerned(cause))))
 
     def _concerned(self, cause: Cause) -> float:
@@ -445,10 +461,10 @@ class _Search:
             right = right.reshape(len(f), len(own), count)
             beside = beside.reshape(len(f), len(own), count, -1)
         sizes = np.tile([block.sizes for block in blocks], right.shape[2] // own.shape[1])
-        explained = beside @ fit.test_covariance
-        matrix = inner - explained @ beside.swapaxes(2, 3)
+        explained = beside @ fit.test_root
+        matrix = inner - explained @ explained.swapaxes(2, 3)
         matrix += MIN_UNEXPLAINED * inner * np.eye(sizes.shape[1])
-        right = right - explained @ fit.score
+        right = right - explained @ (fit.test_root.T @ fit.score)
         values, vectors = np.linalg.eigh(matrix * sizes[:, None] * sizes[:, :, None])
         values = np.maximum(values, 0.0)
         along = np.einsum("sbij,sbi->sbj", vectors, right * sizes)

@@ -54,14 +54,13 @@ def contact_bias(problem: Problem, x: Array, root: Array) -> Array:
         return slopes
     drawn = [item.take(np.s_[:: -(-len(item.rows) // _MAX_SAMPLES)]) for item in contacts]
     shares = [len(item.rows) / len(part.rows) for item, part in zip(contacts, drawn, strict=True)]
+    n_robot, names = len(problem.errors.parameters), [parameter.name for parameter in problem.parameters]
     for i, step in enumerate(_STEP * np.eye(len(x))):
-        volumes = [
-            sum(
-                share * log_volume(problem, x + side, part) for share, part in zip(shares, drawn, strict=True)
-            )
-            for side in (step, -step)
-        ]
-        slopes[i] = (volumes[0] - volumes[1]) / (2 * _STEP)
+        for share, part in zip(shares, drawn, strict=True):
+            # A touched object only concerns the contacts with it.
+            if i < n_robot or names[i] in {parameter.name for parameter in part.instrument_parameters}:
+                up, down = (log_volume(problem, x + side, part) for side in (step, -step))
+                slopes[i] += share * (up - down) / (2 * _STEP)
     return -root @ (root.T @ slopes)
 
 
