@@ -20,14 +20,9 @@ import numpy as np
 from ... import se3
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, InvalidArgumentError
-from ...formatting import format_count
-from ...measurements.base import Measurement
-from ...measurements.pose import Pose
-from ...measurements.position import Position
 from ...robot.chain import Chain
-from ..tabular import csv_text, require_usable_names
-from .standstills import JointSeries, PoseSeries, Stops, find_stops
-from .writing import joint_columns, value_columns
+from ..tabular import require_usable_names
+from .standstills import JointSeries, PoseSeries, describe_stops, find_stops, have_common_times, stops_text
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -92,25 +87,18 @@ def convert_bag(
             raise InvalidArgumentError(f"{source}: {problem}; candidates: {candidates}")
         joints = _read_joints(reader, source, joint_topic, chain)
         poses = _read_poses(reader, source, pose_topic)
-    notes = []
+    notes: list[str] = []
     # Column of the times that are used.
     clock = 0
-    if not _have_common_times(joints.times[:, 0], poses.times[:, 0]):
+    if not have_common_times(joints.times[:, 0], poses.times[:, 0]):
         clock = 1
         notes.append("the stamps of the topics have no time in common; the times of the recording are used")
     try:
         stops = find_stops(*_in_order(joints, poses, clock))
     except DhcalError as error:
         raise FileFormatError(f"{source}: {joint_topic}, {pose_topic}: {error}") from None
-    frame = poses.frame or "unknown"
-    notes = [
-        f"{format_count(len(stops.q), 'stop')} of {joint_topic} and {pose_topic} (frame {frame})",
-        *notes,
-        f"the clock of {pose_topic} is {stops.clock_offset:+.2f} s off that of {joint_topic}",
-    ]
-    if stops.n_without_poses:
-        notes.append(f"left out {format_count(stops.n_without_poses, 'stop')} without a pose")
-    return _stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes
+    notes = describe_stops(stops, joint_topic, pose_topic, f" (frame {poses.frame or 'unknown'})", notes)
+    return stops_text(stops, joints.names, chain, [f"{source}: {notes[0]}", *notes[1:]]), notes
 
 
 def read_bag_joints(path: PathLike, joint_topic: str | None) -> JointSeries:
@@ -118,21 +106,6 @@ def read_bag_joints(path: PathLike, joint_topic: str | None) -> JointSeries:
     source = os.fspath(path)
     with _open_bag(source) as reader:
         return _read_joints(reader, source, _choose_joint_topic(reader, source, joint_topic), None)
-
-
-def _stops_text(stops: Stops, names: tuple[str, ...], chain: Chain | None, comments: list[str]) -> str:
-    """Return the text of a measurement file with one row per stop."""
-    data: Measurement
-    if stops.rotations is None:
-        data = Position(stops.q, stops.positions)
-    else:
-        data = Pose(stops.q, se3.transform(stops.rotations, stops.positions))
-    if chain is not None:
-        joints = joint_columns(stops.q, chain)
-    else:
-        joints = {f"{name}[rad]": stops.q[:, j].tolist() for j, name in enumerate(names)}
-    times = np.round(stops.times - stops.times[0], 3).tolist()
-    return csv_text({"time[s]": times, **joints, **value_columns(data)}, comments)
 
 
 # --- reading ---------------------------------------------------------------------------------------
@@ -294,12 +267,6 @@ def _rotations(quaternions: Array, where: str) -> Array:
     if not (norms > _MIN_NORM).all():
         raise FileFormatError(f"{where}: has a quaternion of norm {norms.min():.3g}; expected 1")
     return se3.quaternion_to_matrix(quaternions / norms[:, None])
-
-
-def _have_common_times(first: Array, second: Array) -> bool:
-    """Return whether two series of times overlap, and none of them has the same time in all messages."""
-    is_set = all(len(times) == 1 or np.ptp(times) > 0 for times in (first, second))
-    return is_set and bool(first.min() <= second.max() and second.min() <= first.max())
 
 
 def _in_order(joints: JointSeries, poses: PoseSeries, clock: int) -> tuple[JointSeries, PoseSeries]:

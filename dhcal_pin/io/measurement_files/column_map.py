@@ -52,7 +52,14 @@ from ...units import ANGLES, UNITS
 from .. import toml_table as toml
 from ..tables import SEPARATORS, TextLayout
 from ..toml_table import Key, TomlTable
-from .columns import ROTVEC, SECOND_PREFIX, column_contents, known_columns, unknown_column_error
+from .columns import (
+    ROTVEC,
+    SECOND_PREFIX,
+    column_contents,
+    condition_contents,
+    known_columns,
+    unknown_column_error,
+)
 from .counts import TICKS
 
 # Placeholders in a constant, each written in braces.
@@ -172,7 +179,7 @@ def read_map(path: PathLike, chain: Chain) -> ColumnMap:
         if key in table:
             names = [prefix + name for name in chain.joint_names]
             rules += _joint_rules(table.table(key), names, contents)
-    rules += _column_rules(table.table("columns"), contents)
+    rules += _column_rules(table.table("columns"), contents, condition_contents(chain))
     rotation = _rotation(table.table("rotation")) if "rotation" in table else None
     constants = _constants(table.table("constant"), contents)
     table.finish()
@@ -221,12 +228,15 @@ def _joint_rules(table: TomlTable, joints: Sequence[str], contents: Mapping[str,
     ]
 
 
-def _column_rules(table: TomlTable, contents: Mapping[str, str]) -> list[ColumnRule]:
+def _column_rules(
+    table: TomlTable, contents: Mapping[str, str], conditions: Mapping[str, str]
+) -> list[ColumnRule]:
     rules = []
     for name in table.keys():
         entry = table.table(name)
         source, unit, scale, offset = entry.values(COLUMN_KEYS).values()
-        rules.append(_rule(entry, name, contents, (), source, unit, scale, offset))
+        known = {**contents, **conditions} if unit else contents
+        rules.append(_rule(entry, name, known, (), source, unit, scale, offset))
     return rules
 
 

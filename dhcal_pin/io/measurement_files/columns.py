@@ -113,12 +113,16 @@ def column_contents(chain: Chain) -> dict[str, str]:
         for joint in chain.urdf.joints
         for name in joint_column_names([joint.name])
     }
-    conditions = {
+    return {**condition_contents(chain), **_CONTENTS, **joints}
+
+
+def condition_contents(chain: Chain) -> dict[str, str]:
+    """Return the quantity of each column of a condition; a time without a unit is a text for people."""
+    return {
         column: CONDITIONS[name].quantity
         for name, columns in condition_columns(chain).items()
         for column in columns
     }
-    return {**conditions, **_CONTENTS, **joints}
 
 
 def check_joint_names(chain: Chain) -> None:
@@ -368,10 +372,20 @@ def find_kind(table: DataTable) -> type[Measurement]:
     present = _present_values(table)
     if has_tool_poses(table):
         present -= set(TOOL_POSE)
-    return _kind_of_columns(present, table.header_location)
+    return _kind_of_columns(present, table.header_location, join_hint(table))
 
 
-def _kind_of_columns(present: Set[str], where: str) -> type[Measurement]:
+def join_hint(table: DataTable) -> str:
+    """Say how values over time in a file of their own are joined with the others; empty without times."""
+    if "time" not in table.columns:
+        return ""
+    return (
+        "; joint values and measured values of two recordings are joined by dhcal convert JOINTS.csv OUT.csv "
+        "--poses FILE.csv --robot ROBOT"
+    )
+
+
+def _kind_of_columns(present: Set[str], where: str, hint: str = "") -> type[Measurement]:
     """Find the measurement kind that has some columns of values."""
     candidates = [
         (len(required), -len(kind.columns), kind)
@@ -386,7 +400,7 @@ def _kind_of_columns(present: Set[str], where: str) -> type[Measurement]:
         if len(possible) == 1:
             (missing, *_) = sorted((sorted(each - present) for each in possible[0].required_columns), key=len)
             expected = f"kind {possible[0].kind} needs {', '.join(missing)}, too"
-        raise FileFormatError(f"{where}: no measured values{incomplete}; {expected}")
+        raise FileFormatError(f"{where}: no measured values{incomplete}; {expected}{hint}")
     kind = max(candidates, key=lambda candidate: candidate[:2])[2]
     if unrelated := sorted(present - set(kind.columns)):
         others = "".join(

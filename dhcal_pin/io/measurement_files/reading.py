@@ -50,6 +50,7 @@ from .columns import (
     has_titles,
     has_tool_poses,
     is_in_order,
+    join_hint,
     joint_units,
     joints_off_the_chain,
     known_columns,
@@ -431,6 +432,7 @@ def _require_joints(table: DataTable, chain: Chain, prefix: str) -> None:
         raise FileFormatError(
             f"{table.header_location}: no column for joint {prefix + missing[0]!r}; this robot needs "
             f"{expected}; if the measured point does not move with it, choose another tip link"
+            f"{join_hint(table)}"
         )
 
 

@@ -21,6 +21,13 @@ from ... import se3
 from ..._frozen import frozen
 from ..._typing import Array
 from ...exceptions import FileFormatError
+from ...formatting import format_count
+from ...measurements.base import Measurement
+from ...measurements.pose import Pose
+from ...measurements.position import Position
+from ...robot.chain import Chain
+from ..tabular import csv_text
+from .writing import joint_columns, value_columns
 
 # Half of the window in which a series must not change to stand still [s].
 _HALF_WINDOW_S = 0.1
@@ -95,7 +102,9 @@ def find_stops(joints: JointSeries, poses: PoseSeries) -> Stops:
             (0.5 * (start + end), joints.q[during].mean(0), poses.positions[inside].mean(0), rotation)
         )
     if not rows:
-        raise FileFormatError("no pose was recorded while the arm stood still; check the topics")
+        raise FileFormatError(
+            "no pose was recorded while the arm stood still; check that both are of the same motion"
+        )
     times, q, positions, rotations = zip(*rows, strict=True)
     return Stops(
         times=np.array(times),
@@ -107,17 +116,54 @@ def find_stops(joints: JointSeries, poses: PoseSeries) -> Stops:
     )
 
 
+def have_common_times(first: Array, second: Array) -> bool:
+    """Return whether two series of times overlap, and none of them has the same time in all samples."""
+    is_set = all(len(times) == 1 or np.ptp(times) > 0 for times in (first, second))
+    return is_set and bool(first.min() <= second.max() and second.min() <= first.max())
+
+
+def describe_stops(stops: Stops, joints: str, poses: str, frame: str, clocks: list[str]) -> list[str]:
+    """Describe the stops of recorded joints and poses in a frame, with notes on their clocks."""
+    notes = [
+        f"{format_count(len(stops.q), 'stop')} of {joints} and {poses}{frame}",
+        *clocks,
+        f"the clock of {poses} is {stops.clock_offset:+.2f} s off that of {joints}",
+    ]
+    if stops.n_without_poses:
+        notes.append(f"left out {format_count(stops.n_without_poses, 'stop')} without a pose")
+    return notes
+
+
+def stops_text(stops: Stops, names: tuple[str, ...], chain: Chain | None, comments: list[str]) -> str:
+    """Return the text of a measurement file with one row per stop."""
+    data: Measurement
+    if stops.rotations is None:
+        data = Position(stops.q, stops.positions)
+    else:
+        data = Pose(stops.q, se3.transform(stops.rotations, stops.positions))
+    if chain is not None:
+        joints = joint_columns(stops.q, chain)
+    else:
+        joints = {f"{name}[rad]": stops.q[:, j].tolist() for j, name in enumerate(names)}
+    times = np.round(stops.times - stops.times[0], 3).tolist()
+    return csv_text({"time[s]": times, **joints, **value_columns(data)}, comments)
+
+
 def _stands_still(times: Array, values: Array, limits: tuple[float, float]) -> Array:
     """Return at which samples no component of a series (k, ·) changes within the window, (k,)."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d  # lazy import: slow, only for bags
 
-    interval = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
     # Samples that are further apart than the window are measurements of their own.
-    size = 2 * int(np.ceil(_HALF_WINDOW_S / interval)) + 1 if interval <= 2 * _HALF_WINDOW_S else 1
+    size = 1 if _is_sparse(times) else 2 * int(np.ceil(_HALF_WINDOW_S / np.median(np.diff(times)))) + 1
     changes = maximum_filter1d(values, size, axis=0) - minimum_filter1d(values, size, axis=0)
     change = changes.max(1)
     tolerance = np.clip(_NOISE_FACTOR * np.quantile(change, 0.1), *limits)
     return change <= tolerance
+
+
+def _is_sparse(times: Array) -> bool:
+    """Return whether samples are further apart than the window in which a series must not change."""
+    return len(times) < 2 or float(np.median(np.diff(times))) > 2 * _HALF_WINDOW_S
 
 
 def _clock_offset(joint_times: Array, joints_move: Array, pose_times: Array, poses_move: Array) -> float:
@@ -141,7 +187,9 @@ def _clock_offset(joint_times: Array, joints_move: Array, pose_times: Array, pos
     products = products[middle - n_steps : middle + n_steps + 1]
     correlation = products / (np.linalg.norm(joint_flags) * np.linalg.norm(pose_flags))
     if correlation.max() < _MIN_CORRELATION:
-        raise FileFormatError("the measured point does not move when the joints do; check the topics")
+        raise FileFormatError(
+            "the measured point does not move when the joints do; check that both are of the same motion"
+        )
     # The maximum is flat within one step of the slower series.
     best = np.flatnonzero(correlation >= correlation.max() - 1e-9)
     return float((best.mean() - n_steps) * _STEP_S)
@@ -155,6 +203,8 @@ def _on_grid(grid: Array, times: Array, flags: Array) -> Array:
 
 def _standstills(joints: JointSeries, is_still: Array) -> list[tuple[float, float]]:
     """Return start and end of each standstill of the joints [s]."""
+    if _is_sparse(joints.times):
+        return [(time - _HALF_WINDOW_S, time + _HALF_WINDOW_S) for time in joints.times.tolist()]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], is_still.astype(int), [0]])))
     merged: list[tuple[int, int]] = []
     for first, last in (edges.reshape(-1, 2) - [0, 1]).tolist():
