@@ -45,7 +45,7 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def record(place, offset=0.0, start=0.0, kind=Position, joint_start=0.0):
+def record(place, offset=0.0, start=0.0, kind: type = Position, joint_start=0.0):
     """Write joints.csv and poses.csv with a clock of its own; return the stops and the arm."""
     arm, (stops, times, q) = nominal_arm("ur10"), motion()
     names = [f"{name}[deg]" for name in arm.joint_names]
@@ -60,9 +60,9 @@ def record(place, offset=0.0, start=0.0, kind=Position, joint_start=0.0):
         xyz[rng.random(len(xyz)) < 0.02] = np.nan
         write(place / "poses.csv", ["Time (Seconds)", "X", "Y", "Z"], (shown, xyz), ";")
     else:
-        quaternion = np.stack(se3.rotvec_to_quaternion(se3.log3(poses[:, :3, :3])).T, 0)
+        quaternion = se3.rotvec_to_quaternion(se3.log3(poses[:, :3, :3]))
         headers = ["time[ms]", "x[mm]", "y[mm]", "z[mm]", "qw", "qx", "qy", "qz"]
-        write(place / "poses.csv", headers, (1e3 * shown, xyz, quaternion.T))
+        write(place / "poses.csv", headers, (1e3 * shown, xyz, quaternion))
     (place / "map.toml").write_text(MAP)
     return stops, arm
 
