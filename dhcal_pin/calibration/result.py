@@ -70,9 +70,10 @@ class Result(Evidence, ResultPlots):
         """This result, without the correction if the verdict keeps the nominal robot."""
         if not (self.verdict.keeps_nominal and self.shrinkage_factor):
             return self
+        instruments = self.problem.instrument_start(self.nominal_instruments)
         return replace(
             self,
-            x=np.zeros_like(self.x),
+            x=np.append(np.zeros(len(self.errors.parameters)), instruments),
             chain=self.nominal_refitted,
             shrinkage_factor=0.0,
             bare=None,

@@ -23,6 +23,7 @@ from dhcal_pin.cli.main import main
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.robust import LOSSES
 from dhcal_pin.measurements import KINDS, Noise, Pose, Position
+from dhcal_pin.measurements.length import Wires
 from dhcal_pin.measurements.position import PointMeasurement
 
 # Samples that are 20 mm wrong, and those that are held out.
@@ -219,6 +220,19 @@ def test_a_kept_robot_has_no_part_of_the_correction():
     assert verdict.keeps_nominal
     (reason,) = (text for text in verdict.reasons if "correction" in text)
     assert reason.endswith("No correction is applied; measure more poses.")
+
+
+@pytest.mark.parametrize("zero", [0.0, 0.015])
+def test_a_kept_robot_has_the_instruments_that_fit_it(zero):
+    """The anchor and the zero of a wire were those before the fit: 8 mm in place of 0.2."""
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(4)
+    q, anchor = rng.uniform(-2.3, 2.3, (60, 6)), np.array([1.2, -0.3, 0.9])
+    lengths = np.linalg.norm(arm.poses(q)[:, :3, 3] - anchor, axis=1) + zero
+    fit = calibrate(arm, Wires(q, (lengths + 2e-4 * rng.standard_normal(60))[:, None]), extend="none")
+    assert fit.verdict.keeps_nominal
+    kept = fit.accepted
+    assert kept.instruments["wire1.zero"] == pytest.approx(zero, abs=2e-3)
+    assert kept.validate(kept.data)["residual_rms"] < 2.5e-4
 
 
 def test_repeated_samples_do_not_show_outliers_but_stated_noise_does():
