@@ -301,12 +301,16 @@ def _set_up(
     signs = _joint_signs(chain, data, turned, is_low_cost, progress)
     chain = signs.apply(chain) if signs else chain
     exchanges: Sequence[cameras.Exchange] = ()
+    stated = _validated_known(data, options.known or {})
     if has_images(data):
         shown = with_shown_entries((*data, *holdout))
         data, holdout = shown[: len(data)], shown[len(data) :]
         data, exchanges = cameras.exchange_axes(chain, data)
         holdout = cameras.reorder(holdout, exchanges)
-    known = {**held_values(data, rig_sets), **_validated_known(data, options.known or {})}
+    # Cameras and boards that no image shows are not part of the problem.
+    shown_names = {parameter.name for parameter in merge_instrument_parameters(data)}
+    stated = {name: value for name, value in stated.items() if name in shown_names}
+    known = {**held_values(data, rig_sets), **stated}
     errors = (
         select_parameters(chain, robot_sets, options.fix, free)
         if robot_sets or free

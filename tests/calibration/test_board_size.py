@@ -172,3 +172,19 @@ def test_estimated_corners_have_the_size_of_their_board():
     assert isinstance(larger, CameraCorners)
     (points,) = larger.points(np.array([p.nominal for p in larger.instrument_parameters]))
     np.testing.assert_allclose(points, 1.1 * board.points, atol=1e-12)
+
+
+def test_a_board_that_no_image_shows_needs_no_known_pose():
+    """Images that show one of two calibrated boards were an error: its pose belongs to no measurement."""
+    arm, images = photograph(0, 1e-3)
+    (board,) = images.rig.boards
+    rig = replace(images.rig, boards=(board, replace(board, name="other")))
+    names = [board.name] * len(images.rows)
+    shown = CameraCorners(images.q, images.values, images.corner, rig, board=names)
+    known = {"board_other.x": 0.1, "board_other.rz": 0.2}
+    fit = dh.calibrate(arm, shown, "base,tool", known=known)
+    assert not any("other" in name for name in fit.instruments)
+    alone = dh.calibrate(arm, images, "base,tool")
+    assert fit.problem.cost(fit.x) == pytest.approx(alone.problem.cost(alone.x), rel=1e-9)
+    with pytest.raises(dh.exceptions.UnknownNameError, match=r"board_none\.x"):
+        dh.calibrate(arm, shown, "base,tool", known={"board_none.x": 0.1})
