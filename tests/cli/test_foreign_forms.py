@@ -448,6 +448,20 @@ def test_joints_are_proposed_by_their_names(run, expected, columns, order, unit)
         assert one["value"] == pytest.approx(other["value"], abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    "headers", [("rvx", "rvy", "rvz"), ("rvec_x", "rvec_y", "rvec_z"), ("rvec[0]", "rvec[1]", "rvec[2]")]
+)
+def test_rotation_vectors_of_opencv_are_proposed(run, headers):
+    """The rotation of a pose by solvePnP was left out without a word."""
+    turns = np.random.default_rng(5).uniform(-2, 2, (20, 3))
+    rows = [[*cells, *map(repr, turn)] for cells, turn in zip(CELLS, turns.tolist(), strict=True)]
+    names = [*(f"joint_{j}_deg" for j in (1, 2, 3)), "tx_mm", "ty_mm", "tz_mm", *headers]
+    write("data.csv", "\n".join(map(";".join, [names, *rows])))
+    status, _, err = run(*CALIBRATE)
+    assert status == 2
+    assert f'rotation = {{convention = "rotvec", columns = {json.dumps(headers)}, unit = "rad"}}' in err
+
+
 def test_a_counter_is_no_joint_without_names_either(run, expected):
     rows = [[str(i), *cells] for i, cells in enumerate(CELLS, 1)]
     write("data.csv", "\n".join(map(",".join, rows)))

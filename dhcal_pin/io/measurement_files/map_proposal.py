@@ -54,7 +54,11 @@ _NOT_MEASURED = r"std|sigma|goal|target|command|nominal|soll"
 _NOT_POSITION = (
     rf"vel|speed|acc|effort|torque|force|moment|current|temp|tcp|(?<![a-z])qd+(?![a-z])|{_NOT_MEASURED}"
 )
-_ROTATION = r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|[abcwpr]|roll|pitch|yaw|rot.*|orientation.*)(?![a-z])"
+# Rotation vectors of OpenCV have headers such as `rvx`, `rvec_x` and `rvec[0]`.
+_ROTATION = (
+    r"(?<![a-z])(?:q[wxyz0-3]|r[xyz]|r(?:v|vec|odrigues)[_. \[]?[xyz0-3]|[abcwpr]|roll|pitch|yaw|rot.*|"
+    r"orientation.*)(?![a-z])"
+)
 # Headers of times, and of counters of rows.
 _TIME = r"time|stamp|zeit|datum|(?<![a-z])(?:n?secs?|date)(?![a-z])"
 _COUNTER = (
