@@ -451,7 +451,7 @@ def test_joints_are_proposed_by_their_names(run, expected, columns, order, unit)
 @pytest.mark.parametrize(
     "headers", [("rvx", "rvy", "rvz"), ("rvec_x", "rvec_y", "rvec_z"), ("rvec[0]", "rvec[1]", "rvec[2]")]
 )
-def test_rotation_vectors_of_opencv_are_proposed(run, headers):
+def test_rotation_vectors_of_opencv_are_proposed(run, expected, headers):
     """The rotation of a pose by solvePnP was left out without a word."""
     turns = np.random.default_rng(5).uniform(-2, 2, (20, 3))
     rows = [[*cells, *map(repr, turn)] for cells, turn in zip(CELLS, turns.tolist(), strict=True)]
