@@ -225,7 +225,8 @@ def _choose_position(table: DataTable, others: Sequence[int]) -> list[int]:
 def _is_axis(header: str, axis: str) -> bool:
     """Return whether a header in lower case names a measured coordinate along an axis."""
     is_named = re.search(rf"(?<![a-z]){axis}(?![a-z])", header)
-    return bool(is_named) and not re.search(rf"orientation|rotation|quat|rv(?:ec)?_|rodrigues|{_NOT_MEASURED}", header)
+    others = rf"orientation|rotation|quat|rv(?:ec)?_|rodrigues|{_NOT_MEASURED}"
+    return bool(is_named) and not re.search(others, header)
 
 
 def _rotation_line(
