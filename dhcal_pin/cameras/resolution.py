@@ -1,10 +1,13 @@
 """Whether a lens that images show is far from the stated one, and whether another resolution explains it.
 
 Images of another resolution than stated scale focal lengths and image centre by one factor. A wrong lens
-changes the focal lengths, but hardly the image centre.
+changes the focal lengths, but hardly the image centre. The lens of another resolution has the same effect;
+then all corners are within the stated size of the images.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +22,21 @@ MAX_DIFFERENCE = 0.1
 MIN_FAR = 5.0
 
 
-def find_resolution(camera: Camera, found: Array, corners: Array) -> float | None:
-    """Find the factor between the resolution of the images and the stated one; None without such a factor.
+class Resolution(NamedTuple):
+    """Resolution of the images or of the lens, in place of the stated one."""
+
+    factor: float  # Focal length that the images show, as a multiple of the stated one
+    is_of_lens: bool  # Whether the images have the stated size, and the lens that of another one
+
+    @property
+    def remedy(self) -> str:
+        """What has to be corrected in the rig."""
+        size = "" if self.is_of_lens else "width, height, "
+        return f"Correct {size}fx, fy, cx and cy of the camera."
+
+
+def find_resolution(camera: Camera, found: Array, corners: Array) -> Resolution | None:
+    """Find the resolution of the images or of the lens, if one of them is not the stated one.
 
     Args:
         camera: Camera with its stated lens.
@@ -28,8 +44,8 @@ def find_resolution(camera: Camera, found: Array, corners: Array) -> float | Non
         corners: Image coordinates of the camera, shape (m, 2) [px].
 
     Returns:
-        The factor, or None if the lens is not that of another usual resolution, or if corners are outside of
-        its images.
+        The resolution, or None if the lens is not that of another usual resolution, or if corners are outside
+        of the images.
     """
     stated = camera.values[:4]
     if not camera.has_intrinsics or min(stated.min(), found[:4].min()) <= 0:
@@ -37,8 +53,11 @@ def find_resolution(camera: Camera, found: Array, corners: Array) -> float | Non
     ratios = found[:4] / stated
     factor = float(FACTORS[np.argmin(np.abs(np.log(FACTORS) - np.mean(np.log(ratios))))])
     is_scaled = np.all(np.abs(ratios / factor - 1) <= MAX_DIFFERENCE)
-    size = factor * np.array([camera.width, camera.height])
-    return factor if is_scaled and np.all(corners < size) else None
+    size = np.array([camera.width, camera.height])
+    # Corners of larger images are not all in one corner of them.
+    is_of_lens = bool(np.all(corners < size)) and (factor > 1 or bool(np.any(corners >= factor * size)))
+    is_possible = is_of_lens or np.all(corners < factor * size)
+    return Resolution(factor, is_of_lens) if is_scaled and is_possible else None
 
 
 def is_far(camera: Camera, found: Array) -> bool:
@@ -52,12 +71,18 @@ def is_far(camera: Camera, found: Array) -> bool:
     return is_stated and bool(np.max(np.abs((found - camera.values)[:4])) > MIN_FAR * PIXEL_PRIORS["prior"])
 
 
-def describe_resolution(camera: Camera, factor: float) -> str:
-    """Say which resolution the images have, in place of the stated one.
+def describe_resolution(camera: Camera, resolution: Resolution) -> str:
+    """Say which resolution the images or the lens have, in place of the stated one.
 
     Args:
         camera: Camera with its stated resolution.
-        factor: Factor between the two.
+        resolution: The other resolution.
     """
+    factor = 1 / resolution.factor if resolution.is_of_lens else resolution.factor
     width, height = round(factor * camera.width), round(factor * camera.height)
+    if resolution.is_of_lens:
+        return (
+            f"fx, fy, cx and cy are those of images of {width} x {height} px, not of {camera.width} x "
+            f"{camera.height} px"
+        )
     return f"the images are {width} x {height} px, not {camera.width} x {camera.height} px"

@@ -61,9 +61,12 @@ def corrected(images, factor):
 def test_a_resolution_scales_focal_lengths_and_image_centre(factor):
     camera = Camera("c", "tip", 1280, 960, STATED)
     found = factor * np.pad([1020.0, 1020.0, 660.0, 460.0], (0, 5))
-    corners = factor * np.array([[10.0, 10.0], [1270.0, 950.0]])
-    assert find_resolution(camera, found, corners) == pytest.approx(factor)
-    assert find_resolution(camera, found, 1.1 * corners) is None
+    seen = np.array([[10.0, 10.0], [1270.0, 950.0]])
+    corners = factor * seen
+    assert find_resolution(camera, found, corners) == (pytest.approx(factor), False)
+    # The images have the stated size, and the lens is that of another one.
+    assert find_resolution(camera, found, seen) == (pytest.approx(factor), True)
+    assert find_resolution(camera, found, 1.1 * max(factor, 1.0) * seen) is None
     only_focal = np.concatenate([found[:2], STATED[2:]])
     assert find_resolution(camera, only_focal, corners) is None
 
@@ -93,6 +96,24 @@ def test_another_resolution_is_named_and_its_correction_helps(seed, factor, size
     assert fit.verdict.status == "caution"
     (reason,) = [text for text in fit.verdict.reasons if "resolution" in text or "the images are" in text]
     assert f"the images are {size} px, not 1280 x 960 px" in reason
+    assert right.verdict.status == "ok"
+
+
+@pytest.mark.parametrize(
+    ("seed", "factor", "size"), some_slow([(0, 1 / 2, "640 x 480"), (1, 2.0, "2560 x 1920")], {0})
+)
+def test_a_lens_of_another_resolution_is_named_and_its_correction_helps(seed, factor, size):
+    """The size of the images was right: the advice to change it made the rig wrong."""
+    arm, images = photograph(seed, intrinsics_error=0.02)
+    lens = images.rig.cameras[0].values
+    wrong = with_camera(images, values=np.concatenate([factor * lens[:4], lens[4:]]))
+    fit, right = (
+        dh.calibrate(arm, data, loss="linear") for data in (wrong, with_camera(images, values=lens))
+    )
+    reasons = [text for text in fit.verdict.reasons if "fx, fy, cx and cy are those of images" in text]
+    assert len(reasons) == 1
+    assert f"of images of {size} px, not of 1280 x 960 px" in reasons[0]
+    assert reasons[0].endswith("Correct fx, fy, cx and cy of the camera.")
     assert right.verdict.status == "ok"
 
 

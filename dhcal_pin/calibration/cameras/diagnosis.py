@@ -580,11 +580,9 @@ def _lens_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     values, texts = state.values, []
     item = _images(hand_eye.data)
     for number, camera in enumerate(item.rig.cameras):
-        if factor := find_image_resolution(hand_eye.data, camera, values):
-            return (
-                f"the resolution: {describe_resolution(camera, factor)} (camera {camera.name!r})",
-                "Correct width, height, fx, fy, cx and cy of the camera.",
-            )
+        if resolution := find_image_resolution(hand_eye.data, camera, values):
+            text = describe_resolution(camera, resolution)
+            return f"the resolution: {text} (camera {camera.name!r})", resolution.remedy
         found = lens_values(camera, values)
         if not camera.has_intrinsics or found[:2].min() <= 0:
             continue

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..._typing import Array
-from ...cameras.resolution import describe_resolution, find_resolution, is_far
+from ...cameras.resolution import Resolution, describe_resolution, find_resolution, is_far
 from ...cameras.rig import Camera
 from ...estimation.priors import PriorGroup, PriorGroups
 from ...estimation.problem import Problem
@@ -95,8 +95,8 @@ def lens_values(camera: Camera, values: Mapping[str, float]) -> Array:
 
 def find_image_resolution(
     data: Sequence[Measurement], camera: Camera, values: Mapping[str, float]
-) -> float | None:
-    """Find the factor between the resolution of the images of a camera and the stated one; None without."""
+) -> Resolution | None:
+    """Find the resolution of the images or of the lens of a camera, if one of them is not the stated one."""
     corners = [
         item.values[item.camera == number]
         for item in select_images(data)
@@ -112,11 +112,11 @@ def describe_far_lenses(data: Sequence[Measurement], values: Mapping[str, float]
     texts = []
     for camera in cameras.values():
         found = lens_values(camera, values)
-        if factor := find_image_resolution(data, camera, values):
+        if resolution := find_image_resolution(data, camera, values):
             texts.append(
                 f"The focal length of camera {camera.name!r} is {np.mean(found[:2] / camera.values[:2]):.2f} "
-                f"times the stated one, and its image centre as well: {describe_resolution(camera, factor)}. "
-                "Correct width, height, fx, fy, cx and cy of the camera."
+                "times the stated one, and its image centre as well: "
+                f"{describe_resolution(camera, resolution)}. {resolution.remedy}"
             )
         elif is_far(camera, found):
             before, after = ([f"{v:.0f}" for v in each[:4]] for each in (camera.values, found))
