@@ -111,6 +111,8 @@ MAX_CONTINUED = 500
 # A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
 # standard errors, and by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
+# RMS error of the nominal robot, as a fraction of the workspace, of values that were computed, not measured.
+MAX_COMPUTED_ERROR = 2e-5
 # Residuals this many times as large as the stated standard deviations may be the cause of a large correction.
 MIN_SIGMA_RATIO = 10.0
 # Smallest residuals of a second fit, with the residuals of the first one as standard deviations. If they are
@@ -775,7 +777,14 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
     if change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
-    return [Finding("caution", f"{text}. No correction is applied; measure more poses.", True)]
+    remedy = "measure more poses"
+    before = head.before.groups[group]
+    if before.unit == "m" and before.rms < MAX_COMPUTED_ERROR * _workspace_size(fit):
+        remedy = (
+            "no real arm fits its nominal model so well: the measured values were probably computed with it, "
+            "such as by the controller. Measure with an independent instrument"
+        )
+    return [Finding("caution", f"{text}. No correction is applied; {remedy}.", True)]
 
 
 def _fitted_holdout(fit: Evidence) -> list[Finding]:

@@ -222,6 +222,19 @@ def test_a_kept_robot_has_no_part_of_the_correction():
     assert reason.endswith("No correction is applied; measure more poses.")
 
 
+@pytest.mark.parametrize(("noise", "is_computed"), [(2e-6, True), (5e-5, False)])
+def test_positions_that_the_controller_computed_are_named(noise, is_computed):
+    """More of them show nothing."""
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(1)
+    q = rng.uniform(-2.5, 2.5, (60, 6))
+    points = arm.poses(q)[:, :3, 3] + noise * rng.standard_normal((60, 3))
+    verdict = calibrate(arm, Position(q, points), extend="none").verdict
+    assert verdict.keeps_nominal
+    (reason,) = (text for text in verdict.reasons if "No correction is applied" in text)
+    assert ("probably computed with it" in reason) == is_computed
+    assert ("measure more poses" in reason) == (not is_computed)
+
+
 @pytest.mark.parametrize("zero", [0.0, 0.015])
 def test_a_kept_robot_has_the_instruments_that_fit_it(zero):
     """The anchor and the zero of a wire were those before the fit: 8 mm in place of 0.2."""
