@@ -131,11 +131,8 @@ def _constants(chain: Chain, transmission: Transmission) -> dict[str, Any]:
 
 
 def _weights(chain: Chain, loads: GravityLoads) -> tuple[dict[str, Array], Array, Array]:
-    """Return the tree of the moving joints in the whole robot, and masses and first moments of its bodies.
-
-    Joints that are not on the chain stay at neutral. The order is that of Pinocchio: a joint is behind the
-    one that carries it, also where the chain passes joints from child to parent. The payload is the last.
-    """
+    """Return the tree of the moving joints in Pinocchio's order, and masses and first moments of bodies."""
+    # Joints that are not on the chain stay at neutral. The payload is the last body.
     model = loads.model
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))

@@ -20,17 +20,7 @@ MIN_FAR = 5.0
 
 
 def find_resolution(camera: Camera, found: Array, corners: Array) -> float | None:
-    """Find the factor between the resolution of the images and the stated one; None without such a factor.
-
-    Args:
-        camera: Camera with its stated lens.
-        found: Values of the lens that the images show, shape (s,) [px and 1].
-        corners: Image coordinates of the camera, shape (m, 2) [px].
-
-    Returns:
-        The factor, or None if the lens is not that of another usual resolution, or if corners are outside of
-        its images.
-    """
+    """Find the factor of the resolution of a lens (s,) with corners (m, 2) to the stated one, if any."""
     stated = camera.values[:4]
     if not camera.has_intrinsics or min(stated.min(), found[:4].min()) <= 0:
         return None
@@ -42,22 +32,12 @@ def find_resolution(camera: Camera, found: Array, corners: Array) -> float | Non
 
 
 def is_far(camera: Camera, found: Array) -> bool:
-    """Return whether focal lengths or image centre are far from what a rig states with a prior.
-
-    Args:
-        camera: Camera with its stated lens.
-        found: Values of the lens that the images show, shape (s,) [px and 1].
-    """
+    """Return whether focal lengths or image centre (s,) are far from what a rig states with a prior."""
     is_stated = camera.has_intrinsics and camera.intrinsics == "prior"
     return is_stated and bool(np.max(np.abs((found - camera.values)[:4])) > MIN_FAR * PIXEL_PRIORS["prior"])
 
 
 def describe_resolution(camera: Camera, factor: float) -> str:
-    """Say which resolution the images have, in place of the stated one.
-
-    Args:
-        camera: Camera with its stated resolution.
-        factor: Factor between the two.
-    """
+    """Say which resolution the images have, a factor times the stated one."""
     width, height = round(factor * camera.width), round(factor * camera.height)
     return f"the images are {width} x {height} px, not {camera.width} x {camera.height} px"

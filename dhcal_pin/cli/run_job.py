@@ -38,6 +38,7 @@ from ..diagnostics.robot_checks import find_robot_warnings
 from ..estimation.parameters import LOW_COST
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
+from ..formatting import texts_by_file
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
@@ -137,10 +138,7 @@ class CalibrationOutcome:
         return document | {
             "outliers_by_file": rows,
             "warnings": [
-                f"{path}: {text}"
-                for by_file in (data.changes, data.notes, data.warnings)
-                for path, texts in by_file.items()
-                for text in texts
+                text for each in (data.changes, data.notes, data.warnings) for text in texts_by_file(each)
             ],
             "command": source.command,
             "settings": source.settings,
@@ -187,8 +185,7 @@ def run_job(
     on_images = fit.input_warnings
     fit = replace(
         fit,
-        input_warnings=fit.input_warnings
-        + tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts),
+        input_warnings=fit.input_warnings + tuple(texts_by_file(data.warnings)),
     )
     fit = fit.accepted
     # More parameters are not suggested if the columns may be mixed up. The verdict judges default ones.
