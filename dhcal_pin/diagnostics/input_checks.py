@@ -243,7 +243,7 @@ def _format_as_written(value: float, unit: str) -> str:
 
 def _format_rows(data: Measurement, mask: Array) -> str:
     """Return a text such as `line 3` or `lines 3, 5, 8, 9, 12 and 4 more`."""
-    rows = data.rows[mask]
+    rows = data.rows[mask].tolist()
     return f"line{'s' if len(rows) > 1 else ''} {list_first(rows, _MAX_LISTED_ROWS)}"
 
 

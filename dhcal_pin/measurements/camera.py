@@ -637,9 +637,7 @@ class CameraCorners(Measurement):
         return values, {"sigma_u": self.sigma[:, 0], "sigma_v": self.sigma[:, 1]}
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> CameraCorners:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return images of six points on the tool, by two cameras in turn that look at the robot."""
         q = conditions.q
         rig = mount_rig(simulated_rig(chain, q), chain)
