@@ -188,8 +188,9 @@ def run_job(
         input_warnings=fit.input_warnings + tuple(texts_by_file(data.warnings)),
     )
     fit = fit.accepted
-    # More parameters are not suggested if the columns may be mixed up. The verdict judges default ones.
-    if not fit.has_default_sets and not any(data.warnings.values()):
+    # More parameters are not suggested if the columns may be mixed up, or if the verdict names a mistake, as
+    # they do not explain it either. The verdict judges default ones.
+    if not (fit.has_default_sets or any(data.warnings.values()) or fit.diagnosis.hypotheses):
         text = suggest_full_set(fit)
         warning = f"{text}: the chosen parameters cannot represent the errors"
         data.warnings[job.robot] = [warning] if text else []
