@@ -29,12 +29,7 @@ def frozen(cls: type[_T], /) -> type[_T]: ...
 def frozen(*, eq: bool = True) -> Callable[[type[_T]], type[_T]]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def frozen(cls: Any = None, /, *, eq: bool = True) -> Any:
-    """Make a class a frozen dataclass.
-
-    Args:
-        cls: The class.
-        eq: Whether two objects with equal fields are equal. False for fields that are arrays.
-    """
+    """Make a class a frozen dataclass; `eq` is False for fields that are arrays."""
     if cls is None:
         return lambda given: _frozen(given, eq)
     return _frozen(cls, eq)

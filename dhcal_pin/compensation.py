@@ -382,10 +382,7 @@ def _is_near_singular(nominal: Chain, search: _Search, targets: Array, q: Array)
 
 
 def _min_singular_value(chain: Chain, q: Array, components: slice) -> Array:
-    """Return the smallest singular value of the scaled Jacobian, shape (m,).
-
-    Lengths are divided by the characteristic length, in the rows as well as in the columns.
-    """
+    """Return the smallest singular value (m,) of the Jacobian in units of the characteristic length."""
     jacobian = tool_pose_and_jacobian(chain, q)[1]
     jacobian[:, :3] /= characteristic_length(chain)
     jacobian[:, :, chain.is_prismatic] *= characteristic_length(chain)

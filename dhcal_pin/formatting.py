@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +35,8 @@ MAX_DECIMALS = 6
 MIN_EXPONENT_VALUE = 1e6
 # Table cells with more characters get the CSS class "long", which allows line breaks.
 MAX_UNBROKEN_CHARS = 48
+# Longest list in a sentence; the files that are written contain all items.
+MAX_LISTED = 12
 # Tables of a page with more columns become lists on medium pages already.
 MAX_NARROW_COLUMNS = 6
 
@@ -82,6 +84,21 @@ def _round_numbers(value: float) -> list[float]:
 def join_names(names: Sequence[str]) -> str:
     """Join names with commas and a final "and"."""
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def list_first(items: Sequence[object], most: int = MAX_LISTED, noun: str = "") -> str:
+    """Join the first items of a list with commas, and count the others.
+
+    >>> list_first([2, 5, 7], 2), list_first(["a", "b"]), list_first("abc", 1, "letters")
+    ('2, 5 and 1 more', 'a, b', 'a and 2 more letters')
+    """
+    more = f" and {len(items) - most} more {noun}".rstrip() if len(items) > most else ""
+    return ", ".join(map(str, items[:most])) + more
+
+
+def texts_by_file(by_file: Mapping[str, Iterable[str]], kind: str = "") -> list[str]:
+    """List the texts about each file behind its name, and behind what they are, such as "warning: "."""
+    return [f"{name}: {kind}{text}" for name, texts in by_file.items() for text in texts]
 
 
 def format_count(count: int, noun: str) -> str:

@@ -52,25 +52,16 @@ _LINE_LENGTH = 120
 
 @frozen
 class Language:
-    """How a language states constants and the terms of joint errors.
+    """How a language states constants and the terms of joint errors."""
 
-    Attributes:
-        template: Name of the file with the template.
-        constants: Function that states the constants, whose names begin with a prefix.
-        names: Function that states a list of names.
-        torques: Statement that computes the gravity torques.
-        joint_term: Statement that adds a joint term with its `{formula}`; `{name}`, `{NAME}`: its family.
-        derivative: Statement that adds its derivative.
-        link_term: Statement that adds a link term.
-    """
-
-    template: str
-    constants: Callable[[_Constants, str], str]
-    names: Callable[[Sequence[str]], str]
-    torques: str
+    template: str  # Name of the file with the template
+    constants: Callable[[_Constants, str], str]  # States the constants, whose names begin with a prefix
+    names: Callable[[Sequence[str]], str]  # States a list of names
+    torques: str  # Statement that computes the gravity torques
+    # Statement that adds a joint term with its `{formula}`, of the family `{name}` or `{NAME}`.
     joint_term: str
-    derivative: str
-    link_term: str
+    derivative: str  # Statement that adds its derivative
+    link_term: str  # Statement that adds a link term
 
 
 def model_code(chain: Chain, path: PathLike) -> str:
@@ -131,11 +122,8 @@ def _constants(chain: Chain, transmission: Transmission) -> dict[str, Any]:
 
 
 def _weights(chain: Chain, loads: GravityLoads) -> tuple[dict[str, Array], Array, Array]:
-    """Return the tree of the moving joints in the whole robot, and masses and first moments of its bodies.
-
-    Joints that are not on the chain stay at neutral. The order is that of Pinocchio: a joint is behind the
-    one that carries it, also where the chain passes joints from child to parent. The payload is the last.
-    """
+    """Return the tree of the moving joints in Pinocchio's order, and masses and first moments of bodies."""
+    # Joints that are not on the chain stay at neutral. The payload is the last body.
     model = loads.model
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))

@@ -15,12 +15,7 @@ _LOCK = threading.RLock()
 
 @contextmanager
 def discard_native_messages() -> Iterator[None]:
-    """Discard what compiled libraries print to standard error in the `with` block.
-
-    Parsers of URDFs and meshes print remarks that name neither the file nor the line. The project checks the
-    file before, or handles the failure after the call. The block should contain only the call: messages of
-    Python and of other threads are discarded as well.
-    """
+    """Discard what compiled libraries, and anything else, print to standard error in the `with` block."""
     with _LOCK:
         try:
             original = os.dup(_STDERR)

@@ -102,11 +102,8 @@ def open_executor(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskE
 
 
 def end_with_parent() -> None:
-    """End this worker process as soon as the process that started it ends, even if that is killed.
-
-    A worker waits for its next task on a pipe that its siblings hold open as well. Without this function it
-    would wait for ever, and keep standard output open. A worker that is saving files completes that first.
-    """
+    """End this worker process as soon as the process that started it ends, even if that is killed."""
+    # A worker waits for its next task on a pipe that its siblings hold open as well: it would wait for ever.
     from multiprocessing import parent_process  # lazy import, as the following: only in workers
     from multiprocessing.connection import wait
 

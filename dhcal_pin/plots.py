@@ -552,10 +552,7 @@ def plot_study(
     column: str,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot one column of a study over the numeric setting with the most values.
-
-    Each combination of the other settings is one line.
-    """
+    """Plot one column of a study over the setting with the most numbers, a line per choice of the others."""
     ax = _axes(ax)
     abscissa = _study_abscissa(rows, n_settings)
     if abscissa is None:

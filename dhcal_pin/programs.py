@@ -69,11 +69,7 @@ def program_text(program: Program, path: PathLike) -> str:
 
 
 def urscript(program: Program) -> str:
-    """Write a program in URScript.
-
-    The program shows its warning and waits for the operator before the arm moves for the first time, and
-    again before a move that may collide.
-    """
+    """Write a program in URScript, which waits for the operator before the first and each unchecked move."""
     chain = program.chain
     if chain.n_joints != _N_UR_JOINTS or chain.is_prismatic.any():
         raise InvalidArgumentError(

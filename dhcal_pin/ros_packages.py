@@ -43,11 +43,7 @@ def _share_folder() -> Path | None:
 
 
 def example_robots() -> dict[str, Path]:
-    """Find the robots of example-robot-data.
-
-    A robot has the name of its file without `.urdf` and `_robot`. Files of the same name in two packages have
-    names such as `anymal_b_simple_description/anymal`.
-    """
+    """Find the robots of example-robot-data by name: `ur10`, or `anymal_b_simple_description/anymal`."""
     share = _share_folder()
     by_name: dict[str, dict[str, Path]] = {}
     for path in sorted((share / _DISTRIBUTION / "robots").glob("*/*/*.urdf")) if share else ():
@@ -108,10 +104,7 @@ def mesh_files(mesh: str, folders: Iterable[PathLike]) -> list[str]:
 
 
 def is_mesh_too_large(mesh: str, folders: Iterable[PathLike]) -> bool:
-    """Return whether a mesh is larger than `MAX_MESH_BYTES`.
-
-    Pinocchio takes about 25 times the size of a mesh in memory.
-    """
+    """Return whether a mesh is larger than `MAX_MESH_BYTES`; Pinocchio takes 25 times its size in memory."""
     return any(os.path.getsize(file) > MAX_MESH_BYTES for file in mesh_files(mesh, folders))
 
 

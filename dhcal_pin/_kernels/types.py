@@ -72,8 +72,5 @@ class ObservationMatrix:
 
 
 def twists_before(body: int | None, bodies: Array, twists: Array) -> Array:
-    """Return twists (..., p, 6) of bodies (p,), those that do not move the frame of an observed body zeroed.
-
-    A twist of a body moves the frames of the bodies behind it; see `ObservationMatrix.body`.
-    """
+    """Return twists (..., p, 6) of bodies (p,), zero where they do not move the frame of an observed body."""
     return twists if body is None else np.where((bodies < body)[:, None], twists, 0.0)

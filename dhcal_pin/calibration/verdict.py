@@ -417,10 +417,7 @@ def _session(fit: Evidence) -> list[Finding]:
 
 
 def _convergence(fit: Evidence, causes: Sequence[Finding]) -> list[Finding]:
-    """Refuse a fit that did not converge: its values are those of an arbitrary last step.
-
-    If causes are known, options with which it converges do not help.
-    """
+    """Refuse a fit that did not converge, and name options with which it does unless causes are known."""
     if fit.converged or any(cause.status == "refused" for cause in causes):
         return []
     text = f"The fit did not converge in {format_count(fit.iterations, 'iteration')}."
@@ -939,10 +936,8 @@ def _poses_advice(fit: Evidence) -> str:
 
 
 def needed_poses(fit: Evidence) -> int:
-    """Return the number of different poses that leaves no reason about too few samples; 0 with enough.
-
-    Outliers among images are found in other ways, so that no number is known.
-    """
+    """Return the number of different poses that leaves no reason about too few samples; 0 with enough."""
+    # Outliers among images are found in other ways, so that no number is known.
     rows_per_direction = _min_rows_per_direction(fit)
     if fit.camera_stages or fit.hand_eye or fit.rows_per_direction >= rows_per_direction:
         return 0

@@ -36,17 +36,7 @@ class Resolution(NamedTuple):
 
 
 def find_resolution(camera: Camera, found: Array, corners: Array) -> Resolution | None:
-    """Find the resolution of the images or of the lens, if one of them is not the stated one.
-
-    Args:
-        camera: Camera with its stated lens.
-        found: Values of the lens that the images show, shape (s,) [px and 1].
-        corners: Image coordinates of the camera, shape (m, 2) [px].
-
-    Returns:
-        The resolution, or None if the lens is not that of another usual resolution, or if corners are outside
-        of the images.
-    """
+    """Find the resolution of images or lens from a lens (s,) and corners (m, 2), if it is not the stated one."""
     stated = camera.values[:4]
     if not camera.has_intrinsics or min(stated.min(), found[:4].min()) <= 0:
         return None
@@ -61,23 +51,13 @@ def find_resolution(camera: Camera, found: Array, corners: Array) -> Resolution 
 
 
 def is_far(camera: Camera, found: Array) -> bool:
-    """Return whether focal lengths or image centre are far from what a rig states with a prior.
-
-    Args:
-        camera: Camera with its stated lens.
-        found: Values of the lens that the images show, shape (s,) [px and 1].
-    """
+    """Return whether focal lengths or image centre (s,) are far from what a rig states with a prior."""
     is_stated = camera.has_intrinsics and camera.intrinsics == "prior"
     return is_stated and bool(np.max(np.abs((found - camera.values)[:4])) > MIN_FAR * PIXEL_PRIORS["prior"])
 
 
 def describe_resolution(camera: Camera, resolution: Resolution) -> str:
-    """Say which resolution the images or the lens have, in place of the stated one.
-
-    Args:
-        camera: Camera with its stated resolution.
-        resolution: The other resolution.
-    """
+    """Say which resolution the images or the lens have, in place of the stated one."""
     factor = 1 / resolution.factor if resolution.is_of_lens else resolution.factor
     width, height = round(factor * camera.width), round(factor * camera.height)
     if resolution.is_of_lens:

@@ -1,17 +1,7 @@
 """Calibration of many robots: a manifest of jobs, run in parallel processes, and their summary.
 
-A manifest is a TOML file whose name ends with `.fleet.toml`. Its keys are the names of the options of
-`dhcal calibrate`. Keys at the top apply to every job. Paths are relative to the manifest:
-
-    parameters = "minimal,base,tool"
-    holdout = 0.3
-
-    [[job]]
-    name = "cell 1"                     # optional; default: the name of the robot file
-    robot = "cell1/ur10.urdf"
-    data = ["cell1/monday.csv", "cell1/friday.csv"]
-    output = "cell1/ur10_calibrated.urdf"
-    tip = "tool0"
+A manifest is a TOML file whose name ends with `.fleet.toml`, see docs/howto/fleet.md. Its keys are the names
+of the options of `dhcal calibrate`; those at the top apply to every job. Paths are relative to the manifest.
 
 The whole manifest is checked before the first job runs. A job that fails does not stop the others.
 """

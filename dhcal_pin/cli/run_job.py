@@ -38,6 +38,7 @@ from ..diagnostics.robot_checks import find_robot_warnings
 from ..estimation.parameters import LOW_COST
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
+from ..formatting import texts_by_file
 from ..io.measurement_files import MeasurementFile, read_measurement_file
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
@@ -137,10 +138,7 @@ class CalibrationOutcome:
         return document | {
             "outliers_by_file": rows,
             "warnings": [
-                f"{path}: {text}"
-                for by_file in (data.changes, data.notes, data.warnings)
-                for path, texts in by_file.items()
-                for text in texts
+                text for each in (data.changes, data.notes, data.warnings) for text in texts_by_file(each)
             ],
             "command": source.command,
             "settings": source.settings,
@@ -187,12 +185,12 @@ def run_job(
     on_images = fit.input_warnings
     fit = replace(
         fit,
-        input_warnings=fit.input_warnings
-        + tuple(f"{p}: {text}" for p, texts in data.warnings.items() for text in texts),
+        input_warnings=fit.input_warnings + tuple(texts_by_file(data.warnings)),
     )
     fit = fit.accepted
-    # More parameters are not suggested if the columns may be mixed up. The verdict judges default ones.
-    if not fit.has_default_sets and not any(data.warnings.values()):
+    # More parameters are not suggested if the columns may be mixed up, or if the verdict names a mistake, as
+    # they do not explain it either. The verdict judges default ones.
+    if not (fit.has_default_sets or any(data.warnings.values()) or fit.diagnosis.hypotheses):
         text = suggest_full_set(fit)
         warning = f"{text}: the chosen parameters cannot represent the errors"
         data.warnings[job.robot] = [warning] if text else []

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._frozen import frozen
 from ..calibration.evaluation import Accuracy, compute_errors, take_errors
-from ..formatting import format_quantity
+from ..formatting import format_quantity, list_first
 from ..measurements.base import Measurement
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.measured_region import MeasuredRegion
@@ -76,8 +76,7 @@ class Extrapolation:
                 "No joint is beyond its measured range, but the combinations of joint values are new or rare."
             )
             return [*out, text]
-        more = f" and {len(exceeding) - _MAX_JOINTS} more joints" if len(exceeding) > _MAX_JOINTS else ""
-        return [*out, f"Beyond the measured range: {', '.join(exceeding[:_MAX_JOINTS])}{more}."]
+        return [*out, f"Beyond the measured range: {list_first(exceeding, _MAX_JOINTS, 'joints')}."]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for the JSON document."""

@@ -17,14 +17,14 @@ from ..calibration.evaluation import compute_errors
 from ..estimation.initialization import align
 from ..estimation.parameters import PARAMETER_SETS
 from ..exceptions import FileFormatError
-from ..formatting import join_names
+from ..formatting import join_names, list_first
 from ..io.measurement_files import MeasurementFile
 from ..io.measurement_files.columns import ROTVEC, SECOND_PREFIX, VALUE_COLUMNS
 from ..io.measurement_files.counts import TICKS
 from ..io.measurement_files.fitted_rows import count_fitted_rows
 from ..io.servo_file import RESOLUTION
 from ..io.sidecar import Fitted
-from ..measurements.base import Measurement
+from ..measurements.base import Measurement, known_conditions
 from ..measurements.columns import MAX_TOOL_OFFSET
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
@@ -108,6 +108,20 @@ def find_unstated_conditions(
         f"depends: add the column {CONDITIONS[name].header}"
         for family, name in needed
         if name not in known
+    ]
+
+
+def file_notes(
+    chain: Chain, files: Sequence[MeasurementFile], payloads: tuple[float, float] | None
+) -> list[str]:
+    """List the notes on files, and the conditions that they do not state."""
+    return [
+        f"{file.source}: {text}"
+        for file in files
+        for text in (
+            *file.notes,
+            *find_unstated_conditions(chain, known_conditions([file.data]), payloads),
+        )
     ]
 
 
@@ -229,11 +243,8 @@ def _format_as_written(value: float, unit: str) -> str:
 
 def _format_rows(data: Measurement, mask: Array) -> str:
     """Return a text such as `line 3` or `lines 3, 5, 8, 9, 12 and 4 more`."""
-    rows = [str(row) for row in data.rows[mask]]
-    listed, more = rows[:_MAX_LISTED_ROWS], len(rows) - _MAX_LISTED_ROWS
-    return f"line{'s' if len(rows) > 1 else ''} {', '.join(listed)}" + (
-        f" and {more} more" if more > 0 else ""
-    )
+    rows = data.rows[mask].tolist()
+    return f"line{'s' if len(rows) > 1 else ''} {list_first(rows, _MAX_LISTED_ROWS)}"
 
 
 def _columns_beyond_motion(chain: Chain, file: MeasurementFile) -> dict[str, Array]:

@@ -25,14 +25,7 @@ _N_CONFIGURATIONS = 64
 
 
 def find_robot_warnings(chain: Chain) -> list[str]:
-    """Find joints whose origins are far outside of the others.
-
-    Args:
-        chain: Robot with n joints.
-
-    Returns:
-        Warnings, one sentence each.
-    """
+    """Warn of joints whose origins are far outside of the others, one sentence each."""
     joints = _joints_of_arm(chain)
     distances = np.array([np.linalg.norm(joint.origin[:3, 3]) for joint in joints])
     usual = np.array([_usual_distance(np.delete(distances, i)) for i in range(len(joints))])

@@ -3,19 +3,10 @@
 A TOML file has `convention`, `[units]`, one `[[joint]]` table per joint, and optionally the poses `[base]`
 and `[tool]`; a CSV file has one row per joint, units in the header, and convention and poses in comments:
 
-    convention = "standard"          # convention: standard
-    [units]                          # base: 0 0 0 0 0 0
-    length = "mm"                    joint,type,theta[deg],d[mm],a[mm],alpha[deg],lower[deg|mm],upper[deg|mm]
-    angle = "deg"                    joint_1,revolute,0,433,0,90,-160,160
-    [[joint]]
-    name = "joint_1"
-    type = "revolute"
-    theta = 0.0
-    d = 433.0
-    a = 0.0
-    alpha = 90.0
-    lower = -160.0
-    upper = 160.0
+    # convention: standard
+    # base: 0 0 0 0 0 0
+    joint,type,theta[deg],d[mm],a[mm],alpha[deg],lower[deg|mm],upper[deg|mm]
+    joint_1,revolute,0,433,0,90,-160,160
 
 Both can have `beta`, Hayati's angle. A limit has the unit of the joint: an angle, or a length if it is
 prismatic. The type `continuous` is a revolute joint that turns without end and has no limits. Files are

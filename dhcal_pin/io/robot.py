@@ -245,11 +245,7 @@ def convert_robot(
     template: PathLike | None = None,
     template_tip: str | None = None,
 ) -> ConvertedRobot:
-    """Convert a robot file to another format, chosen by the ending of the target; return its text, and notes.
-
-    A URDF or an MJCF can be copied. With a template the target is that file with the kinematics of the
-    source, see `template`; its tip has the name of the tip of the source if `template_tip` is None.
-    """
+    """Convert a robot file to the format of the ending of the target; return its text, and notes."""
     robot_format = find_format(target)
     if robot_format is None or robot_format.convert is None:
         written = _endings(other for other in FORMATS if other.convert)
@@ -335,14 +331,8 @@ def urdf_files(
     findings: Findings = NO_FINDINGS,
     edit: Callable[[bytes], bytes] = lambda data: data,
 ) -> dict[PathLike, str | bytes]:
-    """Return the contents of a calibrated URDF and its sidecar, without writing them.
-
-    The URDF has the origins that are best without the sidecar, which has what the complete model adds to
-    them. An origin that moved by less than `origins_file.MIN_MOVE` keeps its text. Both are read again and
-    compared with the chain. A sidecar is needed only for a base, a tool, a payload, joint errors, instrument
-    parameters, an uncertainty or a measured region. One that exists already is always replaced, because it
-    would be read with the new URDF.
-    """
+    """Return the contents of a calibrated URDF and its sidecar, which are read again and compared."""
+    # A sidecar that exists already is always replaced, because it would be read with the new URDF.
     robot_format = find_format(path)
     if robot_format is None or robot_format.read_urdf is None:
         expected = " or ".join(_endings(other for other in FORMATS if other.read_urdf))

@@ -4,20 +4,9 @@ The joint value q of a count c is
 
     q = sign·(c - zero)·2π/counts_per_turn
 
-A servo file is the calibration that LeRobot keeps of an arm (.json), or a TOML file:
-
-    resolution = 4096              # counts that a servo can report, from 0 on; default 4096
-    lerobot = "so101.json"         # optional: LeRobot's calibration with zero and range of each motor
-    make = "feetech"               # optional: makers of LeRobot's motors, "feetech" (default) or "dynamixel"
-    [motor.base]
-    joint = "shoulder_pan"         # joint of the URDF; default: the name of the motor
-    id = 1                         # optional
-    sign = 1                       # default 1
-    zero = 2048                    # count at the zero of the joint; default: half the resolution
-    counts_per_turn = 4096         # default: the resolution
-
-With `lerobot`, motors have the keys `joint` and `resolution` only, and those that are not named have the
-names of their joints.
+A servo file is the calibration that LeRobot keeps of an arm (.json), or a TOML file with one table
+`[motor.NAME]` per servo, see docs/reference/robot_files.md. With `lerobot`, motors have the keys `joint` and
+`resolution` only, and those that are not named have the names of their joints.
 
 In degrees, LeRobot reports (c - m)·360/(resolution - 1) of the count c with the middle m of `range_min` and
 `range_max`; `drive_mode` has no effect in this unit. The count contains the homing offset h already: it is

@@ -1,40 +1,7 @@
 """Sidecar files: what a calibration found and a URDF cannot hold.
 
-The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
-
-    tip = "tool0"                      # link that holds the tool
-
-    [base]                             # pose of the base link in the measuring frame
-    xyz_m = [0.0, 0.0, 0.0]
-    rotvec_rad = [0.0, 0.0, 0.0]
-
-    [tool]                             # pose of the measured point in the tip frame; keys as in [base]
-
-    [link.forearm_link]                # what the complete model adds to the origin of the joint
-    xyz_m = [1e-4, 0.0, 0.0]           # before the link, in the frame of that origin
-    rotvec_rad = [0.0, 0.0, 2e-4]
-
-    [payload]                          # point mass at the tip
-    mass_kg = 5.0
-    centre_m = [0.0, 0.0, 0.08]
-
-    [joint.elbow_joint]                # coefficients of `robot.transmission`
-    gain = 0.001
-    harmonics = [[1, 2e-4, -1e-4]]     # order, sine and cosine of each harmonic [rad]
-    compliance_rad_per_nm = -2e-5
-    backlash_rad = 4e-4                # width; the joint lags behind its direction of motion by half of it
-
-    [joint.elbow_joint.coupling]       # coefficients of other joints' positions
-    wrist_1_joint = 0.0001
-
-    [thermal]                          # growth of the links
-    reference_degc = 24.0              # temperature at which the links have the lengths of the URDF
-
-    [thermal.per_kelvin]               # relative growth of each link, by the name of the link
-    forearm_link = 2.3e-5
-
-    [instrument]                       # parameters of instruments [m or rad]
-    "wire1.x" = 1.25
+The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it. `SIDECAR_KEYS` declares its
+tables, which docs/reference/robot_files.md explains, except for those that programs write for programs:
 
     [uncertainty]                      # `estimation.Uncertainty`
     joints = ["elbow_joint"]
@@ -42,7 +9,6 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
     sqrt_covariance = "..."            # rows of little-endian doubles in base64
     unbounded_directions = "..."
     frame_part = "..."                 # absent if the measurements determine base and tool
-
     temperature = 75.8                 # factor on the variance of the residuals that the covariance contains
     model_std_m = 1.1e-4               # errors that the model lacks: of the position, per axis
     model_std_rad = 1e-4               # the same of the orientation
@@ -61,12 +27,6 @@ The sidecar of `arm.urdf` is the TOML file `arm.calibration.toml` beside it:
 
     [uncertainty.information.conditions]
     q = "..."                          # conditions of the samples by name, as `added`
-
-    [manifest]
-    urdf_sha256 = "..."                # hash of the URDF that this file was written with
-    joints_sha256 = "..."              # hash of its joints from the root to the tip
-    fitted_sha256 = ["..."]            # hashes of the measurement files that were fitted
-    fitted_rows = "..."                # digests of the fitted rows in base64, see `fitted_rows`
 
     [measured]                         # `measurements.MeasuredRegion`
     joints = ["elbow_joint"]

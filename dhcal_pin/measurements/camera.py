@@ -637,9 +637,7 @@ class CameraCorners(Measurement):
         return values, {"sigma_u": self.sigma[:, 0], "sigma_v": self.sigma[:, 1]}
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> CameraCorners:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return images of six points on the tool, by two cameras in turn that look at the robot."""
         q = conditions.q
         rig = mount_rig(simulated_rig(chain, q), chain)
@@ -659,10 +657,7 @@ class CameraCorners(Measurement):
 
 
 def simulated_rig(chain: Chain, q: Array) -> Rig:
-    """Return two fixed cameras that look at the tool from two sides in turn, and six points on the tool.
-
-    All points are in the images, which are larger than usual if the robot is.
-    """
+    """Return two fixed cameras, large enough for the robot, that look at six points on the tool in turn."""
     poses = chain.poses(q) if len(q) else np.eye(4)[None]
     centre = poses[:, :3, 3].mean(0)
     distance = _DISTANCE * max(1.0, float(np.abs(poses[:, :3, 3] - centre).max()))

@@ -98,9 +98,7 @@ class PointContact(PointMeasurement):
         return self.replace(instrument_parameters=tuple(parameters))
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> PointContact:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return contacts with the first four tool points, in configurations moved onto them in turn."""
         q = conditions.q
         points = _simulated_points(chain, q)
@@ -189,9 +187,7 @@ class PointDistance(PointMeasurement):
         return length[None], np.zeros((1, 1, 3, m)), jacobian
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> PointDistance:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return the distances between the points that `PointContact` touches with these configurations."""
         points = _simulated_points(chain, conditions.q)
         pairs = [(i, j) for i in range(len(points)) for j in range(i + 1, len(points))]
@@ -277,9 +273,7 @@ class PlaneContact(PointMeasurement):
         return self.replace(origin=origin, axes=np.linalg.svd(points - origin)[2][::-1])
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> PlaneContact:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return contacts with a tilted plane amid the tool points, in configurations moved onto it."""
         q = conditions.q
         centre = chain.poses(q)[:, :3, 3].mean(0)
@@ -350,9 +344,7 @@ class SphereContact(PointMeasurement):
         return images_of_point(f"sphere_{self.name}", points, values)
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> SphereContact:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return contacts with a sphere of radius 150 mm, in configurations moved onto it."""
         q = conditions.q
         centre = chain.poses(q)[0, :3, 3]

@@ -309,9 +309,7 @@ class Inclination(Measurement):
         return values | link, {f"sigma_{name}": s for name, s in zip(values, self.sigma.T, strict=True)}
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> Inclination:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return inclinations of a sensor that is turned on the tip, with normal noise of the direction."""
         q = conditions.q
         item = cls(q, np.zeros((len(q), 2)), noise.rotation or None).mounted(chain)

@@ -237,9 +237,7 @@ class Distance(PointMeasurement):
         return length[None], np.stack([-direction, direction]), np.empty((0, 1, points.shape[-1]))
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> Distance:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return distances between each configuration and the next one, and the last and the first."""
         q = conditions.q
         points = chain.forward_kinematics(q).tool[3].T

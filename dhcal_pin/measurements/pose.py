@@ -341,9 +341,7 @@ class RelativePose(PoseMeasurement):
         return {"position": translation.T, "orientation": log_rotations(rotation).T}
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> RelativePose:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return relative poses from each configuration to the next one, and from the last to the first."""
         q = conditions.q
         following = np.roll(np.arange(len(q)), -1)

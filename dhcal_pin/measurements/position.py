@@ -173,9 +173,7 @@ class Position(PointMeasurement):
         return self.values
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> Position:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return positions of the chain's tool point with normal noise on each axis."""
         return cls(conditions.q, _noisy_positions(chain, conditions, noise, rng), noise.position or None)
 
@@ -245,9 +243,7 @@ class PositionComponents(PointMeasurement):
         )
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> PositionComponents:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return the coordinates x and z of the chain's tool point with normal noise."""
         positions = _noisy_positions(chain, conditions, noise, rng)
         return cls(conditions.q, positions[:, [0, 2]], (0, 2), noise.position or None)
@@ -361,9 +357,7 @@ class MultiTargetPosition(PointMeasurement):
         return self.values
 
     @classmethod
-    def _simulate(
-        cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator
-    ) -> MultiTargetPosition:
+    def _simulate(cls, chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Self:
         """Return positions of three targets within 5 cm of each other, measured in turn."""
         q = conditions.q
         label = np.arange(len(q)) % 3

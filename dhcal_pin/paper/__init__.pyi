@@ -5,13 +5,11 @@ from .experiment import paper_arm as paper_arm
 from .experiment import run_experiment as run_experiment
 from .factors import alpf as alpf
 from .factors import apply_correction as apply_correction
-from .factors import differential_motion as differential_motion
 from .factors import error_factors as error_factors
 from .factors import laf as laf
 from .factors import ldf as ldf
 from .factors import link_vectors as link_vectors
 from .factors import pseudo_inverse_step as pseudo_inverse_step
-from .factors import q_matrices as q_matrices
 from .factors import tail_matrices as tail_matrices
 from .factors import thf as thf
 from .factors import tool_error as tool_error

@@ -38,26 +38,6 @@ from ..robot.dh import DHTable
 RTOL = 1e-9
 
 
-def q_matrices(table: DHTable) -> Array:
-    """Return the derivative matrices Q, equations (9) and (10).
-
-    They satisfy ∂A_i/∂x = A_i·Q_x. Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
-    """
-    s, c = np.sin(table.alpha), np.cos(table.alpha)
-    out = np.zeros((4, table.n_joints, 4, 4))
-    # Q_θ
-    out[0, :, 0, 1], out[0, :, 0, 2] = -c, s
-    out[0, :, 1, 0], out[0, :, 1, 3] = c, table.a * c
-    out[0, :, 2, 0], out[0, :, 2, 3] = -s, -table.a * s
-    # Q_d
-    out[1, :, 1, 3], out[1, :, 2, 3] = s, c
-    # Q_a
-    out[2, :, 0, 3] = 1.0
-    # Q_α
-    out[3, :, 1, 2], out[3, :, 2, 1] = -1.0, 1.0
-    return out
-
-
 def link_vectors(table: DHTable) -> tuple[Array, Array, Array]:
     """Return the vectors k1, k2 and k3, equations (13) to (15).
 
@@ -172,22 +152,6 @@ def error_factors(table: DHTable, q: Array) -> Array:
     k1, k2, k3 = link_vectors(table)
     blocks = [thf(u, k1, k2), ldf(u, k2), laf(u, k3), alpf(u, k3)]
     return np.concatenate([np.swapaxes(block, 1, 2) for block in blocks], -1)
-
-
-def differential_motion(change: Array, pose: Array) -> Array:
-    """Compute dn, do, da, dp of the tool pose, shape (..., 3, 4), from DX: equations (30) to (34).
-
-        dT_N = T_N·δT_N = [dn do da dp; 0 0 0 0]     (30)
-        dn   =  o·δz - a·δy                          (31)
-        do   = -n·δz + a·δx                          (32)
-        da   =  n·δy - o·δx                          (33)
-        dp   =  n·dx + o·dy + a·dz                   (34)
-
-    Erratum, probably of the transcription: (31) prints a·δz in place of o·δz.
-    """
-    n, o, a = pose[..., :3, 0], pose[..., :3, 1], pose[..., :3, 2]
-    dx, dy, dz, rx, ry, rz = (change[..., i, None] for i in range(6))
-    return np.stack([o * rz - a * ry, a * rx - n * rz, n * ry - o * rx, n * dx + o * dy + a * dz], -1)
 
 
 def tool_error(measured: Array, model: Array) -> Array:

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -173,9 +174,7 @@ class Information:
         return float(np.sqrt(np.sum((combinations.T @ sqrt_covariance) ** 2)))
 
     @classmethod
-    def from_prior(
-        cls, planned: PlannedCalibration, q: Array, omitted_sets: Sequence[str] = ()
-    ) -> Information:
+    def from_prior(cls, planned: PlannedCalibration, q: Array, omitted_sets: Sequence[str] = ()) -> Self:
         """Collect the knowledge before measuring from priors, existing measurements or a calibration."""
         if planned.priors == "none":
             raise InvalidArgumentError(

@@ -8,6 +8,7 @@ import numpy as np
 
 from .._frozen import frozen
 from .._typing import Array
+from ..formatting import list_first
 from ..measurements.base import Measurement, residual_of
 from ..measurements.contact import PointContact
 from ..measurements.position import MultiTargetPosition
@@ -15,8 +16,6 @@ from ..robot.chain import Chain
 
 # Largest mean squared residual of a sample that fits, relative to that of all good samples.
 MAX_MISFIT = 16.0
-# Largest number of lines that are listed.
-MAX_LISTED = 12
 
 
 @frozen
@@ -32,13 +31,11 @@ class WrongLabel:
     @property
     def sentence(self) -> str:
         """State the lines and both labels."""
-        listed = ", ".join(map(str, self.rows[:MAX_LISTED]))
-        more = f" and {len(self.rows) - MAX_LISTED} more" if len(self.rows) > MAX_LISTED else ""
         of_file = f" of {self.source}" if self.source else ""
         subject, states, fits = (
             ("Lines", "state", "fit") if len(self.rows) > 1 else ("Line", "states", "fits")
         )
-        where = f"{subject} {listed}{more}{of_file}"
+        where = f"{subject} {list_first(self.rows)}{of_file}"
         return f"{where} {states} {self.column} {self.stated} and {fits} {self.fitting}."
 
 

@@ -24,7 +24,7 @@ from ..calibration.presentation.curves import JointCurve, find_lattices, fitted_
 from ..calibration.presentation.workspace import RELATIVE_TEXT
 from ..diagnostics.residuals import median_sigmas
 from ..estimation import robust
-from ..formatting import Quantity, Table, capitalized, format_fixed
+from ..formatting import Quantity, Table, capitalized, format_fixed, texts_by_file
 from ..identifiability import EXPECTED
 from ..io.origins_file import origin_table
 from ..measurements.groups import ERROR_GROUPS, error_group
@@ -113,7 +113,7 @@ def _signs_section(context: ReportContext) -> Section | None:
     if signs is None:
         return None
     note = signs.note or "all joints turn as in the URDF"
-    return Section("signs", "Signs of the joints", [f"{note[0].upper()}{note[1:]}.", *signs.questions])
+    return Section("signs", "Signs of the joints", [f"{capitalized(note)}.", *signs.questions])
 
 
 def _residual_section(context: ReportContext) -> Section:
@@ -411,8 +411,8 @@ def _outlier_section(context: ReportContext) -> Section:
         for name, reasons in context.source.excluded_rows.items()
         for row, reason in reasons.items()
     ]
-    items += [f"{name}: {text}" for name, texts in context.source.notes.items() for text in texts]
-    items += [f"{name}: warning: {text}" for name, texts in context.source.warnings.items() for text in texts]
+    items += texts_by_file(context.source.notes)
+    items += texts_by_file(context.source.warnings, "warning: ")
     table = Table(["file", "line", "error", "score"], rows)
     return Section("outliers", "Outliers", [text], items, [table] if rows else [])
 

@@ -12,7 +12,7 @@ Shapes: m samples, n joints.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -127,9 +127,7 @@ class ConfigurationSampler:
         return (self.collision.note,) if self.collision.note else ()
 
     @classmethod
-    def from_chain(
-        cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float
-    ) -> ConfigurationSampler:
+    def from_chain(cls, chain: Chain, workspace: WorkspaceConstraints, angle: float, length: float) -> Self:
         """Create a sampler with margins to the joint limits."""
         from .collision import CollisionChecker  # lazy import: only for plans
 

@@ -18,10 +18,7 @@ TIMEOUT_S, INTERVAL_S = 30.0, 0.02
 
 @contextmanager
 def lock_folders(folders: Iterable[str], signals: DeferredSignals) -> Iterator[bool]:
-    """Lock folders against other runs that save in them; wait for those that do.
-
-    The system releases the locks of a process that ends, even if it is killed. No lock files are left behind.
-    """
+    """Lock folders against other runs that save in them; the system releases locks of killed processes."""
     descriptors: list[int] = []
     is_locked = True
     try:

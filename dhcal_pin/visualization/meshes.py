@@ -32,6 +32,7 @@ import pinocchio as pin
 from .. import se3
 from .._frozen import frozen
 from .._typing import Array, PathLike
+from ..formatting import capitalized, list_first
 from ..native_output import discard_native_messages
 from ..robot.chain import Chain
 from ..robot.collision import FLOOR, Obstacle
@@ -208,12 +209,10 @@ def _missing_meshes_note(missing: dict[str, list[str]]) -> str:
     if not missing:
         return ""
     names = [f"{os.path.basename(name)} ({link})" for link, files in missing.items() for name in files]
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     remedy = mesh_remedy(next(name for files in missing.values() for name in files))
     return (
         f"Drawn as rods, because meshes are missing, unreadable or larger than {MAX_MESH_BYTES >> 20} MiB: "
-        f"{', '.join(names[:MAX_NAMED])}{more}. "
-        f"{remedy[0].upper()}{remedy[1:]}."
+        f"{list_first(names, MAX_NAMED)}. {capitalized(remedy)}."
     )
 
 
@@ -333,11 +332,7 @@ def _simplified(mesh: Mesh, limit: int) -> Mesh:
 
 
 def allocate_triangles(counts: Sequence[int], total: int) -> list[int]:
-    """Share a number of triangles between meshes, in proportion to the square roots of their own numbers.
-
-    A mesh with four times as many triangles as another one thus keeps twice as many. Meshes with fewer
-    triangles than their share are not simplified.
-    """
+    """Share a number of triangles between meshes, in proportion to the square roots of their own numbers."""
     remaining, roots = float(total), np.sqrt(counts)
     rate = 0.0
     # A damaged mesh may have no triangles.

@@ -135,7 +135,7 @@ def test_a_lens_of_another_camera_is_named():
     assert dh.calibrate(arm, images, loss="linear").verdict.status == "ok"
 
 
-@pytest.mark.parametrize("seed", some_slow([3, 1, 2], {0}))
+@pytest.mark.parametrize("seed", some_slow([3, 1, 2], {1}))
 def test_another_resolution_with_a_held_lens_is_the_likely_cause(seed):
     arm, images = photograph(seed, intrinsics_error=0.0, n_images=16)
     images = with_camera(resized(images, 0.5), intrinsics="fixed")

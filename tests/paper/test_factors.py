@@ -11,13 +11,11 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.paper import (
     alpf,
     apply_correction,
-    differential_motion,
     error_factors,
     laf,
     ldf,
     link_vectors,
     pseudo_inverse_step,
-    q_matrices,
     tail_matrices,
     thf,
     tool_error,
@@ -33,6 +31,26 @@ KEYS = ("theta", "d", "a", "alpha")
 
 def joints(table: DHTable, m: int = 30, seed: int = 0):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (m, table.n_joints))
+
+
+def q_matrices(table: DHTable):
+    """Return the derivative matrices Q, equations (9) and (10).
+
+    They satisfy ∂A_i/∂x = A_i·Q_x. Erratum, probably of the transcription: Q_α has -1 at row 2, column 3.
+    """
+    s, c = np.sin(table.alpha), np.cos(table.alpha)
+    out = np.zeros((4, table.n_joints, 4, 4))
+    # Q_θ
+    out[0, :, 0, 1], out[0, :, 0, 2] = -c, s
+    out[0, :, 1, 0], out[0, :, 1, 3] = c, table.a * c
+    out[0, :, 2, 0], out[0, :, 2, 3] = -s, -table.a * s
+    # Q_d
+    out[1, :, 1, 3], out[1, :, 2, 3] = s, c
+    # Q_a
+    out[2, :, 0, 3] = 1.0
+    # Q_α
+    out[3, :, 1, 2], out[3, :, 2, 1] = -1.0, 1.0
+    return out
 
 
 def test_link_derivatives_are_products_with_q():
@@ -108,6 +126,22 @@ def test_ldf_and_laf_have_no_rotation():
     table = paper("sim_6dof_actual")
     factors = error_factors(table, joints(table))
     assert np.abs(factors[:, 3:, 6:18]).max() == 0.0
+
+
+def differential_motion(change, pose):
+    """Compute dn, do, da, dp of the tool pose, shape (..., 3, 4), from DX: equations (30) to (34).
+
+        dT_N = T_N·δT_N = [dn do da dp; 0 0 0 0]     (30)
+        dn   =  o·δz - a·δy                          (31)
+        do   = -n·δz + a·δx                          (32)
+        da   =  n·δy - o·δx                          (33)
+        dp   =  n·dx + o·dy + a·dz                   (34)
+
+    Erratum, probably of the transcription: (31) prints a·δz in place of o·δz.
+    """
+    n, o, a = pose[..., :3, 0], pose[..., :3, 1], pose[..., :3, 2]
+    dx, dy, dz, rx, ry, rz = (change[..., i, None] for i in range(6))
+    return np.stack([o * rz - a * ry, a * rx - n * rz, n * ry - o * rx, n * dx + o * dy + a * dz], -1)
 
 
 def test_differential_motion_is_the_derivative_of_the_pose():

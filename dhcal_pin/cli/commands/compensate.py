@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from ... import io, robot
 from ...exceptions import InvalidArgumentError
+from ...formatting import texts_by_file
 from .. import screens
 from ..options import JSON, ROBOT, URDF_OPTIONS, Options, motion_options, read_robot_or_table
 
@@ -78,6 +79,7 @@ def run(args: Namespace) -> int:
     frame = f"the root link {nominal.root}" if args.frame == BASE else "the measuring frame"
     notes = [f"{targets.source}: {text}" for text in _unstated_conditions(args, calibrated, targets)]
     warning = robots_warning(args.nominal, args.calibrated, nominal, calibrated)
+    warnings = {args.nominal: [warning]} if warning else {}
     write_with_json(
         contents,
         args.json,
@@ -86,7 +88,7 @@ def run(args: Namespace) -> int:
         targets=len(result.status),
         reached=int(result.reached.sum()),
         status=list(result.status),
-        warnings=[*notes, *([f"{args.nominal}: {warning}"] if warning else [])],
+        warnings=[*notes, *texts_by_file(warnings)],
     )
     screen = screens.compensation_screen(
         f"targets: {_tool_text(args, calibrated)} in {frame}",
@@ -94,7 +96,7 @@ def run(args: Namespace) -> int:
         calibrated,
         targets,
         notes,
-        {args.nominal: [warning]} if warning else {},
+        warnings,
         _hint(args, nominal, calibrated, targets, result),
         contents,
     )
@@ -195,13 +197,7 @@ def _fitting_unit(nominal: robot.Chain, calibrated: robot.Chain, targets: io.Tar
 def robots_warning(
     nominal_path: str, calibrated_path: str, nominal: robot.Chain, calibrated: robot.Chain
 ) -> str:
-    """Return a warning if the nominal and the calibrated robot are the same, or look exchanged.
-
-    They look exchanged in two cases. Only the nominal robot has a sidecar, which a calibration writes. Or
-    both or none have one, and of the numbers that differ between the URDFs most are computed in the nominal
-    file and most are not in the calibrated one. A number is computed if it has at least 15 significant digits
-    and is not a multiple of 15 degrees: a calibration writes all digits, and people do not.
-    """
+    """Return a warning if the nominal and the calibrated robot are the same, or look exchanged."""
     import numpy as np  # lazy import: it is slow to load
 
     is_known = nominal.origins.shape == calibrated.origins.shape and calibrated.transmission is None

@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 from ... import diagnostics, io, report
 from ...exceptions import InvalidArgumentError
+from ...formatting import texts_by_file
 from .. import screens
 from ..options import DATA, JSON, RIG, ROBOT, TABLE_OPTIONS, URDF_OPTIONS, Options, read_one_robot
 
@@ -67,9 +68,8 @@ def run(args: Namespace) -> int:
         "robot": robot,
         "files": [asdict(inspection) for inspection in inspections],
         "warnings": [
-            f"{path}: {text}"
-            for path, texts in (*warnings.items(), *((one.path, one.warnings) for one in inspections))
-            for text in texts
+            *texts_by_file(warnings),
+            *(f"{one.path}: {text}" for one in inspections for text in one.warnings),
         ],
         "inputs": report.file_digests(inputs),
     }

@@ -6,16 +6,14 @@ import os
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ... import diagnostics, io, report, session
 from ...exceptions import InvalidArgumentError
+from ...formatting import texts_by_file
 from .. import options, screens
 from ..output_table import Makers, Output
 from ..servo_zeros import other_zeros_warning
-
-if TYPE_CHECKING:
-    from ...robot import Chain
 
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
@@ -54,7 +52,6 @@ def run(args: Namespace) -> int:
     from ...io.check_history import Check, history_text, read_history  # lazy import, as the following
     from ...io.measurement_files.reading import has_image_coordinates
     from ...measurements import Noise
-    from ...measurements.base import known_conditions
     from ...units import parse_noise
     from ..output_table import file_contents, paths_by_name
     from ..outputs import checked_files, require_workbook, write_outputs
@@ -97,7 +94,9 @@ def run(args: Namespace) -> int:
         size=size,
         payloads=payloads,
     )
-    mistakes = {} if result.verdict == "ok" else _find_mistakes(chain, files)
+    # Mistakes look like a change of the robot.
+    suspects = [] if result.verdict == "ok" else files
+    mistakes = {file.source: diagnostics.find_input_warnings(chain, file) for file in suspects}
     if any(mistakes.values()) and any(change.kind == "robot" for change in result.changes):
         # Wrong units and the like change all parts of the robot at once.
         result = replace(result, verdict="cannot say", reasons=(_MISTAKE,), changes=())
@@ -105,17 +104,10 @@ def run(args: Namespace) -> int:
     if servos is not None:
         are_fitted = any(warnings[file.source] != mistakes.get(file.source, []) for file in files)
         warnings[args.servos] = other_zeros_warning(args.robot, servos, are_fitted)
-    notes = [
-        f"{file.source}: {text}"
-        for file in files
-        for text in (
-            *file.notes,
-            *diagnostics.find_unstated_conditions(chain, known_conditions([file.data]), payloads),
-        )
-    ]
+    notes = diagnostics.file_notes(chain, files, payloads)
     now = Check.of(result, args.robot, args.data)
     document: dict[str, Any] = result.to_dict() | {
-        "warnings": [*notes, *(f"{path}: {text}" for path, texts in warnings.items() for text in texts)],
+        "warnings": [*notes, *texts_by_file(warnings)],
         "time": now.time,
         "robot": args.robot,
         "files": paths_by_name(outputs),
@@ -130,11 +122,6 @@ def run(args: Namespace) -> int:
     write_outputs(contents, args.json, document)
     screens.show(screens.recheck_screen(result, notes, warnings, contents), args.verbosity)
     return STATUS[result.verdict]
-
-
-def _find_mistakes(chain: Chain, files: Sequence[io.MeasurementFile]) -> dict[str, list[str]]:
-    """List the mistakes in each file, which look like a change of the robot."""
-    return {file.source: diagnostics.find_input_warnings(chain, file) for file in files}
 
 
 def _with_fitted_rows(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
 from ...exceptions import InvalidArgumentError
+from ...formatting import list_first, texts_by_file
 from .. import options, screens
 from ..output_table import Makers, Output
 from ..servo_zeros import other_zeros_warning
@@ -91,8 +92,7 @@ OUTPUTS = {
 
 def run(args: Namespace) -> int:
     """Compute the accuracy of a model, write it and show it."""
-    from ...measurements.base import known_conditions  # lazy import, as the following
-    from ..output_table import file_contents, paths_by_name
+    from ..output_table import file_contents, paths_by_name  # lazy import, as the following
     from ..outputs import checked_files, existing_sidecars, require_workbook, write_outputs
 
     sidecar = args.sidecar or io.existing_sidecar(args.robot)
@@ -110,14 +110,7 @@ def run(args: Namespace) -> int:
         characteristics = iso9283.pose_characteristics(judged.chain, data, points, judged.known)
     warnings = _input_warnings(args, given, judged, sidecar)
     payloads = given.region.payloads if given.region else None
-    notes = [
-        f"{file.source}: {text}"
-        for file in given.files
-        for text in (
-            *file.notes,
-            *diagnostics.find_unstated_conditions(given.chain, known_conditions([file.data]), payloads),
-        )
-    ]
+    notes = diagnostics.file_notes(given.chain, given.files, payloads)
     extrapolation = given.region and diagnostics.find_extrapolation(
         given.region, judged.chain, data, judged.known
     )
@@ -135,7 +128,7 @@ def run(args: Namespace) -> int:
             *(extrapolation.sentences if extrapolation else ()),
             *_rig_remarks(args, given, sidecar),
         ],
-        [f"{path}: {text}" for path, texts in warnings.items() for text in texts],
+        texts_by_file(warnings),
         notes,
         report.file_digests(inputs),
         characteristics,
@@ -234,7 +227,7 @@ def _outlier_remarks(judged: Judged, data: Sequence[Measurement]) -> list[str]:
     errors = compute_errors(judged.chain, data, judged.known)
     masks = find_inliers(errors)
     rows = [(item.source, item.rows[~mask].tolist()) for item, mask in zip(data, masks, strict=True)]
-    texts = [f"{source}: {screens.list_first(lines)}" for source, lines in rows if lines]
+    texts = [f"{source}: {list_first(lines)}" for source, lines in rows if lines]
     if not texts:
         return []
     group, rest = next(iter(calibration.Accuracy.from_errors(take_errors(errors, masks)).groups.items()))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from ... import diagnostics, io, robot
 from ...exceptions import InvalidArgumentError
+from ...formatting import texts_by_file
 from .. import options, screens
 from ..output_table import Output, chosen_files, require_endings
 
@@ -101,9 +102,8 @@ def run(args: Namespace) -> int:
         magnification=args.magnification,
         triangles=args.simplify,
     )
-    findings = [f"{path}: {text}" for path, texts in warnings.items() for text in texts]
-    write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=findings)
-    notes = [f"{file.source}: {text}" for file in files for text in file.notes]
+    write_with_json({page: text}, args.json, {"html": page}, inputs, warnings=texts_by_file(warnings))
+    notes = texts_by_file({file.source: file.notes for file in files})
     screens.show(screens.files_screen([page], notes, warnings), args.verbosity)
     if args.open if args.open is not None else not args.html:
         screens.open_page(page)

@@ -21,4 +21,3 @@ from .result_screens import robot_screen as robot_screen
 from .result_screens import simulation_screen as simulation_screen
 from .result_screens import study_screen as study_screen
 from .result_screens import validation_screen as validation_screen
-from .screen import list_first as list_first

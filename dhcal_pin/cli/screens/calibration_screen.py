@@ -12,7 +12,7 @@ from ...calibration.cameras import split_sets
 from ...calibration.evaluation import Comparison
 from ...calibration.result import Result
 from ...calibration.verdict import Verdict
-from ...formatting import Quantity, Table, format_count
+from ...formatting import Quantity, Table, format_count, list_first, texts_by_file
 from ...identifiability import EXPECTED
 from ...measurements.base import Measurement
 from ...measurements.groups import ERROR_GROUPS
@@ -21,7 +21,7 @@ from ...report.provenance import Provenance, short_names
 from ..job import Job
 from ..run_job import CalibrationOutcome
 from .result_screens import robot_line
-from .screen import Block, Screen, list_first, section_blocks
+from .screen import Block, Screen, section_blocks
 
 # Number of corrections that are shown.
 N_CORRECTIONS = 5
@@ -39,18 +39,20 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
     # The parameters of a refused robot have no meaning.
     unidentified = [] if is_refused else summary.parameter_notes(fit.unobservable, fit.weakly_observable)
     unidentified = [text for text in unidentified if not text.startswith(EXPECTED)]
-    all_warnings = [f"{names[p]}: warning: {text}" for p, texts in data.warnings.items() for text in texts]
+
+    def named(by_file: Mapping[str, Sequence[str]]) -> dict[str, Sequence[str]]:
+        return {names[path]: texts for path, texts in by_file.items()}
+
+    all_warnings = texts_by_file(named(data.warnings), "warning: ")
     signs = fit.signs
     turned = [f"{names[outcome.robot]}: warning: {signs.note}"] if signs and signs.turned else []
     warnings = [text for text in all_warnings if text not in turned]
     moved = [f"warning: {text}" for text in outcome.moved_zeros]
-    notes = [
-        f"note: {names[p]}: {text}"
-        for p, texts in data.notes.items()
-        for text in texts
-        if text not in outcome.moved_zeros
-    ]
-    changes = [f"{names[p]}: {text}" for p, texts in data.changes.items() for text in texts]
+    kept = {
+        path: [text for text in texts if text not in outcome.moved_zeros]
+        for path, texts in data.notes.items()
+    }
+    notes = [f"note: {text}" for text in texts_by_file(named(kept))]
     hints = [f"hint: {source.hint}"] if source.hint else []
     files = [f"wrote {name}: {path}" for name, path in outcome.files.items()]
     by_file = summary.file_table([names[path] for path in data.fitted], fit.file_comparisons)
@@ -76,7 +78,7 @@ def calibration_screen(outcome: CalibrationOutcome, job: Job) -> Screen:
         Block(warnings, "yellow", noun="warning", rank=4),
         Block(files, noun="file written", rank=6),
         Block([] if is_refused else [summary.headline(fit.comparisons).text], "bold", has_space=True),
-        Block(changes, "yellow", is_verdict=True, has_space=is_refused),
+        Block(texts_by_file(named(data.changes)), "yellow", is_verdict=True, has_space=is_refused),
         *verdict_blocks(fit.verdict, job.force),
     ]
     return Screen(blocks, partial(_details, fit))

@@ -11,13 +11,13 @@ import numpy as np
 from ...calibration.evaluation import Accuracy
 from ...calibration.summary import STATISTIC_LABELS, statistic
 from ...diagnostics.inspection import FileInspection, column_table
-from ...formatting import Quantity, Table, format_count
+from ...formatting import Quantity, Table, format_count, list_first, texts_by_file
 from ...io.tables import format_lines
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
 from ...report.changes import difference_table
 from ...report.provenance import short_names
-from .screen import Block, Screen, list_first
+from .screen import Block, Screen
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -49,8 +49,7 @@ def notes_block(texts: Sequence[str]) -> Block:
 
 def warnings_block(warnings: Mapping[str, Sequence[str]]) -> Block:
     """Describe warnings about files."""
-    texts = [f"{path}: warning: {text}" for path, items in warnings.items() for text in items]
-    return Block(texts, "yellow", noun="warning", rank=2)
+    return Block(texts_by_file(warnings, "warning: "), "yellow", noun="warning", rank=2)
 
 
 def files_block(paths: Iterable[object]) -> Block:

@@ -25,9 +25,6 @@ Verbosity = Literal["quiet", "normal", "verbose"]
 # Size of a small terminal, without the line of the next prompt.
 WIDTH, HEIGHT = 80, 23
 
-# Longest list in a sentence; the files that are written contain all items.
-MAX_LISTED = 12
-
 # Indentation of continuation lines.
 _INDENT = "  "
 # Spaces between the columns of a table.
@@ -166,12 +163,6 @@ def _joined(parts: Sequence[_Part], counts: Sequence[int], has_spaces: bool, wid
             lines.append(Line(""))
         lines += new
     return lines
-
-
-def list_first(items: Sequence[object]) -> str:
-    """Join the first items of a list and count the others."""
-    text = ", ".join(map(str, items[:MAX_LISTED]))
-    return text + (f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else "")
 
 
 # --- folding ---------------------------------------------------------------------------------------

@@ -38,16 +38,7 @@ _STEP = 1e-4
 
 
 def contact_bias(problem: Problem, x: Array, root: Array) -> Array:
-    """Estimate the bias (p,) at the solution x from a square root (p, r) of the covariance.
-
-    Args:
-        problem: Problem that was solved.
-        x: Solution, (p,).
-        root: Square root of the covariance of the solution, (p, r).
-
-    Returns:
-        Bias of the solution, (p,) [m or rad]; zero without contacts.
-    """
+    """Estimate the bias (p,) of a solution x (p,) from a square root (p, r) of its covariance."""
     contacts = [item for item in problem.data if item.is_contact and len(item.rows)]
     slopes = np.zeros(len(x))
     if not contacts:

@@ -1,36 +1,8 @@
 """Column maps: read measurement files of other vendors.
 
-A column map is a TOML file that describes the columns of a vendor's file. Every key except the columns
-themselves has a default:
-
-    separator = ";"        # ",", ";", "tab", or "space" for any white space; detected by default
-    decimal = ","          # "." or ","; detected by default
-    skip = 2               # number of lines before the header (default 0)
-    header = true          # false: the file has no header; columns are numbers counted from 1
-    comment = "#"          # start of a comment line; "" if there are none
-    encoding = "cp1252"    # UTF-8 by default
-
-    [joints]               # joints of the robot from base to tip, or those in `names`
-    order = ["A1", "A2"]   # header or number of each joint's column
-    unit = "deg"           # or one unit per joint, such as ["deg", "mm"]; "ticks" for counts of servos
-    sign = [1, -1]         # optional
-    offset = [0.0, 90.0]   # optional, in that unit: joint = sign * column + offset
-
-    [columns]              # project column = vendor column
-    x = {from = "X pos", unit = "mm"}
-    sigma_x = {from = 9, unit = "mm", scale = 0.5}    # value = scale * column + offset
-    point = {from = "socket"}
-
-    [rotation]             # how the rotation of the target is written
-    convention = "euler"   # or "rotvec", "quaternion", "matrix" (9 columns, row by row)
-    axes = "ZYX"           # euler: axes in the order of the columns
-    frame = "intrinsic"    # euler: about the rotated axes; "extrinsic": about the fixed axes
-    order = "wxyz"         # quaternion, in place of the keys of euler; or "xyzw"
-    columns = ["A", "B", "C"]
-    unit = "deg"           # euler and rotvec
-
-    [constant]             # text for the whole file; {file}, {stem}, {parent} are parts of its path
-    point = "{parent}/{stem}"
+A column map is a TOML file that describes the columns of a vendor's file, see docs/reference/robot_files.md.
+Every key except the columns themselves has a default. Placeholders in texts of `[constant]` are `{file}`,
+`{stem}` and `{parent}`, the parts of the path of the file.
 
 `[to_joints]` has the keys of `[joints]` and describes the second configuration of a row. Columns of the file
 that the map does not name are ignored. The map applies to every file, except to files with a header of the

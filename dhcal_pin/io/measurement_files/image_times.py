@@ -10,6 +10,7 @@ import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import FileFormatError
+from ...formatting import list_first
 from .bag import read_bag_joints
 from .image_joints import ImageJoints
 
@@ -73,8 +74,8 @@ def read_recorded_joints(path: PathLike, images: Sequence[str], joint_topic: str
         }
     notes = []
     if moving:
-        more = f" and {len(moving) - 1} more images" if len(moving) > 1 else ""
-        notes.append(f"the robot moved at the time of {moving[0]}{more}; take images while it stands still")
+        first = list_first(moving, 1, "images")
+        notes.append(f"the robot moved at the time of {first}; take images while it stands still")
     return ImageJoints(joints, notes)
 
 

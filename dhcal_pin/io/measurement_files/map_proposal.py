@@ -18,7 +18,7 @@ import numpy as np
 
 from ..._typing import Array
 from ...exceptions import FileFormatError
-from ...formatting import join_names
+from ...formatting import join_names, list_first
 from ...messages import quote
 from ...robot.chain import Chain
 from ...units import ANGLES, LENGTHS
@@ -45,8 +45,6 @@ _HEADER_UNITS = {
     "mm": r"(?<![a-z])mm\b",
     "m": r"(?<![a-z])m\b|(?<![a-z])meter",
 }
-# Greatest number of column names that a message lists.
-_MAX_LISTED_NAMES = 12
 # Image coordinates: a file with these has no measured positions.
 _IMAGE_COLUMNS = frozenset(("u", "v"))
 # Headers of coordinates that are not measured, of rotations, and of other quantities of a joint.
@@ -287,12 +285,10 @@ def header_problem(table: DataTable, chain: Chain) -> str:
             f"{where}: {join_names([*map(quote, angles)])} are Euler angles without their axes; remove them"
         )
     headers = [quote(header) for header in table.written_headers if header]
-    n_more = len(headers) - _MAX_LISTED_NAMES
-    listed = ", ".join(headers[:_MAX_LISTED_NAMES]) + (f" and {n_more} more" if n_more > 0 else "")
     expected = f"a joint of this robot ({', '.join(chain.joint_names)})"
     if set(chain.joint_names) & set(table.columns):
         expected = "a measured value, such as x[mm]"
-    problem = f"{where}: no column is {expected}; the columns are {listed}{_text_axis(table)}"
+    problem = f"{where}: no column is {expected}; the columns are {list_first(headers)}{_text_axis(table)}"
     if _has_other_joints(table, chain, _numeric_columns(table)):
         problem += "; they have more angles than the robot has joints: give the robot that was measured"
         return f"{problem}, rename them"
