@@ -30,6 +30,7 @@ from .sets import HAND_EYE_SETS as HAND_EYE_SETS
 from .sets import MIXED_SETS as MIXED_SETS
 from .sets import RIG_SETS as RIG_SETS
 from .sets import default_sets as default_sets
+from .sets import describe_configurations as describe_configurations
 from .sets import has_images as has_images
 from .sets import has_joint_values as has_joint_values
 from .sets import held_values as held_values

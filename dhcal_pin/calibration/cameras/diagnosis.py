@@ -32,6 +32,7 @@ from ...formatting import Quantity, Table, format_quantity
 from ...measurements.base import Measurement, errors_of, instrument_values
 from ...measurements.camera import CameraCorners, select_images
 from ...measurements.images.names import list_images
+from ...measurements.mounting import Mount
 from ...plausibility.displacement import measure_correction
 from ...subsampling import evenly_spaced_indices
 from ..evaluation import Accuracy
@@ -551,15 +552,39 @@ def _pairing_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     )
 
 
-def _links_text(hand_eye: HandEyeData, _: _State) -> tuple[str, str]:
-    """Describe exchanged links."""
+def _links_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe exchanged links, and beside poses of the flange inverse poses, which show the same images."""
     rig = _rig(hand_eye.data)
     camera, board = rig.cameras[0], rig.boards[0]
-    return (
-        f"the links: camera {camera.name!r} on link {board.link!r} and board {board.name!r} on link "
-        f"{camera.link!r} explain the images",
-        "Exchange the links in the rig file.",
+    if has_joint_values(hand_eye.data):
+        return (
+            f"the links: camera {camera.name!r} on link {board.link!r} and board {board.name!r} on link "
+            f"{camera.link!r} explain the images",
+            "Exchange the links in the rig file.",
+        )
+    solved = _images(state.fit.data).solved_rig(state.values) or rig
+    # The pose of a camera in its end is the same for both explanations, and so is that of a board.
+    ends = solved.camera_in_end(0), solved.board_in_end(0)
+    stated, exchanged = (
+        f"camera {camera.name!r} is {_distance(ends[0], of_camera)} from link {first!r}, and board "
+        f"{board.name!r} {_distance(ends[1], of_board)} from link {second!r}"
+        for of_camera, first, of_board, second in (
+            (rig.camera_mounts[0], camera.link, rig.board_mounts[0], board.link),
+            (rig.board_mounts[0], board.link, rig.camera_mounts[0], camera.link),
+        )
     )
+    return (
+        "inverse flange poses (of the base in the flange), or exchanged links; the images do not show which "
+        f"of them. If the poses are inverse, {stated}; if the links are exchanged, {exchanged}",
+        f"If camera {camera.name!r} is on link {camera.link!r}, invert the poses, or add --mend "
+        f"poses:inverse; if it is on link {board.link!r}, exchange the links in the rig file.",
+    )
+
+
+def _distance(pose: Array, mount: Mount) -> str:
+    """Format the distance of a pose in the frame of an end from the link of a mount."""
+    size = float(np.linalg.norm(pose[:3, 3] - mount.link_pose[:3, 3]))
+    return format_quantity(size, "m", 0.03 * size)
 
 
 def _size_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
