@@ -247,6 +247,15 @@ class CameraCorners(Measurement):
         )
         return self.replace(instrument_parameters=parameters)
 
+    def without_poses(self, entries: Collection[str]) -> Self:
+        """Return a copy in which the poses of cameras and boards, such as `camera_wrist`, are not known."""
+        cameras, boards = (
+            tuple(replace(e, pose=None) if f"{kind}_{e.name}" in entries else e for e in group)
+            for kind, group in (("camera", self.rig.cameras), ("board", self.rig.boards))
+        )
+        unknown = {f"{entry}.{name}": np.nan for entry in entries for name in POSE_NAMES}
+        return self.with_rig(replace(self.rig, cameras=cameras, boards=boards)).with_values(unknown)
+
     def matched_to(self, known: Mapping[str, float]) -> Self:
         """Return a copy whose boards have free corners where the calibration estimated them."""
         boards = tuple(

@@ -1,9 +1,6 @@
 """Public names of dhcal_pin.calibration.cameras; `__init__.py` loads each on first use."""
 
 from .arm_types import arm_type as arm_type
-from .axis_order import Exchange as Exchange
-from .axis_order import exchange_axes as exchange_axes
-from .axis_order import reorder as reorder
 from .board_size import BoardSize as BoardSize
 from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
@@ -21,6 +18,8 @@ from .image_checks import small_ranges as small_ranges
 from .image_session import fit_image_session as fit_image_session
 from .lens_priors import describe_far_lenses as describe_far_lenses
 from .lens_priors import with_stated_distortion as with_stated_distortion
+from .mistakes import RigMistakes as RigMistakes
+from .mistakes import correct_rig as correct_rig
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images
 from .procedure import require_shown_families as require_shown_families

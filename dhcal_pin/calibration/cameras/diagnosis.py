@@ -47,6 +47,7 @@ from .causes import (
     LINKS,
     OFFSETS,
     PAIRING,
+    POSES,
     SIZE,
     Causes,
     HandEyeData,
@@ -59,6 +60,7 @@ from .causes import (
 from .gate import residual_jitter
 from .image_checks import MIN_ROTATION, MORE_ROTATIONS, NO_ROTATION, describe_rotation, second_rotation
 from .lens_priors import find_image_resolution, lens_values
+from .mistakes import held_entries, pose_differences
 from .sets import MAX_POINTS, count_corners, describe_configurations, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
@@ -478,6 +480,13 @@ def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
         if LINKS in out and out[LINKS].error.pixels < MAX_LINKS_ERROR * max(camera.width, camera.height):
             return out
         out.pop(LINKS, None)
+    if not causes.has_free_poses and held_entries(hand_eye.data, hand_eye.known):
+        attempt(POSES, replace(causes, has_free_poses=True), None)
+        # Errors of the arm displace cameras and boards, too, but leave more than noise.
+        if POSES in out and out[POSES].error.pixels > MAX_NOISE_RATIO * out[POSES].noise:
+            out.pop(POSES)
+        elif POSES in out and is_large:
+            return out
     if is_large and not causes.shift and (shift := find_shift(hand_eye, causes)):
         attempt(PAIRING, replace(causes, shift=shift), None)
         if PAIRING in out and out[PAIRING].error.pixels < MAX_ERROR_SHARE * state.error.pixels:
@@ -504,6 +513,7 @@ def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
     text, remedy = {
         PAIRING: _pairing_text,
         LINKS: _links_text,
+        POSES: _poses_text,
         SIZE: _size_text,
         LENS: _lens_text,
         CORNERS: _corner_text,
@@ -585,6 +595,16 @@ def _distance(pose: Array, mount: Mount) -> str:
     """Format the distance of a pose in the frame of an end from the link of a mount."""
     size = float(np.linalg.norm(pose[:3, 3] - mount.link_pose[:3, 3]))
     return format_quantity(size, "m", 0.03 * size)
+
+
+def _poses_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe the stated poses that are inverse, or else the one that differs most."""
+    held = held_entries(hand_eye.data, hand_eye.known)
+    found = pose_differences(select_images(hand_eye.data), state.values, held)
+    wrong = [each for each in found if each.is_inverse] or [max(found, key=lambda each: each.size)]
+    sets = " and ".join(dict.fromkeys(each.entry.partition("_")[0] for each in wrong))
+    remedies = " ".join(dict.fromkeys(each.remedy for each in wrong))
+    return " and ".join(each.text for each in wrong), f"{remedies} Or add {sets} to --parameters."
 
 
 def _size_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
