@@ -72,10 +72,12 @@ class PoseDifference:
             kind = self.entry.partition("_")[0]
             return f"the stated pose of {self.name} is inverse, of its link in the {kind}"
         change = se3.inverse(self.stated) @ self.found
-        distance, angle = np.linalg.norm(change[:3, 3]), np.linalg.norm(se3.log3(change[:3, :3]))
+        distance, angle = (
+            float(np.linalg.norm(vector)) for vector in (change[:3, 3], se3.log3(change[:3, :3]))
+        )
         return (
-            f"the stated pose of {self.name} is {format_quantity(float(distance), 'm', 0.03 * distance)} and "
-            f"{format_quantity(float(angle), 'rad', 0.03 * angle)} from the one in the images"
+            f"the stated pose of {self.name} is {format_quantity(distance, 'm', 0.03 * distance)} and "
+            f"{format_quantity(angle, 'rad', 0.03 * angle)} from the one in the images"
         )
 
     @property
