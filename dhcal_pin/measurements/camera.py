@@ -165,6 +165,7 @@ class CameraCorners(Measurement):
     )
     required_columns = (frozenset(("u", "v", "corner")),)
     accepts_tool_poses = True
+    label_column = "camera"
     sample_fields = (
         *Measurement.sample_fields,
         *("values", "sigma", "camera", "board", "corner", "image_names", "jitter"),
@@ -346,6 +347,20 @@ class CameraCorners(Measurement):
             format_count(self.n_images, "image"),
             format_sigma((self.sigma, 1.0, "px")) if self.has_stated_sigma else "sigma not stated",
         ]
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(camera.name for camera in self.rig.cameras)
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of each sample's camera, (m,)."""
+        return self.camera
+
+    def with_label(self, number: int) -> Self:
+        """Return the same corners in images of one camera."""
+        return self.replace(camera=np.full(len(self.rows), number))
 
     @property
     def n_images(self) -> int:

@@ -7,6 +7,7 @@ from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import describe_contradiction as describe_contradiction
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
+from .image_checks import count_outlying_images as count_outlying_images
 from .image_checks import describe_outlying_end as describe_outlying_end
 from .image_checks import describe_weak_positions as describe_weak_positions
 from .image_checks import largest_fixed_std as largest_fixed_std

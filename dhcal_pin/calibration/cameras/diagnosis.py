@@ -161,25 +161,34 @@ class HandEyeDiagnosis:
     @property
     def image_sentences(self) -> list[str]:
         """What is wrong with the choice of the images, one finding each."""
-        out = []
-        if self.has_few_rotations:
-            size = f"by up to {1 / self.rotation:.2g} mm" if self.rotation > NO_ROTATION else "by metres"
-            out.append(
-                f"Too few rotations: {describe_rotation(self.rotation)}. An error of the arm of "
-                f"1 mm displaces the camera {size}, and the images do not show it. {MORE_ROTATIONS}"
-            )
+        return [*self.rotation_sentences, *self.wrong_image_sentences]
+
+    @property
+    def rotation_sentences(self) -> list[str]:
+        """One sentence if the tool turned too little about a second axis, else empty."""
+        if not self.has_few_rotations:
+            return []
+        size = f"by up to {1 / self.rotation:.2g} mm" if self.rotation > NO_ROTATION else "by metres"
+        return [
+            f"Too few rotations: {describe_rotation(self.rotation)}. An error of the arm of "
+            f"1 mm displaces the camera {size}, and the images do not show it. {MORE_ROTATIONS}"
+        ]
+
+    @property
+    def wrong_image_sentences(self) -> list[str]:
+        """One sentence that names the images that do not fit the others, empty without such images."""
+        if not self.n_wrong_images:
+            return []
         names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:
-            out.append(
+            return [
                 f"One image does not fit the others and is left out{names}: check the {self.stated} in its "
                 "rows, and that the robot stood still."
-            )
-        elif self.n_wrong_images:
-            out.append(
-                f"{self.n_wrong_images} images do not fit the others and are left out{names}: check the "
-                f"{self.stated} in their rows, and that the robot stood still."
-            )
-        return out
+            ]
+        return [
+            f"{self.n_wrong_images} images do not fit the others and are left out{names}: check the "
+            f"{self.stated} in their rows, and that the robot stood still."
+        ]
 
     @property
     def error_sentence(self) -> str:

@@ -24,12 +24,12 @@ from ....robot.chain import Chain
 
 # Ratio of the median errors of the first values from which stated poses are not used, and smallest error of
 # stated ones as a fraction of the size of the image.
-MIN_RATIO, MIN_ERROR_SHARE = 5.0, 0.05
+MIN_RATIO, MIN_ERROR_SHARE = 3.0, 0.05
 # Difference from the inverse of a stated pose below which the stated one is inverse: rotation [rad], or
 # distance relative to that from the link.
 MAX_INVERSE_DIFFERENCE = 0.3
 # Distances from the link below this one count as this [m].
-_MIN_DISTANCE = 0.03
+_MIN_DISTANCE = 0.1
 
 
 @frozen(eq=False)
