@@ -39,6 +39,8 @@ MAX_UNBROKEN_CHARS = 48
 MAX_LISTED = 12
 # Tables of a page with more columns become lists on medium pages already.
 MAX_NARROW_COLUMNS = 6
+# Largest number of runs of lines that a message lists.
+MAX_LISTED_RUNS = 100
 
 
 def significant_decimals(std: float) -> int:
@@ -222,3 +224,16 @@ def markdown_table(table: Table) -> str:
         "| " + " | ".join(map(escape_markdown, row)) + " |" for row in (table.header, *table.texts)
     )
     return "\n".join([header, "|" + "|".join(rules) + "|", *rows])
+
+
+def format_lines(lines: Iterable[int], n_listed: int = MAX_LISTED_RUNS) -> str:
+    """Return line numbers as text: the first runs of them, then how many lines follow.
+
+    >>> format_lines([2, 5, 6, 7, 11])
+    '2, 5-7, 11'
+    """
+    groups = itertools.groupby(enumerate(lines), lambda pair: pair[1] - pair[0])
+    runs = [[line for _, line in pairs] for _, pairs in groups]
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:n_listed]]
+    n_more = sum(map(len, runs[n_listed:]))
+    return ", ".join(parts) + f" and {n_more} more" * bool(n_more)

@@ -226,7 +226,7 @@ class Evidence(FittedModel):
 
     @cached_property
     def wrong_labels(self) -> tuple[WrongLabel, ...]:
-        """Outliers that fit another touched point or target than they state."""
+        """Outliers that fit another touched point, target or camera than they state."""
         return tuple(
             found
             for item, is_counted in zip(self.data, self.is_counted, strict=True)

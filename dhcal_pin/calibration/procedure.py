@@ -269,7 +269,7 @@ class _Setup:
     priors: Priors  # Priors of the options, or those of the method
     progress: Progress | None
     signs: plausibility.SignDecision | None  # Signs of the joints; None if they are those of the URDF
-    exchanges: Sequence[cameras.Exchange]  # Exchanged axes of images
+    mistakes: cameras.RigMistakes  # Mistakes in the rig, which are corrected
     known: Mapping[str, float]  # Values of the instrument parameters that are held
     errors: ErrorModel  # Unknown errors of the robot
     first: Mapping[str, float]  # Errors at which a low-cost arm starts, by name
@@ -300,13 +300,14 @@ def _set_up(
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     signs = _joint_signs(chain, data, turned, is_low_cost, progress)
     chain = signs.apply(chain) if signs else chain
-    exchanges: Sequence[cameras.Exchange] = ()
+    mistakes = cameras.RigMistakes()
     stated = _validated_known(data, options.known or {})
     if has_images(data):
         shown = with_shown_entries((*data, *holdout))
         data, holdout = shown[: len(data)], shown[len(data) :]
-        data, exchanges = cameras.exchange_axes(chain, data)
-        holdout = cameras.reorder(holdout, exchanges)
+        # With another base or tool, the frames of stated poses are not known yet.
+        checked = [] if {"base", "tool"} & {*robot_sets} else rig_sets
+        data, holdout, mistakes = cameras.correct_rig(chain, data, holdout, checked)
     # Cameras and boards that no image shows are not part of the problem.
     shown_names = {parameter.name for parameter in merge_instrument_parameters(data)}
     stated = {name: value for name, value in stated.items() if name in shown_names}
@@ -321,7 +322,7 @@ def _set_up(
     if has_images(data):
         cameras.require_shown_families(extend, families)
     return _Setup(
-        chain, data, holdout, tuple(robot_sets), tuple(rig_sets), options, priors, progress, signs, exchanges,
+        chain, data, holdout, tuple(robot_sets), tuple(rig_sets), options, priors, progress, signs, mistakes,
         known, errors, plausibility.first_errors(chain, data) if is_low_cost else {}, families,
     )  # fmt: skip
 
@@ -501,7 +502,7 @@ def _calibrate_images(setup: _Setup, begun: SessionFit, groups: PriorGroups) -> 
         groups, stages, options.max_iterations, setup.progress, arm_type(setup.robot_sets)
     )
     result = cameras.calibrate_images(
-        fitting, begun.fit, setup.chain, begun.holdout, setup.exchanges, setup.families
+        fitting, begun.fit, setup.chain, begun.holdout, setup.mistakes, setup.families
     )
     if setup.finds_session and (others := positions_beside_images(setup.data)):
         alone = _first_fit(setup, others, setup.errors)

@@ -234,6 +234,7 @@ def judge(fit: Evidence) -> Verdict:
             *_few_measurements(fit),
             *(hidden or _few_judged(fit)),
             *_outliers(fit),
+            *_outlying_cameras(fit),
         ]
         if any(finding.status == "refused" for finding in found):
             # Outliers to which the fit adapts explain the others.
@@ -547,7 +548,11 @@ def _hand_eye_error(fit: Evidence) -> list[Finding]:
 def _hand_eye_images(fit: Evidence) -> list[Finding]:
     """Advise caution if images of a hand-eye calibration are too few or too similar, or some do not fit."""
     if fit.hand_eye:
-        return [Finding("caution", text) for text in fit.hand_eye.image_sentences]
+        # Images of another camera than they state are named with it.
+        n_named = sum(len(found.images) for found in fit.wrong_labels)
+        texts = [*fit.hand_eye.rotation_sentences]
+        texts += fit.hand_eye.wrong_image_sentences if fit.hand_eye.n_wrong_images > n_named else []
+        return [Finding("caution", text) for text in texts]
     count = len(np.unique(configuration_groups(fit.data)))
     has_only_images = bool(fit.camera_stages) and all(item.kind == "camera" for item in fit.data)
     if not has_only_images or count >= cameras.MIN_CONFIGURATIONS:
@@ -980,8 +985,20 @@ def _outliers(fit: Evidence) -> list[Finding]:
     return [Finding("refused" if is_refused else "caution", f"{text}. {remedy}")]
 
 
+def _outlying_cameras(fit: Evidence) -> list[Finding]:
+    """Refuse one of several cameras most of whose images are outliers: it was fitted to others."""
+    counts = cameras.count_outlying_images(list(zip(fit.data, fit.is_counted, strict=True)))
+    texts = [
+        f"{n_outliers} of {n_images} images of camera {name!r} are outliers: it is not calibrated. Check "
+        "which camera took its images, and whether it moved."
+        for name, n_outliers, n_images in counts
+        if 2 * n_outliers > n_images
+    ]
+    return [Finding("refused", " ".join(texts))] if texts else []
+
+
 def _wrong_labels(fit: Evidence) -> list[Finding]:
-    """Advise caution if outliers fit another touched point or target than they state."""
+    """Advise caution if outliers fit another touched point, target or camera than they state."""
     if not fit.wrong_labels:
         return []
     text = " ".join(found.sentence for found in fit.wrong_labels)

@@ -36,7 +36,7 @@ class Resolution(NamedTuple):
 
 
 def find_resolution(camera: Camera, found: Array, corners: Array) -> Resolution | None:
-    """Find the resolution of images or lens from a lens (s,) and corners (m, 2), if it is not the stated one."""
+    """Find the resolution of images or lens from lens (s,) and corners (m, 2), if it is not stated so."""
     stated = camera.values[:4]
     if not camera.has_intrinsics or min(stated.min(), found[:4].min()) <= 0:
         return None

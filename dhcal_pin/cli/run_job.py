@@ -25,7 +25,7 @@ from .. import io, plausibility, report, visualization
 from .._frozen import frozen
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure
-from ..calibration.cameras import MIXED_SETS, default_sets, has_images
+from ..calibration.cameras import MIXED_SETS, default_sets, describe_configurations, has_images
 from ..calibration.cross_validation import leave_regions_out
 from ..calibration.evidence import diagnose
 from ..calibration.presentation.curves import find_lattices
@@ -292,7 +292,7 @@ def _mended(
 def _describe_change(before: Measurement, after: Measurement, key: str, target: str) -> str:
     """Describe what a change of --mend changed in a file, or in a target that is a part of the files."""
     has_same_joints = np.array_equal(before.configurations(), after.configurations())
-    what = "measured values" if has_same_joints else "joint values"
+    what = "measured values" if has_same_joints else describe_configurations([before])
     option = f"--mend {key}@{target}" if target else f"--mend {key}"
     kinds = {part.partition(":")[0] for part in key.split("+")}
     is_lasting = not kinds.isdisjoint(plausibility.LASTING_CHANGES) and not target

@@ -129,6 +129,8 @@ class Measurement(ABC):
     shows_changes: ClassVar[bool] = False
     # Whether a file may have poses of the tip in place of joint values.
     accepts_tool_poses: ClassVar[bool] = False
+    # Column of the names that samples state, see `label_names`; empty without names.
+    label_column: ClassVar[str] = ""
     # What `simulate` assumes about the instrument and its place, for plans; empty without any choice.
     simulated_instrument: ClassVar[str] = ""
 
@@ -280,6 +282,20 @@ class Measurement(ABC):
         These are the samples of one stop of the arm.
         """
         return label_stops(self)
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names that the samples state in the column `label_column`, such as those of touched points."""
+        return ()
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of the name of each sample in `label_names`, (m,)."""
+        return np.zeros(len(self.rows), int)
+
+    def with_label(self, number: int) -> Self:
+        """Return the same samples, all of which state one name."""
+        return self
 
     @property
     def n_images(self) -> int:

@@ -165,6 +165,7 @@ class CameraCorners(Measurement):
     )
     required_columns = (frozenset(("u", "v", "corner")),)
     accepts_tool_poses = True
+    label_column = "camera"
     sample_fields = (
         *Measurement.sample_fields,
         *("values", "sigma", "camera", "board", "corner", "image_names", "jitter"),
@@ -246,6 +247,15 @@ class CameraCorners(Measurement):
             replace(p, nominal=float(values.get(p.name, p.nominal))) for p in self.instrument_parameters
         )
         return self.replace(instrument_parameters=parameters)
+
+    def without_poses(self, entries: Collection[str]) -> Self:
+        """Return a copy in which the poses of cameras and boards, such as `camera_wrist`, are not known."""
+        cameras, boards = (
+            tuple(replace(e, pose=None) if f"{kind}_{e.name}" in entries else e for e in group)
+            for kind, group in (("camera", self.rig.cameras), ("board", self.rig.boards))
+        )
+        unknown = {f"{entry}.{name}": np.nan for entry in entries for name in POSE_NAMES}
+        return self.with_rig(replace(self.rig, cameras=cameras, boards=boards)).with_values(unknown)
 
     def matched_to(self, known: Mapping[str, float]) -> Self:
         """Return a copy whose boards have free corners where the calibration estimated them."""
@@ -337,6 +347,20 @@ class CameraCorners(Measurement):
             format_count(self.n_images, "image"),
             format_sigma((self.sigma, 1.0, "px")) if self.has_stated_sigma else "sigma not stated",
         ]
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(camera.name for camera in self.rig.cameras)
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of each sample's camera, (m,)."""
+        return self.camera
+
+    def with_label(self, number: int) -> Self:
+        """Return the same corners in images of one camera."""
+        return self.replace(camera=np.full(len(self.rows), number))
 
     @property
     def n_images(self) -> int:

@@ -56,6 +56,7 @@ class PointContact(PointMeasurement):
     is_contact = True
     shows_changes = True
     has_length_scale = False
+    label_column = "point"
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = text_column("points", "point") + length_columns("", "x", "y", "z", is_implied=True)
     sample_fields = (*PointMeasurement.sample_fields, "label")
@@ -71,6 +72,20 @@ class PointContact(PointMeasurement):
     def text_values(self) -> dict[str, Sequence[str]]:
         """Return the names of the samples' points."""
         return {"point": [self.names[i] for i in self.label]}
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the points."""
+        return self.names
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of each sample's point, (m,)."""
+        return self.label
+
+    def with_label(self, number: int) -> Self:
+        """Return the same samples of one point."""
+        return self.replace(label=np.full(len(self.rows), number))
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""

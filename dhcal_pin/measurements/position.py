@@ -268,6 +268,7 @@ class MultiTargetPosition(PointMeasurement):
 
     kind = "targets"
     shows_changes = True
+    label_column = "target"
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES) + text_column("targets", "target")
     sample_fields = (*PointMeasurement.sample_fields, "label")
@@ -299,6 +300,20 @@ class MultiTargetPosition(PointMeasurement):
     def text_values(self) -> dict[str, Sequence[str]]:
         """Return the names of the samples' targets."""
         return {"target": [self.names[i] for i in self.label]}
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the targets."""
+        return self.names
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of each sample's target, (m,)."""
+        return self.label
+
+    def with_label(self, number: int) -> Self:
+        """Return the same samples of one target."""
+        return self.replace(label=np.full(len(self.rows), number))
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""

@@ -35,7 +35,7 @@ from ..measurements.euler_angles import (
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
-from ..robot.inverse_kinematics import tool_pose_and_jacobian
+from ..robot.inverse_kinematics import MAX_POSE_DIFFERENCE, reach_poses, tool_pose_and_jacobian
 from ..robot.joint_path import joint_path
 from ..session.facts import MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
@@ -259,11 +259,31 @@ class QuaternionOrder:
 
 @frozen
 class InversePose:
-    """Poses of the measuring frame in the tool frame, in place of the tool in the measuring frame."""
+    """Poses of one frame in another, in place of the other way round.
+
+    The measured poses, or those of the flange that images have in place of joint values.
+    """
+
+    chain: Chain  # Robot that was measured
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the inverse poses."""
-        return _with_poses(item, se3.inverse(item.poses)) if isinstance(item, PoseMeasurement) else None
+        if isinstance(item, PoseMeasurement):
+            return _with_poses(item, se3.inverse(item.poses))
+        return None if item.has_joint_values else _with_inverse_flange(self.chain, item)
+
+
+def _with_inverse_flange(chain: Chain, item: Measurement) -> Measurement:
+    """Return images with the inverse poses of the flange."""
+    arm = chain.with_base_and_tool(np.eye(4), np.eye(4))
+    different, number = np.unique(item.q, axis=0, return_inverse=True)
+    q, differences = reach_poses(arm, se3.inverse(arm.poses(different)))
+    if np.any(differences > MAX_POSE_DIFFERENCE):
+        raise InvalidArgumentError(
+            f"{item.source}: the robot does not reach the inverse poses; expected one that reaches them, "
+            "such as flange.urdf"
+        )
+    return item.resample(q[number.reshape(-1)])
 
 
 @frozen
@@ -491,9 +511,8 @@ def list_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypot
     else:
         # Positions alone are the same in all left-handed frames, up to a rotation of the base.
         yield Hypothesis("axes:x,y,-z", "the measuring frame is mirrored", AxisChange((0, 1, 2), (1, 1, -1)))
-    yield Hypothesis(
-        "poses:inverse", "the poses are inverse, of the measuring frame in the tool frame", InversePose()
-    )
+    text = "the poses are inverse, of the measuring frame in the tool frame"
+    yield Hypothesis("poses:inverse", text, InversePose(chain))
     yield Hypothesis("rotations:inverse", "the measured rotations are inverse", InverseRotation())
 
 

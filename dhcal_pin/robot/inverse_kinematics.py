@@ -25,6 +25,7 @@ from .._typing import Array
 from ..exceptions import ConvergenceError
 from .chain import Chain
 from .conditions import Conditions
+from .sampling import joint_range
 
 # Function from tool poses, shape (r, 4, 4), and sample numbers, shape (r,), to task errors, shape (r, k) [m],
 # and their derivatives by the tool twist [v, ω] in axes of the measuring frame, shape (r, k, 6), or by v, (r,
@@ -57,6 +58,15 @@ REACHED_TOL = 1e-9
 
 # Number of random restarts before `reach_within_limits` gives up, and steps of each.
 _MAX_RESTARTS, _STEPS_PER_START = 100, 60
+
+# Largest difference from a pose that counts as reached [m]; rotations by the characteristic length.
+MAX_POSE_DIFFERENCE = 5e-7
+
+# Damping of the last steps towards poses [m²]; smaller values make the system singular in double precision.
+_MIN_POSE_DAMPING = 1e-14
+
+# Largest distance of the first start from the middle of the joint limits [rad and m].
+_MAX_START = 0.5
 
 
 def tool_pose_and_jacobian(chain: Chain, q: Array) -> tuple[Array, Array]:
@@ -221,3 +231,15 @@ def solve_within_limits(chain: Chain, task_error: TaskError, start: Array, rng: 
             f"{n_missed} of {len(start)} targets are out of reach of this arm; choose other joint positions"
         )
     return q
+
+
+def reach_poses(chain: Chain, poses: Array) -> tuple[Array, Array]:
+    """Find joint positions that bring the tool to poses (m, 4, 4); return the differences [m], too."""
+    rng = np.random.default_rng(0)
+    # In the middle of the limits many arms are singular.
+    start = np.mean(joint_range(chain), 0) + rng.uniform(-_MAX_START, _MAX_START, chain.n_joints)
+    task = pose_task(poses, characteristic_length(chain))
+    q, differences = reach_within_limits(chain, task, np.tile(start, (len(poses), 1)), rng)
+    # Near a singularity, stronger damping leaves a small error.
+    q, differences = solve_ik(without_rotary_limits(chain), task, q, min_damping=_MIN_POSE_DAMPING)
+    return wrap_into_limits(chain, q)[0], differences

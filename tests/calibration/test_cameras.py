@@ -14,9 +14,11 @@ from robots import URDF
 from slow_cases import some_slow
 
 import dhcal_pin as dh
-from dhcal_pin.calibration.cameras import axis_order, seen_ranges_warning
+from dhcal_pin.calibration.cameras import seen_ranges_warning
 from dhcal_pin.calibration.cameras.arm_types import INDUSTRIAL
-from dhcal_pin.calibration.cameras.axis_order import (
+from dhcal_pin.calibration.cameras.gate import Gate, _far_points, apply_gate, cluster_folds
+from dhcal_pin.calibration.cameras.mistakes import axis_order
+from dhcal_pin.calibration.cameras.mistakes.axis_order import (
     ORDERS,
     Exchange,
     _images_of,
@@ -24,7 +26,6 @@ from dhcal_pin.calibration.cameras.axis_order import (
     exchange_axes,
     reorder,
 )
-from dhcal_pin.calibration.cameras.gate import Gate, _far_points, apply_gate, cluster_folds
 from dhcal_pin.calibration.cameras.procedure import with_common_start
 from dhcal_pin.calibration.cameras.stages import ImageError
 from dhcal_pin.calibration.cameras.target_points import judged_boards

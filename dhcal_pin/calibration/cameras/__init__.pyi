@@ -1,15 +1,13 @@
 """Public names of dhcal_pin.calibration.cameras; `__init__.py` loads each on first use."""
 
 from .arm_types import arm_type as arm_type
-from .axis_order import Exchange as Exchange
-from .axis_order import exchange_axes as exchange_axes
-from .axis_order import reorder as reorder
 from .board_size import BoardSize as BoardSize
 from .diagnosis import MIN_CONFIGURATIONS as MIN_CONFIGURATIONS
 from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import describe_contradiction as describe_contradiction
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
+from .image_checks import count_outlying_images as count_outlying_images
 from .image_checks import describe_outlying_end as describe_outlying_end
 from .image_checks import describe_weak_positions as describe_weak_positions
 from .image_checks import largest_fixed_std as largest_fixed_std
@@ -21,6 +19,8 @@ from .image_checks import small_ranges as small_ranges
 from .image_session import fit_image_session as fit_image_session
 from .lens_priors import describe_far_lenses as describe_far_lenses
 from .lens_priors import with_stated_distortion as with_stated_distortion
+from .mistakes import RigMistakes as RigMistakes
+from .mistakes import correct_rig as correct_rig
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images
 from .procedure import require_shown_families as require_shown_families
@@ -30,6 +30,7 @@ from .sets import HAND_EYE_SETS as HAND_EYE_SETS
 from .sets import MIXED_SETS as MIXED_SETS
 from .sets import RIG_SETS as RIG_SETS
 from .sets import default_sets as default_sets
+from .sets import describe_configurations as describe_configurations
 from .sets import has_images as has_images
 from .sets import has_joint_values as has_joint_values
 from .sets import held_values as held_values

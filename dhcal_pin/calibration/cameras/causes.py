@@ -7,6 +7,7 @@ changes one of them:
   values between two rows;
 - `links`: the rig states the link of the camera for the board, and that of the board for the camera: a camera
   on the wrist for a fixed one, or the other way round;
+- `stated poses`: a pose of a camera or a board that the calibration holds differs from the one in the rig;
 - `board size`: all lengths of a board have one factor;
 - `lens`: focal lengths, image centre and distortion differ from those of the rig;
 - `board corners`: each corner of a board is displaced;
@@ -37,13 +38,16 @@ from ...estimation.solver import minimize
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners, change_images, select_images
+from ...measurements.images.camera_parameters import POSE_NAMES
 from ...measurements.images.camera_start import first_values
 from ..reweighting import Fit, reweight
+from .mistakes import held_entries
 
 # Causes, and parameter sets of those of the arm. Those with fewer unknowns come first.
-PAIRING, LINKS, SIZE, LENS, CORNERS, OFFSETS, GEOMETRY = (
+PAIRING, LINKS, POSES, SIZE, LENS, CORNERS, OFFSETS, GEOMETRY = (
     "pairing",
     "links",
+    "stated poses",
     "board size",
     "lens",
     "board corners",
@@ -77,6 +81,7 @@ class Causes:
     sizes: Mapping[str, float] = field(default_factory=dict)
     shift: float = 0.0  # Number of rows by which the joint values are shifted; 0.5 is the mean of two rows
     has_exchanged_links: bool = False  # Whether cameras and boards are on each other's links
+    has_free_poses: bool = False  # Whether stated poses that the calibration holds are estimated
 
 
 @frozen(eq=False)
@@ -140,6 +145,11 @@ def _first_fit(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float]
     known = dict(hand_eye.known)
     if causes.has_lens:
         freed = {name for item in select_images(data) for name in _lens_names(item)}
+        known = {name: value for name, value in known.items() if name not in freed}
+    if causes.has_free_poses:
+        held = held_entries(data, known)
+        data = change_images(data, lambda item: item.without_poses(held))
+        freed = {f"{entry}.{name}" for entry in held for name in POSE_NAMES}
         known = {name: value for name, value in known.items() if name not in freed}
     if start is None:
         data = change_images(data, partial(_without_poses, known))

@@ -32,6 +32,7 @@ from ...formatting import Quantity, Table, format_quantity
 from ...measurements.base import Measurement, errors_of, instrument_values
 from ...measurements.camera import CameraCorners, select_images
 from ...measurements.images.names import list_images
+from ...measurements.mounting import Mount
 from ...plausibility.displacement import measure_correction
 from ...subsampling import evenly_spaced_indices
 from ..evaluation import Accuracy
@@ -46,6 +47,7 @@ from .causes import (
     LINKS,
     OFFSETS,
     PAIRING,
+    POSES,
     SIZE,
     Causes,
     HandEyeData,
@@ -58,6 +60,7 @@ from .causes import (
 from .gate import residual_jitter
 from .image_checks import MIN_ROTATION, MORE_ROTATIONS, NO_ROTATION, describe_rotation, second_rotation
 from .lens_priors import find_image_resolution, lens_values
+from .mistakes import held_entries, pose_differences
 from .sets import MAX_POINTS, count_corners, describe_configurations, has_joint_values
 from .stages import ImageError, fitted_error, held_out_error, held_out_prediction_std
 
@@ -158,25 +161,34 @@ class HandEyeDiagnosis:
     @property
     def image_sentences(self) -> list[str]:
         """What is wrong with the choice of the images, one finding each."""
-        out = []
-        if self.has_few_rotations:
-            size = f"by up to {1 / self.rotation:.2g} mm" if self.rotation > NO_ROTATION else "by metres"
-            out.append(
-                f"Too few rotations: {describe_rotation(self.rotation)}. An error of the arm of "
-                f"1 mm displaces the camera {size}, and the images do not show it. {MORE_ROTATIONS}"
-            )
+        return [*self.rotation_sentences, *self.wrong_image_sentences]
+
+    @property
+    def rotation_sentences(self) -> list[str]:
+        """One sentence if the tool turned too little about a second axis, else empty."""
+        if not self.has_few_rotations:
+            return []
+        size = f"by up to {1 / self.rotation:.2g} mm" if self.rotation > NO_ROTATION else "by metres"
+        return [
+            f"Too few rotations: {describe_rotation(self.rotation)}. An error of the arm of "
+            f"1 mm displaces the camera {size}, and the images do not show it. {MORE_ROTATIONS}"
+        ]
+
+    @property
+    def wrong_image_sentences(self) -> list[str]:
+        """One sentence that names the images that do not fit the others, empty without such images."""
+        if not self.n_wrong_images:
+            return []
         names = list_images(self.wrong_images)
         if self.n_wrong_images == 1:
-            out.append(
+            return [
                 f"One image does not fit the others and is left out{names}: check the {self.stated} in its "
                 "rows, and that the robot stood still."
-            )
-        elif self.n_wrong_images:
-            out.append(
-                f"{self.n_wrong_images} images do not fit the others and are left out{names}: check the "
-                f"{self.stated} in their rows, and that the robot stood still."
-            )
-        return out
+            ]
+        return [
+            f"{self.n_wrong_images} images do not fit the others and are left out{names}: check the "
+            f"{self.stated} in their rows, and that the robot stood still."
+        ]
 
     @property
     def error_sentence(self) -> str:
@@ -477,6 +489,13 @@ def _try_causes(hand_eye: HandEyeData, state: _State) -> dict[str, _State]:
         if LINKS in out and out[LINKS].error.pixels < MAX_LINKS_ERROR * max(camera.width, camera.height):
             return out
         out.pop(LINKS, None)
+    if not causes.has_free_poses and held_entries(hand_eye.data, hand_eye.known):
+        attempt(POSES, replace(causes, has_free_poses=True), None)
+        # Errors of the arm displace cameras and boards, too, but leave more than noise.
+        if POSES in out and out[POSES].error.pixels > MAX_NOISE_RATIO * out[POSES].noise:
+            out.pop(POSES)
+        elif POSES in out and is_large:
+            return out
     if is_large and not causes.shift and (shift := find_shift(hand_eye, causes)):
         attempt(PAIRING, replace(causes, shift=shift), None)
         if PAIRING in out and out[PAIRING].error.pixels < MAX_ERROR_SHARE * state.error.pixels:
@@ -503,6 +522,7 @@ def _trial(hand_eye: HandEyeData, name: str, state: _State) -> Trial:
     text, remedy = {
         PAIRING: _pairing_text,
         LINKS: _links_text,
+        POSES: _poses_text,
         SIZE: _size_text,
         LENS: _lens_text,
         CORNERS: _corner_text,
@@ -551,15 +571,49 @@ def _pairing_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     )
 
 
-def _links_text(hand_eye: HandEyeData, _: _State) -> tuple[str, str]:
-    """Describe exchanged links."""
+def _links_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe exchanged links, and beside poses of the flange inverse poses, which show the same images."""
     rig = _rig(hand_eye.data)
     camera, board = rig.cameras[0], rig.boards[0]
-    return (
-        f"the links: camera {camera.name!r} on link {board.link!r} and board {board.name!r} on link "
-        f"{camera.link!r} explain the images",
-        "Exchange the links in the rig file.",
+    if has_joint_values(hand_eye.data):
+        return (
+            f"the links: camera {camera.name!r} on link {board.link!r} and board {board.name!r} on link "
+            f"{camera.link!r} explain the images",
+            "Exchange the links in the rig file.",
+        )
+    solved = _images(state.fit.data).solved_rig(state.values) or rig
+    # The pose of a camera in its end is the same for both explanations, and so is that of a board.
+    ends = solved.camera_in_end(0), solved.board_in_end(0)
+    stated, exchanged = (
+        f"camera {camera.name!r} is {_distance(ends[0], of_camera)} from link {first!r}, and board "
+        f"{board.name!r} {_distance(ends[1], of_board)} from link {second!r}"
+        for of_camera, first, of_board, second in (
+            (rig.camera_mounts[0], camera.link, rig.board_mounts[0], board.link),
+            (rig.board_mounts[0], board.link, rig.camera_mounts[0], camera.link),
+        )
     )
+    return (
+        "inverse flange poses (of the base in the flange), or exchanged links; the images do not show which "
+        f"of them. If the poses are inverse, {stated}; if the links are exchanged, {exchanged}",
+        f"If camera {camera.name!r} is on link {camera.link!r}, invert the poses, or add --mend "
+        f"poses:inverse; if it is on link {board.link!r}, exchange the links in the rig file.",
+    )
+
+
+def _distance(pose: Array, mount: Mount) -> str:
+    """Format the distance of a pose in the frame of an end from the link of a mount."""
+    size = float(np.linalg.norm(pose[:3, 3] - mount.link_pose[:3, 3]))
+    return format_quantity(size, "m", 0.03 * size)
+
+
+def _poses_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
+    """Describe the stated poses that are inverse, or else the one that differs most."""
+    held = held_entries(hand_eye.data, hand_eye.known)
+    found = pose_differences(select_images(hand_eye.data), state.values, held)
+    wrong = [each for each in found if each.is_inverse] or [max(found, key=lambda each: each.size)]
+    sets = " and ".join(dict.fromkeys(each.entry.partition("_")[0] for each in wrong))
+    remedies = " ".join(dict.fromkeys(each.remedy for each in wrong))
+    return " and ".join(each.text for each in wrong), f"{remedies} Or add {sets} to --parameters."
 
 
 def _size_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:

@@ -254,6 +254,23 @@ def describe_outlying_end(parts: Sequence[tuple[Measurement, Array]], has_holdou
     return texts
 
 
+def count_outlying_images(parts: Sequence[tuple[Measurement, Array]]) -> list[tuple[str, int, int]]:
+    """Count the images of each of several cameras all of whose corners are outliers, and all of its images.
+
+    Each part of a file has a mask (m,) of the samples that are no outliers. One camera has no count.
+    """
+    counts: dict[str, list[int]] = {}
+    for (_, camera), images in _images_of_cameras(parts).items():
+        count = counts.setdefault(camera, [0, 0])
+        count[0] += sum(is_outlying for _, _, is_outlying in images)
+        count[1] += len(images)
+    return (
+        [(name, n_outliers, n_images) for name, (n_outliers, n_images) in counts.items()]
+        if len(counts) > 1
+        else []
+    )
+
+
 def _images_of_cameras(
     parts: Sequence[tuple[Measurement, Array]],
 ) -> dict[tuple[str, str], list[tuple[int, str, bool]]]:

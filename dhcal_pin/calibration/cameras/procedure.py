@@ -30,7 +30,6 @@ from ...robot.chain import Chain
 from ..result import Result, make_result
 from ..reweighting import Fit, reweight
 from .arm_types import CORNERS, IMAGES, ArmType
-from .axis_order import Exchange, axis_stages
 from .board_size import BoardSize, find_board_size
 from .diagnosis import HandEyeFit
 from .gate import GatedFit, apply_gate, judge_stages, judge_target_points, residual_jitter, without_arm
@@ -38,6 +37,7 @@ from .image_checks import find_unrelated_images, seen_ranges_warning
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
+from .mistakes import RigMistakes
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
@@ -116,7 +116,7 @@ def calibrate_images(
     fit: Fit,
     chain: Chain,
     holdout: tuple[Measurement, ...],
-    exchanges: Sequence[Exchange],
+    mistakes: RigMistakes,
     families: Sequence[str],
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
@@ -145,7 +145,7 @@ def calibrate_images(
     gated, extension = add_joint_errors(gated, families, fitting.max_iterations)
     stages = judge_stages(ungated, gated, points, fitting.max_iterations)
     gate = gated.gate
-    warnings = [exchange.sentence for exchange in exchanges]
+    warnings = mistakes.sentences
     if has_arm:
         warning = seen_ranges_warning(chain, gated.fit.data) if gate.is_open else gate.sentence
         warnings += [warning] if warning else []
@@ -153,7 +153,7 @@ def calibrate_images(
         make_result(gated.fit, 1.0, holdout, "lm"),
         extension=extension,
         input_warnings=tuple(warnings),
-        camera_stages=(*axis_stages(exchanges), *stages),
+        camera_stages=(*mistakes.stages, *stages),
         arm_type=fitting.arm_type,
     )
     if gate.is_open and fitted_error(gated.fit).pixels < max_error:

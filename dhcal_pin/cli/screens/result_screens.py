@@ -11,8 +11,7 @@ import numpy as np
 from ...calibration.evaluation import Accuracy
 from ...calibration.summary import STATISTIC_LABELS, statistic
 from ...diagnostics.inspection import FileInspection, column_table
-from ...formatting import Quantity, Table, format_count, list_first, texts_by_file
-from ...io.tables import format_lines
+from ...formatting import Quantity, Table, format_count, format_lines, list_first, texts_by_file
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
 from ...report.changes import difference_table

@@ -26,6 +26,7 @@ from ... import se3
 from ..._frozen import frozen
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError, SampleError
+from ...formatting import format_lines
 from ...measurements.base import Measurement
 from ...measurements.euler_angles import ROTATION_VECTOR
 from ...measurements.mounting import MountedRig
@@ -33,7 +34,7 @@ from ...measurements.pose import Pose, PoseMeasurement
 from ...robot.chain import Chain
 from ...robot.conditions import CONDITIONS, Condition, directions_in_order
 from ...units import LENGTHS, MASSES, TEMPERATURES, UNITS
-from ..tables import Column, DataTable, TextLayout, format_lines, read_table
+from ..tables import Column, DataTable, TextLayout, read_table
 from .columns import (
     AFTER,
     COMMANDED,

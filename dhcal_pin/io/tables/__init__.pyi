@@ -6,7 +6,6 @@ from .sources import TableFormat as TableFormat
 from .sources import read_table as read_table
 from .table import Column as Column
 from .table import DataTable as DataTable
-from .table import format_lines as format_lines
 from .text import SEPARATORS as SEPARATORS
 from .text import TextLayout as TextLayout
 from .text import parse_lines as parse_lines

@@ -17,7 +17,6 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from contextlib import contextmanager, suppress
 from dataclasses import field, replace
 from functools import cached_property
-from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +24,7 @@ import numpy as np
 from ..._frozen import frozen
 from ..._typing import Array
 from ...exceptions import DhcalError, FileFormatError, UnknownNameError
+from ...formatting import format_lines
 from ...messages import quote
 from ...units import MAX_SI_VALUE, UNITS
 from ..tabular import parse_number
@@ -49,8 +49,6 @@ _UNIT_SYNONYMS = {"\u00b0": "deg", "\u00ba": "deg"}
 _HEADER = re.compile(r"\s*((?:[^\[\]]|\[\d+\])+?)\s*(?:\[(?!\d+\])\s*([^\[\]]*?)\s*\])?\s*")
 # Least number of names in a header, and of numbers in a row under it.
 _MIN_COLUMNS = 3
-# Largest number of lines, or of runs of lines, that a message lists.
-MAX_LISTED_RUNS = 100
 # Header of a measurement file, as an example in messages.
 MEASUREMENT_HEADER = "joint_1[deg],…,x[mm],y[mm],z[mm]"
 
@@ -387,16 +385,3 @@ class _ColumnRows(Sequence[list[str]]):
             for column in self._columns
         ]
         return _ColumnRows(columns, len(rows))
-
-
-def format_lines(lines: Iterable[int]) -> str:
-    """Return line numbers as text: up to MAX_LISTED_RUNS runs of them, then how many lines follow.
-
-    >>> format_lines([2, 5, 6, 7, 11])
-    '2, 5-7, 11'
-    """
-    groups = groupby(enumerate(lines), lambda pair: pair[1] - pair[0])
-    runs = [[line for _, line in pairs] for _, pairs in groups]
-    parts = [str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs[:MAX_LISTED_RUNS]]
-    n_more = sum(map(len, runs[MAX_LISTED_RUNS:]))
-    return ", ".join(parts) + f" and {n_more} more" * bool(n_more)

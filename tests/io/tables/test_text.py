@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from robots import SCARA, write
 
 from dhcal_pin.exceptions import DhcalError, FileFormatError, UnknownNameError
+from dhcal_pin.formatting import format_lines
 from dhcal_pin.io import read_dh, read_measurements, read_toml
-from dhcal_pin.io.tables import DataTable, TextLayout, format_lines, read_table
+from dhcal_pin.io.tables import DataTable, TextLayout, read_table
 from dhcal_pin.io.tables import table as tables
 from dhcal_pin.io.tabular import csv_text, require_usable_names
 from dhcal_pin.robot import Chain

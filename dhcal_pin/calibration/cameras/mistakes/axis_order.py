@@ -14,17 +14,17 @@ from functools import partial
 
 import numpy as np
 
-from ..._frozen import frozen
-from ..._typing import Array
-from ...estimation.error_model import ErrorModel
-from ...estimation.problem import Problem, merge_instrument_parameters
-from ...estimation.solver import minimize
-from ...exceptions import DhcalError
-from ...measurements.base import Measurement
-from ...measurements.camera import CameraCorners, change_images, select_images
-from ...robot.chain import Chain
-from ..reweighting import Fit
-from .stages import ImageError, Stage, fitted_error
+from ...._frozen import frozen
+from ...._typing import Array
+from ....estimation.error_model import ErrorModel
+from ....estimation.problem import Problem, merge_instrument_parameters
+from ....estimation.solver import minimize
+from ....exceptions import DhcalError
+from ....measurements.base import Measurement
+from ....measurements.camera import CameraCorners, change_images, select_images
+from ....robot.chain import Chain
+from ...reweighting import Fit
+from ..stages import ImageError, Stage, fitted_error
 
 
 @frozen
