@@ -255,7 +255,8 @@ SMALLER = {
         'holdout=held, extend="none")': 'holdout=held, extend="none", session="off")',
     },
     "03_without_an_instrument": {
-        "pair in touches.items():\n    chain": "pair in list(touches.items())[::2]:\n    chain"
+        "pair in touches.items():\n    chain": "pair in list(touches.items())[::2]:\n    chain",
+        '"placement,tool", extend="none")': '"placement,tool", extend="none", session="off")',
     },
     "04_plan_and_trust": {
         **{"in range(40)": "in range(12)", "uniform(-1, 1, 40)": "uniform(-1, 1, 12)"},

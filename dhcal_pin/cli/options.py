@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -337,9 +337,14 @@ def read_mounted_rig(path: str | None, sidecar: str | None, chain: Chain) -> Mou
 
 
 def read_data(
-    args: argparse.Namespace, chain: Chain, servos: ServoFile | None, rig: MountedRig | None = None
+    args: argparse.Namespace,
+    chain: Chain,
+    servos: ServoFile | None,
+    rig: MountedRig | None = None,
+    holdout: Sequence[str] = (),
+    max_rows: int | None = None,
 ) -> list[MeasurementFile]:
-    """Read the measurement files of a command by its options."""
+    """Read the measurement files of a command or a job by its options, and further hold-out files."""
     from ..io import read_measurement_file  # lazy import: loads Pinocchio
 
     return [
@@ -351,8 +356,9 @@ def read_data(
             rig=rig,
             servos=servos,
             sheet=args.sheet,
+            max_rows=max_rows,
         )
-        for path in args.data or []
+        for path in (*(args.data or ()), *holdout)
     ]
 
 

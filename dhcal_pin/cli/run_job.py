@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 import re
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
@@ -39,7 +40,7 @@ from ..estimation.parameters import LOW_COST
 from ..estimation.robust import ZERO_WEIGHT
 from ..exceptions import FileFormatError, InvalidArgumentError, NotObservableError, UnknownNameError
 from ..formatting import texts_by_file
-from ..io.measurement_files import MeasurementFile, read_measurement_file
+from ..io.measurement_files import MeasurementFile
 from ..io.rig_file import read_rig
 from ..io.robot import read_robot
 from ..io.settings import parse_payload, read_bounds, read_priors
@@ -65,7 +66,7 @@ from .job_outputs import (
     robot_ending,
     robot_stem,
 )
-from .options import split_commas
+from .options import read_data, split_commas
 from .output_table import Makers, file_contents, paths_by_name, require_endings
 from .outputs import (
     existing_sidecars,
@@ -317,21 +318,11 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
     by_file: dict[str, Measurement] = {}
     rig = mount_rig(read_rig(job.rig), chain) if job.rig else None
     limited = plausibility.with_wide_limits(chain) if LOW_COST in chain.parameters else chain
-    paths = [*job.data, *filter(None, [holdout_file])]
-    files = [
-        read_measurement_file(
-            path,
-            chain,
-            job.columns,
-            skip_bad_rows=job.skip_bad_rows,
-            rig=rig,
-            servos=servos,
-            sheet=job.sheet,
-            max_rows=MAX_FILE_ROWS,
-        )
-        for path in paths
-    ]
-    files, changes = _mended(chain, files, job.mend)
+    further = [holdout_file] if holdout_file else []
+    paths = [*job.data, *further]
+    files, changes = _mended(
+        chain, read_data(Namespace(**vars(job)), chain, servos, rig, further, MAX_FILE_ROWS), job.mend
+    )
     for path, measured in zip(paths, files, strict=True):
         if not job.mend:
             require_joint_units(chain, measured)

@@ -99,21 +99,13 @@ def ldf(u: Array, k2: Array) -> Array:
 
         LDF1 = n·k2 (22),  LDF2 = o·k2 (23),  LDF3 = a·k2 (24),  LDF4 = LDF5 = LDF6 = 0 (28)
 
-    u and k2 are those of `thf`.
+    u and k2 are those of `thf`. LAF1 … LAF6, the motion per Δa, are these with k3 in place of k2.
     """
     linear = _dot_axes(u, k2)
     return np.concatenate([linear, np.zeros_like(linear)], -1)
 
 
-def laf(u: Array, k3: Array) -> Array:
-    """Return LAF1 … LAF6, the motion of the tool per Δa, shape (..., 6) [m/m, rad/m].
-
-        LAF1 = n·k3 (22),  LAF2 = o·k3 (23),  LAF3 = a·k3 (24),  LAF4 = LAF5 = LAF6 = 0 (28)
-
-    u and k3 are those of `alpf`.
-    """
-    linear = _dot_axes(u, k3)
-    return np.concatenate([linear, np.zeros_like(linear)], -1)
+laf = ldf
 
 
 def alpf(u: Array, k3: Array) -> Array:
