@@ -282,6 +282,117 @@ def test_what_remains_beside_a_named_change_is_no_single_second_change(n_seeds):
         assert "did not change" not in " ".join(result.reasons)
 
 
+def test_residuals_that_noise_does_not_explain_are_not_ok():
+    """The origin of the last joint moved by 0.7 mm, and no noise is stated."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    q = sim.test_q[:12]
+    bent = sim.model.copy()
+    bent.jointPlacements[sim.ids[5]] *= pin.SE3(np.eye(3), np.array([0.0, 0.0, 7e-4]))
+    points = np.array([(sim.base * arm * sim.tool).translation for arm in sim.poses(q, bent)])
+    data = Position(q, points + sim.rng.normal(0, NOISE, points.shape))
+    found = recheck(fit.chain, [data], fit.uncertainty)
+    assert (found.verdict, found.changes) == ("cannot say", ())
+    assert "state their noise by `--sigma`" in found.reasons[0]
+    assert found.residual_rms > 4 * found.expected_rms
+    # The remedy decides it, and the answer that is promised is given.
+    stated = recheck(fit.chain, [data], fit.uncertainty, noise=Noise(NOISE))
+    assert (stated.verdict, stated.what) == ("changed", "robot")
+    assert found.reasons[1].endswith(f"`changed`: {stated.reasons[0]}")
+    # A noise that is larger by far explains it, with a distance that the residuals do not contradict.
+    noisy = recheck(fit.chain, [data], fit.uncertainty, noise=Noise(3e-4), size=2e-3)
+    assert noisy.verdict == "ok"
+    assert stated_distance(noisy) > found.residual_rms / 2
+    # Without a calibration's noise, the residuals may be a change or noise.
+    unknown = recheck(fit.chain, [data], None, size=2e-3)
+    assert (unknown.verdict == "ok") <= (stated_distance(unknown) >= 0.99 * unknown.residual_rms)
+    assert recheck(fit.chain, [data], None, size=0.5 * unknown.residual_rms).verdict != "ok"
+
+
+def stated_distance(result: Recheck) -> float:
+    """Return the distance that a check excludes [m]."""
+    return 1e-3 * float(result.reasons[0].split("more than ")[1].split(" mm")[0])
+
+
+def test_a_noise_that_is_larger_than_stated_is_not_ok():
+    """Ten times the stated noise, which no change explains."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    points = measured(sim, sim.test_q[:14], Position, True)
+    points.positions()[:] += sim.rng.normal(0, 10 * NOISE, (14, 3))
+    assert recheck(fit.chain, [points], fit.uncertainty).verdict != "ok"
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([3, 30], {0}))
+@pytest.mark.parametrize(
+    ("factor", "verdicts"), [(1, {"ok"}), (2, {"ok", "cannot say"}), (5, {"cannot say"})]
+)
+def test_more_noise_than_that_of_the_calibration_is_no_change(factor, verdicts, n_seeds):
+    """An unchanged arm, measured by another instrument whose noise is not stated."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        data = measured(sim, rng.uniform(-2.5, 2.5, (12, 6)), Position, False)
+        more = NOISE * np.sqrt(factor**2 - 1)
+        noisy = Position(data.conditions().q, data.positions() + rng.normal(0, more, (12, 3)))
+        found = recheck(fit.chain, [noisy], fit.uncertainty)
+        assert found.verdict in verdicts
+        if found.verdict == "ok":
+            assert stated_distance(found) >= 0.99 * found.residual_rms
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([2, 20], {0}))
+@pytest.mark.parametrize("size", [8e-4, 2e-3])
+def test_an_instrument_that_moved_during_the_check_is_named_with_its_line(size, n_seeds):
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        first = int(rng.integers(4, 9))
+        data = measured(sim, rng.uniform(-2.5, 2.5, (12, 6)), Position, True)
+        data.positions()[first:] += size * sim.direction()
+        found = recheck(fit.chain, [data], fit.uncertainty)
+        assert (found.verdict, found.what) == ("changed", f"base from sample {first + 1} on")
+        (change,) = found.changes
+        assert abs(change.size - size) < 4 * change.std
+        assert found.reasons[0].endswith(f" from sample {first + 1} on.")
+        assert "the samples fit to the calibrated arm" in found.reasons[1]
+        # The remedy: what was measured before and after has one base each.
+        rest = measured(sim, data.conditions().q, Position, True)
+        assert recheck(fit.chain, [rest], fit.uncertainty).verdict == "ok"
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([2, 20], {0}))
+def test_changes_of_the_arm_are_no_motion_of_the_instrument(n_seeds):
+    """Two zeros, or the origin of a joint, changed before the check."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(-2.5, 2.5, (12, 6))
+        zeros = 2e-3 * np.isin(np.arange(6), rng.choice(np.arange(1, 5), 2, replace=False))
+        bent = sim.model.copy()
+        shift = pin.SE3(np.eye(3), 1e-3 * sim.direction())
+        bent.jointPlacements[sim.ids[int(rng.integers(1, 6))]] *= shift
+        points = np.array([(sim.base * arm * sim.tool).translation for arm in sim.poses(q, bent)])
+        for data in (
+            measured(sim, q, Position, True, zeros=zeros),
+            Position(q, points + rng.normal(0, NOISE, points.shape), NOISE),
+        ):
+            found = recheck(fit.chain, [data], fit.uncertainty)
+            assert found.verdict != "ok"
+            assert "the samples fit to the calibrated arm" not in " ".join(found.reasons)
+
+
+def test_a_motion_during_the_check_is_named_as_possible_if_the_samples_do_not_exclude_it():
+    """With two samples after it, a motion of the instrument is one of several explanations."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    data = measured(sim, sim.test_q[:5], Position, True)
+    data.positions()[3:] += np.array([2e-3, -1e-3, 3e-3])
+    found = recheck(fit.chain, [data], fit.uncertainty)
+    assert (found.verdict, found.what) == ("changed", "robot")
+    assert "or the base or the instrument moved during the check, from sample 4 on." in found.reasons[0]
+    zeros = np.deg2rad([0.0, 0.5, -0.4, 0.6, 0.5, 0.0])
+    arm = measured(sim, sim.test_q[:10], Position, True, zeros=zeros)
+    assert "instrument" not in recheck(fit.chain, [arm], fit.uncertainty).reasons[0]
+
+
 def test_missing_columns_are_named():
     """Elasticity needs the payload only if the calibration had several."""
     chain, _ = conditional("compliance", -3e-5)
