@@ -106,6 +106,9 @@ MAX_EQUAL = 12.0
 HIDING_RATIO = 3.0
 # Standard deviation of a temperature that is not stated, from the reference of the calibration [K].
 TEMPERATURE_STD = MAX_RISE
+# Error of the yielding of joints to a payload beyond those of the calibration, as a share of the yielding to
+# the excess. A centre of mass that is 80 mm from that of the model makes a tenth in a UR10.
+EXTRAPOLATION_ERROR = 0.3
 # Step below which a linearization is kept, as a displacement of the tool [m].
 STEP_TOL = 1e-6
 
@@ -294,7 +297,7 @@ class _CheckModel:
             # temperature or payload may be that of all samples, or differ.
             conditions = self._unknown_conditions(item)
             common, parts = [conditions.reshape(-1, conditions.shape[2])], [conditions]
-            parts.append(self._unknown_directions(item))
+            parts += [self._unknown_directions(item), self._extrapolated_yielding(item)]
             if uncertainty is not None:
                 uncertain, model = self._uncertain_rows(item, uncertainty)
                 common.append(uncertain)
@@ -355,6 +358,37 @@ class _CheckModel:
                 out[..., i] = (moved - at).T
         return out
 
+    def _extrapolated_yielding(self, item: Measurement) -> Array:
+        """Return the whitened errors (m, k, 6) of the yielding to what exceeds the calibrated payloads."""
+        conditions = item.conditions()
+        if (mass := conditions.payload) is None or not self._is_extrapolated(item):
+            return np.zeros((len(item.rows), item.residual_dim, 0))
+        calibrated = np.clip(mass, *self.calibrated_payloads)
+        known = replace(conditions, payload=calibrated)
+        moved = se3.inverse(self.chain.poses(known)) @ self.chain.poses(conditions)
+        # Of the size that all samples with such a payload have on average: the centre may be another one.
+        is_beyond = mass != calibrated
+        sizes = [se3.rms_length(part) for part in np.split(se3.log6(moved)[is_beyond], 2, axis=1)]
+        errors = np.diag(EXTRAPOLATION_ERROR * np.repeat(sizes, 3))[..., None] * is_beyond
+        return self._observed(item, self.chain.forward_kinematics(conditions), errors)
+
+    def _is_extrapolated(self, item: Measurement) -> bool:
+        """Return whether a payload, to which the joints yield, is beyond those of the calibration."""
+        mass, (low, high) = item.conditions().payload, self.calibrated_payloads
+        is_elastic = COMPLIANCE in {family.name for family in self.chain.error_families}
+        return is_elastic and mass is not None and bool(np.any((mass < low) | (mass > high)))
+
+    @property
+    def has_extrapolated_payloads(self) -> bool:
+        """Whether a payload, to which the joints yield, is beyond those of the calibration."""
+        return any(self._is_extrapolated(item) for item in self.data)
+
+    @property
+    def calibrated_payloads(self) -> tuple[float, float]:
+        """Smallest and largest payload of the calibration [kg]."""
+        mass = self.chain.payload.mass if self.chain.payload else 0.0
+        return self.payloads or (mass, mass)
+
     def is_unknown(self, item: Measurement, condition: str) -> bool:
         """Return whether a condition of samples, on which the positions of the robot depend, is unknown."""
         known = item.recorded.names if item.recorded else ()
@@ -365,7 +399,7 @@ class _CheckModel:
         """Value of each condition with which the robot is modelled where it is unknown, and its spread."""
         families = {family.name for family in self.chain.error_families}
         mass = self.chain.payload.mass if self.chain.payload else 0.0
-        low, high = self.payloads or (mass, mass)
+        low, high = self.calibrated_payloads
         # A uniform distribution has the standard deviation of its width by √12.
         spread = np.hypot((high - low) / np.sqrt(12), (low + high) / 2 - mass) if high > low else 0.0
         return {
@@ -728,6 +762,10 @@ def _answer(
         verdict, reasons, changes, has_several = _verified(model, group)
     if verdict == "cannot say" and (columns := model.unknown_columns):
         reasons = [*reasons, f"State the conditions of the samples: {join_names(columns)}."]
+    if verdict == "cannot say" and model.has_extrapolated_payloads:
+        low, high = model.calibrated_payloads
+        masses = f"{low:g} to {high:g} kg" if low < high else f"{high:g} kg"
+        reasons = [*reasons, f"The payload is beyond that of the calibration; measure with {masses}."]
     residual, expected = (model.with_known_noise() or model).position_rms()
     return Recheck(
         verdict,
@@ -896,7 +934,8 @@ def _contradiction(judge: _CheckModel, is_stated: bool, size: float) -> list[str
     answer = _answer(judge, *judge.judged(), size)
     return [
         f"The positions differ by {rms} RMS, and noise and uncertainty of the calibration explain "
-        f"{expected}. Either these measurements have more noise, or the robot changed: state their noise by `--sigma`.",
+        f"{expected}. Either these measurements have more noise, or the robot changed: state their noise by "
+        "`--sigma`.",
         f"With the noise of the calibration, the answer is `{answer.verdict}`: {answer.reasons[0]}",
     ]
 

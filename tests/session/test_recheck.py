@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from command_line import error_of, json_of
-from robots import nominal_arm
+from robots import ARMS, nominal_arm, robot_file
 from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
@@ -445,6 +445,52 @@ def test_unknown_conditions_count_as_uncertainty(family, size, condition, values
             assert recheck(chain, [unstated], size=5e-3).verdict != "ok"
         moved = Position(q, points + np.array([0.02, 0.0, 0.0]), NOISE)
         assert recheck(chain, [moved], **keywords).what == "base"
+
+
+@pytest.mark.parametrize("n_times", some_slow([2, 20], {0}))
+def test_a_payload_beyond_those_of_the_calibration_counts_as_uncertainty(n_times):
+    """Its centre is 80 mm from that of the model, which has no large effect with the calibrated payloads."""
+    chain, rng = conditional("compliance", -3e-5)
+    true = chain.with_payload(Payload(5.0, (0.0, 0.05, 0.18)))
+    keywords = {"payloads": (0.0, 3.0), "size": 5e-3}
+    for _ in range(n_times):
+        q, masses = rng.uniform(-2, 2, (14, 6)), np.full(14, 12.0)
+        points = true.poses(Conditions(q, payload=masses))[:, :3, 3] + rng.normal(0, NOISE, (14, 3))
+        data = Position(q, points, NOISE).with_conditions(payload=masses)
+        assert recheck(chain, [data], **keywords).verdict == "ok"
+        assert recheck(chain, [data], payloads=(0.0, 12.0), size=5e-3).verdict != "ok"
+        moved = Position(q, points + np.array([0.02, 0.0, 0.0]), NOISE).with_conditions(payload=masses)
+        assert recheck(chain, [moved], **keywords).what == "base"
+
+
+def test_a_payload_beyond_those_of_the_calibration_is_no_mistake_of_the_file(tmp_path: Path, capsys):
+    """An elastic arm that was calibrated with 0 to 5 kg, now with 10 kg in all rows."""
+    chain, rng = conditional("compliance", -3e-5)
+    chain = chain.with_payload(None)
+
+    def write(name: str, count: int, masses: np.ndarray) -> str:
+        q = rng.uniform(-2, 2, (count, 6))
+        points = chain.poses(Conditions(q, payload=masses))[:, :3, 3] + rng.normal(0, NOISE, (count, 3))
+        data = Position(q, points, NOISE).with_conditions(payload=masses)
+        (tmp_path / name).write_text(measurement_text(data, chain, []))
+        return str(tmp_path / name)
+
+    fitted = write("fitted.csv", 70, rng.choice([0.0, 2.0, 5.0], 70))
+    robot = str(tmp_path / "cal.urdf")
+    source = str(robot_file(ARMS["ur10"][0]))
+    parameters = "minimal,base,tool,compliance"
+    assert main(["calibrate", source, fitted, "--tip", "tool0", "--parameters", parameters, "-o", robot]) == 0
+    for mass, has_note in ((10.0, True), (5.0, False)):
+        file = write(f"{mass:g}.csv", 12, np.full(12, mass))
+        for command in ("recheck", "validate"):
+            capsys.readouterr()
+            assert main([command, robot, file, "--tip", "tool0", "--json", "-"]) == 0
+            answer = json.loads(capsys.readouterr().out)
+            text = " ".join(answer["warnings"])
+            assert "--payload" not in text
+            assert ("the payload is 10 kg in lines" in text) == has_note
+            assert ("the calibration has 0 to 5 kg" in text) == has_note
+            assert answer.get("verdict", "ok") == "ok" or command == "validate"
 
 
 @pytest.mark.parametrize("n_known", [0, 9, 10])

@@ -111,6 +111,7 @@ def run(args: Namespace) -> int:
         for text in (
             *file.notes,
             *diagnostics.find_unstated_conditions(chain, known_conditions([file.data]), payloads),
+            *diagnostics.find_payload_notes(chain, file, payloads),
         )
     ]
     now = Check.of(result, args.robot, args.data)

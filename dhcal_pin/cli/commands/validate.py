@@ -116,6 +116,7 @@ def run(args: Namespace) -> int:
         for text in (
             *file.notes,
             *diagnostics.find_unstated_conditions(given.chain, known_conditions([file.data]), payloads),
+            *diagnostics.find_payload_notes(given.chain, file, payloads),
         )
     ]
     extrapolation = given.region and diagnostics.find_extrapolation(
