@@ -223,6 +223,47 @@ def recheck(
     return _answer(model, *model.judged(), size)
 
 
+def find_excess_error(
+    chain: Chain,
+    data: Sequence[Measurement],
+    uncertainty: Uncertainty,
+    *,
+    known: Mapping[str, float] | None = None,
+    payloads: tuple[float, float] | None = None,
+) -> tuple[float, float] | None:
+    """Return the RMS error of positions and that of the calibration [m] if the first is clearly larger."""
+    if not can_have_session(data) or not measures_positions(data):
+        return None
+    if (noise := _calibration_noise(uncertainty, data)) is None:
+        return None
+    step = -(-sum(item.residual_dim * len(item.rows) for item in data) // MAX_ROWS)
+    thinned = [_with_least_noise(item.take(np.s_[::step]), noise) for item in data]
+    model = _CheckModel(chain, tuple(thinned), uncertainty, known or {}, payloads)
+    if model.numbers[-1] + 1 < MIN_SAMPLES or model.unchanged_p_value() >= MAX_FALSE_ALARMS:
+        return None
+    rms, expected = model.position_rms()
+    return (rms, expected) if rms > MAX_NOISE_RATIO * expected else None
+
+
+def _calibration_noise(uncertainty: Uncertainty | None, data: Sequence[Measurement]) -> Noise | None:
+    """Return the noise of a calibration; None if it is not known for all that is measured."""
+    stated = uncertainty.fit.residual_std if uncertainty and uncertainty.fit else None
+    if stated is None or not stated[0]:
+        return None
+    if not stated[1] and any(hasattr(item, "rotation_sigma") for item in data):
+        return None
+    return Noise(*(max(each, MIN_NOISE) for each in stated))
+
+
+def _with_least_noise(item: Measurement, noise: Noise) -> Measurement:
+    """Return a measurement with its stated standard deviations, but no smaller ones than those of a noise."""
+    least = _with_noise(item, noise)
+    if not item.has_stated_sigma:
+        return least
+    names = [name for name in ("sigma", "rotation_sigma") if hasattr(item, name)]
+    return item.replace(**{name: np.maximum(getattr(item, name), getattr(least, name)) for name in names})
+
+
 def _with_noise(item: Measurement, noise: Noise) -> Measurement:
     """Return a measurement with other standard deviations."""
     values = {"sigma": np.full_like(item.sigma, noise.position), "has_stated_sigma": True}
@@ -677,12 +718,9 @@ class _CheckModel:
         """Return a model with the noise of the calibration where none is stated; None if it is not known."""
         if all(item.has_stated_sigma for item in self.data):
             return self
-        stated = self.uncertainty.fit.residual_std if self.uncertainty and self.uncertainty.fit else None
-        if stated is None or not stated[0]:
+        noise = _calibration_noise(self.uncertainty, self.data)
+        if noise is None:
             return None
-        if not stated[1] and any(hasattr(item, "rotation_sigma") for item in self.data):
-            return None
-        noise = Noise(*(max(each, MIN_NOISE) for each in stated))
         data = [item if item.has_stated_sigma else _with_noise(item, noise) for item in self.data]
         return _CheckModel(self.chain, tuple(data), self.uncertainty, self.known, self.payloads)
 

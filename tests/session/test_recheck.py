@@ -25,7 +25,7 @@ from dhcal_pin.planning import change_options, plan
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.robot.transmission import Payload
-from dhcal_pin.session import Recheck, recheck
+from dhcal_pin.session import Recheck, find_excess_error, recheck
 from dhcal_pin.session.check import WIDTHS, _CheckModel
 
 STILL = pin.SE3.Identity()
@@ -391,6 +391,57 @@ def test_a_motion_during_the_check_is_named_as_possible_if_the_samples_do_not_ex
     zeros = np.deg2rad([0.0, 0.5, -0.4, 0.6, 0.5, 0.0])
     arm = measured(sim, sim.test_q[:10], Position, True, zeros=zeros)
     assert "instrument" not in recheck(fit.chain, [arm], fit.uncertainty).reasons[0]
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([1, 6], {0}))
+@pytest.mark.parametrize(("arm", "kind"), [("ur10", Position), ("panda", Pose)])
+def test_an_error_that_is_larger_than_that_of_the_calibration(arm, kind, n_seeds):
+    """A zero that is off by 1 mrad; 8 and 14 samples, and more than a check takes."""
+    for seed in range(n_seeds):
+        sim, fit, _ = calibrated(arm, seed, kind)
+        zeros = 1e-3 * np.eye(sim.chain.n_joints)[2]
+        for count, is_stated in product((8, 14, 200), (True, False)):
+            q = sim.test_q[:count]
+            same = measured(sim, q, kind, is_stated)
+            assert find_excess_error(fit.chain, [same], fit.uncertainty) is None
+            other = measured(sim, q, kind, is_stated, zeros=zeros)
+            found = find_excess_error(fit.chain, [other], fit.uncertainty)
+            assert found is not None
+            true = fit.chain.poses(q)[:, :3, 3] - other.positions()
+            assert found[0] == pytest.approx(np.sqrt(np.mean(np.sum(true**2, 1))), rel=0.15)
+            # About the noise, and the uncertainty of 60 samples.
+            assert np.sqrt(3) * 0.8 * NOISE < found[1] < np.sqrt(3) * 1.7 * NOISE
+        # Noise that is stated to be larger explains it.
+        coarse, q = Noise(20 * NOISE, 20 * ANGLE_NOISE), sim.test_q[:14]
+        other = measured(sim, q, kind, False, zeros=zeros)
+        values = other.positions() if kind is Position else other.poses
+        noises = (coarse.position,) if kind is Position else (coarse.position, coarse.rotation)
+        assert find_excess_error(fit.chain, [kind(q, values, *noises)], fit.uncertainty) is None
+
+
+def test_validate_says_that_the_error_is_larger_than_that_of_the_calibration(tmp_path: Path, capsys):
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    robot, file = tmp_path / "cal.urdf", tmp_path / "later.csv"
+    write_urdf(fit, robot)
+    inside = [row for row in sim.test_q if np.abs(row).max() < 2.0][:12]
+    for angle, hints in ((0.0, 0), (1.5e-3, 1)):
+        zeros = angle * np.eye(6)[2]
+        data = measured(sim, np.array(inside), Position, False, zeros=zeros)
+        file.write_text(measurement_text(data, fit.chain, []))
+        args = [str(robot), str(file), "--tip", "tool0", "--json", "-"]
+        assert main(["validate", *args]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        found = [text for text in answer["warnings"] if "times that of the calibration" in text]
+        assert len(found) == hints
+    ratio = float(found[0].split(" is ")[1].split(" times")[0])
+    usual = float(found[0].split("calibration, ")[1].split(" mm")[0])
+    assert ratio * usual == pytest.approx(1e3 * answer["after"]["position_rms_m"], rel=0.1)
+    # The command that it names finds the change.
+    assert main(["recheck", *args, "--sigma", "0.05mm"]) == 1
+    assert json.loads(capsys.readouterr().out)["what"] == "joint elbow_joint"
+    # With base and tool fitted, there is no such comparison.
+    assert main(["validate", *args, "--fit-frames"]) == 0
+    assert "times that of the calibration" not in capsys.readouterr().out
 
 
 def test_missing_columns_are_named():
