@@ -33,7 +33,12 @@ from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
 from ..calibration.session_check import ASSUMED_ORDER, has_assumed_directions
 from ..calibration.verdict import suggest_full_set
-from ..diagnostics.input_checks import find_value_warnings, poorly_fitted_files, require_joint_units
+from ..diagnostics.input_checks import (
+    find_payload_warnings,
+    find_value_warnings,
+    poorly_fitted_files,
+    require_joint_units,
+)
 from ..diagnostics.reachability import UnreachableRow, find_unreachable_rows
 from ..diagnostics.robot_checks import find_robot_warnings
 from ..estimation.parameters import LOW_COST
@@ -329,7 +334,10 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
         by_file[path] = measured.data
         notes[path] = list(measured.notes)
         # The values of a mended file are not those of its columns. The verdict looks for mixed-up columns.
-        warnings[path] = [] if job.mend else find_value_warnings(limited, measured)
+        warnings[path] = [
+            *([] if job.mend else find_value_warnings(limited, measured)),
+            *find_payload_warnings(limited, measured),
+        ]
         # Without base and tool it is not known where the robot can place the measured point.
         unreachable[path] = find_unreachable_rows(chain, measured) if has_known_frames else []
         if path == holdout_file:

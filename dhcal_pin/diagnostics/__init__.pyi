@@ -16,6 +16,7 @@ from .frames import fit_frames as fit_frames
 from .frames import frames_differ as frames_differ
 from .input_checks import file_notes as file_notes
 from .input_checks import find_input_warnings as find_input_warnings
+from .input_checks import find_payload_notes as find_payload_notes
 from .input_checks import find_unstated_conditions as find_unstated_conditions
 from .input_checks import find_value_warnings as find_value_warnings
 from .input_checks import fitted_warning as fitted_warning

@@ -45,6 +45,8 @@ _MIN_RADIANS_AS_DEG, _MAX_RADIANS_AS_DEG = 1.0, 2 * np.pi
 _MIN_SPREAD_RATIO = 5.0
 # Largest mass that a robot carries [kg].
 _MAX_PAYLOAD = 2500.0
+# Difference of two masses that counts as rounding [kg].
+_MASS_TOL = 1e-6
 # A joint may exceed its limits by this much without a warning [rad or m]; controllers round.
 _LIMIT_SLACK = 1e-3
 # Warning about a file that the calibration fitted.
@@ -121,8 +123,51 @@ def file_notes(
         for text in (
             *file.notes,
             *find_unstated_conditions(chain, known_conditions([file.data]), payloads),
+            *find_payload_notes(chain, file, payloads),
         )
     ]
+
+
+def find_payload_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
+    """Find payloads that bend no joint, or that the result of a calibration does not contain."""
+    masses = file.data.conditions().payload
+    if masses is None or not np.any(masses > 0) or np.any(masses > _MAX_PAYLOAD) or chain.payload is not None:
+        return []
+    option = "state mass and centre of the payload by --payload, such as 5kg@0,0,80mm"
+    if not PARAMETER_SETS[COMPLIANCE](chain):
+        return [f"the column of the payload has no effect, because the robot has no masses; {option}"]
+    if np.ptp(masses) == 0:
+        mass = f"{masses[0]:g} kg"
+        return [f"the payload is {mass} in all rows, but the result holds for the robot without it; {option}"]
+    return []
+
+
+def find_payload_notes(
+    chain: Chain, file: MeasurementFile, payloads: tuple[float, float] | None
+) -> list[str]:
+    """Name payloads beyond those of the calibration of a robot, from the smallest to the largest one."""
+    masses = file.data.conditions().payload
+    is_elastic = COMPLIANCE in {family.name for family in chain.error_families}
+    if masses is None or (payloads is None and not is_elastic):
+        return []
+    mass = chain.payload.mass if chain.payload else 0.0
+    low, high = payloads or (mass, mass)
+    is_beyond = (masses < low - _MASS_TOL) | (masses > high + _MASS_TOL)
+    if not is_beyond.any():
+        return []
+    beyond = _format_masses(masses[is_beyond].min(), masses[is_beyond].max())
+    calibrated = f"has {_format_masses(low, high)}" if high else "has no payload"
+    if is_elastic:
+        effect = "how far the joints yield is extrapolated, and its error is not known"
+    else:
+        effect = "the joints of the model do not yield, so that the column has no effect"
+    rows = _format_rows(file.data, is_beyond)
+    return [f"the payload is {beyond} in {rows}, and the calibration {calibrated}: {effect}"]
+
+
+def _format_masses(low: float, high: float) -> str:
+    """Return the text of a range of masses."""
+    return f"{low:g} kg" if high - low <= _MASS_TOL else f"{low:g} to {high:g} kg"
 
 
 def _check_fit(chain: Chain, file: MeasurementFile) -> list[str]:
@@ -151,7 +196,7 @@ def find_value_warnings(chain: Chain, file: MeasurementFile) -> list[str]:
         *_check_lengths(chain, file),
         *_check_rotations(file),
         *_check_limits(chain, file, too_far),
-        *_check_payload(chain, file),
+        *_check_masses(file),
         *_check_repetitions(file),
     ]
 
@@ -424,23 +469,13 @@ def _check_limits(chain: Chain, file: MeasurementFile, reported: Container[str])
     return out
 
 
-def _check_payload(chain: Chain, file: MeasurementFile) -> list[str]:
-    """Return a warning about masses of a payload that bend no joint, or that the result does not contain."""
+def _check_masses(file: MeasurementFile) -> list[str]:
+    """Return a warning about masses of a payload that no robot carries."""
     masses = file.data.conditions().payload
-    if masses is None or not np.any(masses > 0):
+    if masses is None or not np.any(is_heavy := masses > _MAX_PAYLOAD):
         return []
-    if np.any(is_heavy := masses > _MAX_PAYLOAD):
-        largest = f"{masses.max():g} kg in {_format_rows(file.data, is_heavy)}"
-        return [f"the payload is {largest}, more than any robot carries; check its unit, such as payload[g]"]
-    if chain.payload is not None:
-        return []
-    option = "state mass and centre of the payload by --payload, such as 5kg@0,0,80mm"
-    if not PARAMETER_SETS[COMPLIANCE](chain):
-        return [f"the column of the payload has no effect, because the robot has no masses; {option}"]
-    if np.ptp(masses) == 0:
-        mass = f"{masses[0]:g} kg"
-        return [f"the payload is {mass} in all rows, but the result holds for the robot without it; {option}"]
-    return []
+    largest = f"{masses.max():g} kg in {_format_rows(file.data, is_heavy)}"
+    return [f"the payload is {largest}, more than any robot carries; check its unit, such as payload[g]"]
 
 
 def _check_repetitions(file: MeasurementFile) -> list[str]:

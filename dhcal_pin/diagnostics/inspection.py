@@ -35,7 +35,7 @@ from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
 from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
 from ..units import ANGLES, LENGTHS
-from .input_checks import find_input_warnings, first_equal_rows
+from .input_checks import find_input_warnings, find_payload_warnings, first_equal_rows
 
 if TYPE_CHECKING:
     from ..calibration import Result
@@ -111,7 +111,8 @@ def inspect_file(
             lines = tuple(propose_map(table, chain))
             return replace(inspection, problem=header_problem(table, chain), column_map=lines)
         return replace(inspection, problem=str(error))
-    inspection, warnings, notes = _inspect_table(table, chain), find_input_warnings(chain, file), []
+    inspection, notes = _inspect_table(table, chain), []
+    warnings = [*find_input_warnings(chain, file), *find_payload_warnings(chain, file)]
     if (fit := _calibrated(chain, file)) is not None:
         # With other columns or units it may be a good calibration.
         notes = [] if warnings else _calibration_notes(fit)

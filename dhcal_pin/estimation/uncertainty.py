@@ -147,6 +147,17 @@ class ModelFit:
     residual_std: tuple[float, float] | None = None
 
 
+def link_twists(chain: Chain, frames: FrameBatch) -> Array:
+    """Compute the tool twist per unit of each body twist of base link and links, (6(k+1), 6, m)."""
+    n_bodies = len(chain.moving_joints) + 1
+    carry = np.tile(np.eye(4), (n_bodies, 1, 1))
+    carry[0] = se3.inverse(chain.base)
+    error_frames = np.repeat([link_frame(j) for j in range(n_bodies)], 6)
+    unit_twists = np.tile(np.eye(6), (n_bodies, 1))
+    bodies, twists = twists_in_bodies(chain, error_frames, unit_twists, carry.repeat(6, 0))
+    return chain.tool_jacobian(frames, bodies, twists)
+
+
 @frozen(eq=False)
 class Uncertainty:
     """Calibrated chain and the covariance of its errors.
@@ -236,14 +247,8 @@ class Uncertainty:
 
     def tool_twists(self, frames: FrameBatch, directions: Array) -> Array:
         """Compute the tool twists of directions in body twists and coefficients."""
-        chain, n_bodies = self.chain, len(self.chain.moving_joints) + 1
-        carry = np.tile(np.eye(4), (n_bodies, 1, 1))
-        carry[0] = se3.inverse(chain.base)
-        error_frames = np.repeat([link_frame(j) for j in range(n_bodies)], 6)
-        bodies, twists = twists_in_bodies(
-            chain, error_frames, np.tile(np.eye(6), (n_bodies, 1)), carry.repeat(6, 0)
-        )
-        out = np.tensordot(chain.tool_jacobian(frames, bodies, twists), directions[: len(bodies)], (0, 0))
+        chain, twists = self.chain, link_twists(self.chain, frames)
+        out = np.tensordot(twists, directions[: len(twists)], (0, 0))
         out = out.swapaxes(0, 1)
         if not len(self.entries):
             return out
@@ -253,7 +258,7 @@ class Uncertainty:
         angles = np.zeros((len(out), len(by_joint), directions.shape[1]))
         for joint in set(joints):
             moving = np.flatnonzero(np.array(joints) == joint)
-            angles[:, joint] = np.stack([terms[i] for i in moving], 1) @ directions[len(bodies) + moving]
+            angles[:, joint] = np.stack([terms[i] for i in moving], 1) @ directions[len(twists) + moving]
         out += by_joint.transpose(2, 1, 0) @ angles
         return out
 

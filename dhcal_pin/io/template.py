@@ -65,6 +65,7 @@ def with_kinematics(template: Chain, robot: Chain, path: PathLike) -> Chain:
             f"expected those of {robot.urdf.source}: {', '.join(robot.moving_joints)}"
         )
     old, given = np.array(_frames(template)), np.array(_frames(robot))
+    _require_same_place(template, robot, old, given, source)
     new = [
         _joint_frame(source, name, old[j], template.axes[j], given[j], robot.axes[j], template.prismatic[j])
         for j, name in enumerate(template.moving_joints)
@@ -79,6 +80,27 @@ def with_kinematics(template: Chain, robot: Chain, path: PathLike) -> Chain:
     if np.array_equal(joint_origins(filled)[1], np.eye(4)):
         return filled
     return _with_frames(template, [*new[:-1], given[-1] @ se3.inverse(template.origins[-1]), given[-1]])
+
+
+def _require_same_place(template: Chain, robot: Chain, old: Array, given: Array, source: str) -> None:
+    """Require that a robot is not that of the template at another place in its first link."""
+    moved = given[-1] @ se3.inverse(old[-1])
+    if _has_axes(template, old, robot, given) or not _has_axes(template, moved @ old, robot, given):
+        return
+    raise InvalidArgumentError(
+        f"{source}: the whole robot of {robot.urdf.source} is moved by {_size(moved)} in {robot.root}, as "
+        "by `dhcal calibrate --world-joint`, which writes the pose of the base into the URDF; calibrate "
+        "without it, so that the pose is in the sidecar only"
+    )
+
+
+def _has_axes(template: Chain, old: Array, robot: Chain, given: Array) -> bool:
+    """Return whether a template with these joint frames has the axes of a robot, but for a calibration."""
+    axes = [
+        _axis_motion(old[j], template.axes[j], given[j], robot.axes[j], template.prismatic[j])[0]
+        for j in range(len(template.moving_joints))
+    ]
+    return not any(each.exceeds(SAME_ROBOT) for each in axes)
 
 
 def _frames(chain: Chain) -> list[Array]:
@@ -103,20 +125,28 @@ def _joint_frame(
     has_same_axis = np.abs(axis - given_axis).max() <= _AXIS_TOL
     if has_same_axis and not _size(se3.inverse(given) @ old).exceeds(SAME_FRAME):
         return given
-    a, b = old[:3, :3] @ axis, given[:3, :3] @ given_axis
-    normal, shift = np.cross(a, b), np.zeros(3)
-    sine = float(np.linalg.norm(normal))
-    if not is_prismatic:
-        shift = given[:3, 3] - old[:3, 3]
-        shift -= (shift @ b) * b
-    motion = _Size(float(np.linalg.norm(shift)), math.atan2(sine, a @ b))
+    motion, shift, normal = _axis_motion(old, axis, given, given_axis, is_prismatic)
     if motion.exceeds(SAME_ROBOT):
         raise InvalidArgumentError(
             f"{source}: the axis of joint {quote(name)} is {motion} from that of the robot; expected the "
             "same robot with the same root, zero position and directions of its joints"
         )
+    sine = float(np.linalg.norm(normal))
     turn = se3.exp3(normal * (motion.angle / sine)) if sine else np.eye(3)
     return se3.transform(turn @ old[:3, :3], old[:3, 3] + shift)
+
+
+def _axis_motion(
+    old: Array, axis: Array, given: Array, given_axis: Array, is_prismatic: bool
+) -> tuple[_Size, Array, Array]:
+    """Return the smallest motion that puts an axis onto another one: size, shift, and normal of the turn."""
+    a, b = old[:3, :3] @ axis, given[:3, :3] @ given_axis
+    normal, shift = np.cross(a, b), np.zeros(3)
+    if not is_prismatic:
+        shift = given[:3, 3] - old[:3, 3]
+        shift -= (shift @ b) * b
+    angle = math.atan2(float(np.linalg.norm(normal)), a @ b)
+    return _Size(float(np.linalg.norm(shift)), angle), shift, normal
 
 
 def _size(motion: Array) -> _Size:

@@ -1,6 +1,7 @@
 """Public names of dhcal_pin.session; `__init__.py` loads each on first use."""
 
 from .check import Recheck as Recheck
+from .check import find_excess_error as find_excess_error
 from .check import recheck as recheck
 from .facts import History as History
 from .facts import Session as Session

@@ -18,9 +18,11 @@ residuals that are drawn from N(0, Σ). The change is named if its share of the 
 
 Changes may be large: the model is linearized again at the estimate of each hypothesis.
 
-If the noise is not known, any one change explains the samples with enough noise. What a named change leaves
-of the residuals is therefore compared with the noise of the calibration. If it is larger, a second change is
-looked for.
+If the noise is not known, any one change explains the samples with enough noise, and so does no change. What
+either leaves of the residuals is therefore compared with the noise of the calibration. If it is larger, a
+second change is looked for, or the answer is `cannot say`: the noise of another instrument may be larger.
+
+The base or the instrument may also have moved during the check, see `slip`.
 
 Reference: R. E. Kass and A. E. Raftery, Bayes Factors, J. American Statistical Association 90, 1995.
 
@@ -40,11 +42,12 @@ from scipy.linalg import block_diag
 from .. import se3
 from .._frozen import frozen
 from .._kernels import apply_observation_matrix
+from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import initialize_frames, make_problem
 from ..estimation.parameters import base
-from ..estimation.uncertainty import Uncertainty
+from ..estimation.uncertainty import Uncertainty, link_twists
 from ..exceptions import InvalidArgumentError
 from ..formatting import format_quantity, join_names
 from ..measurements.base import Measurement, Noise, instrument_values, residual_of
@@ -56,6 +59,7 @@ from .facts import cause_size
 from .linear_model import Layout, measures_positions, whitened_rows
 from .robot_changes import RobotChanges
 from .search import can_have_session
+from .slip import Slip, find_slip
 from .timeline import order_samples
 
 # Largest share of unchanged robots that are called changed.
@@ -98,8 +102,13 @@ LARGE_TURN = 0.01
 MAX_NOISE_RATIO, MIN_NOISE = 1.5, 1e-6
 # Difference of chi-square up to which two changes explain the samples equally well.
 MAX_EQUAL = 12.0
+# Number of standard deviations of the mean square of noise that a motion of the tool may be hidden in.
+HIDING_RATIO = 3.0
 # Standard deviation of a temperature that is not stated, from the reference of the calibration [K].
 TEMPERATURE_STD = MAX_RISE
+# Error of the yielding of joints to a payload beyond those of the calibration, as a share of the yielding to
+# the excess. A centre of mass that is 80 mm from that of the model makes a tenth in a UR10.
+EXTRAPOLATION_ERROR = 0.3
 # Step below which a linearization is kept, as a displacement of the tool [m].
 STEP_TOL = 1e-6
 
@@ -109,7 +118,7 @@ class Hypothesis:
     """Something that may have changed, with what the measurements say of it."""
 
     kind: str  #: "joint", "base", "tool", "robot" or "sample"
-    of: str  #: Name of the joint, or place of the sample; else empty
+    of: str  #: Name of the joint, place of the sample, or place from which on the base moved; else empty
     share: float  #: Share of its evidence in that of all changes
     size: float  #: Size of the change, signed for a joint, in `unit`; 0 for a robot or a sample
     std: float  #: Standard deviation of the size
@@ -154,7 +163,8 @@ class Recheck:
     log_ratio: float  # Logarithm of the ratio of the likelihoods with and without a change, less its limit
     samples: int  # Number of samples
     residual_rms: float  # RMS distance of the measured positions from those of the robot [m]
-    # RMS distance that noise and uncertainty of the calibration explain [m]; NaN if the noise is not known.
+    # RMS distance that noise and uncertainty of the calibration explain [m]. The noise is that of the
+    # calibration if no other is stated; NaN if neither is known.
     expected_rms: float
     has_several: bool = False  # Whether all of the changes happened, not one of them
 
@@ -211,6 +221,47 @@ def recheck(
         data = [_with_noise(item, noise) for item in data]
     model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
     return _answer(model, *model.judged(), size)
+
+
+def find_excess_error(
+    chain: Chain,
+    data: Sequence[Measurement],
+    uncertainty: Uncertainty,
+    *,
+    known: Mapping[str, float] | None = None,
+    payloads: tuple[float, float] | None = None,
+) -> tuple[float, float] | None:
+    """Return the RMS error of positions and that of the calibration [m] if the first is clearly larger."""
+    if not can_have_session(data) or not measures_positions(data):
+        return None
+    if (noise := _calibration_noise(uncertainty, data)) is None:
+        return None
+    step = -(-sum(item.residual_dim * len(item.rows) for item in data) // MAX_ROWS)
+    thinned = [_with_least_noise(item.take(np.s_[::step]), noise) for item in data]
+    model = _CheckModel(chain, tuple(thinned), uncertainty, known or {}, payloads)
+    if model.numbers[-1] + 1 < MIN_SAMPLES or model.unchanged_p_value() >= MAX_FALSE_ALARMS:
+        return None
+    rms, expected = model.position_rms()
+    return (rms, expected) if rms > MAX_NOISE_RATIO * expected else None
+
+
+def _calibration_noise(uncertainty: Uncertainty | None, data: Sequence[Measurement]) -> Noise | None:
+    """Return the noise of a calibration; None if it is not known for all that is measured."""
+    stated = uncertainty.fit.residual_std if uncertainty and uncertainty.fit else None
+    if stated is None or not stated[0]:
+        return None
+    if not stated[1] and any(hasattr(item, "rotation_sigma") for item in data):
+        return None
+    return Noise(*(max(each, MIN_NOISE) for each in stated))
+
+
+def _with_least_noise(item: Measurement, noise: Noise) -> Measurement:
+    """Return a measurement with its stated standard deviations, but no smaller ones than those of a noise."""
+    least = _with_noise(item, noise)
+    if not item.has_stated_sigma:
+        return least
+    names = [name for name in ("sigma", "rotation_sigma") if hasattr(item, name)]
+    return item.replace(**{name: np.maximum(getattr(item, name), getattr(least, name)) for name in names})
 
 
 def _with_noise(item: Measurement, noise: Noise) -> Measurement:
@@ -287,7 +338,7 @@ class _CheckModel:
             # temperature or payload may be that of all samples, or differ.
             conditions = self._unknown_conditions(item)
             common, parts = [conditions.reshape(-1, conditions.shape[2])], [conditions]
-            parts.append(self._unknown_directions(item))
+            parts += [self._unknown_directions(item), self._extrapolated_yielding(item)]
             if uncertainty is not None:
                 uncertain, model = self._uncertain_rows(item, uncertainty)
                 common.append(uncertain)
@@ -302,17 +353,29 @@ class _CheckModel:
             [uncertainty.sqrt_covariance, UNDETERMINED_SIZE * uncertainty.unbounded_directions], 1
         )
         frames, m = self.chain.forward_kinematics(item.conditions()), len(item.rows)
+        motions = uncertainty.tool_twists(frames, directions).transpose(2, 1, 0)
+        model_std = np.tile(np.diag(np.repeat(uncertainty.model_std, 3))[..., None], m)
+        parameters, model = (self._observed(item, frames, each) for each in (motions, model_std))
+        return parameters.reshape(-1, len(motions)), model
+
+    def _observed(self, item: Measurement, frames: FrameBatch, motions: Array) -> Array:
+        """Return the whitened effects (m, k, c) of twists (c, 6, m) of the tool."""
         u = instrument_values(item, self.problem.instruments(self.x))
         observation = item.observation_matrix(frames, u, item.residual(frames, u))
+        out = np.zeros((len(motions), item.residual_dim, motions.shape[2]))
+        apply_observation_matrix(np.ascontiguousarray(motions), observation, out)
+        return out.transpose(2, 1, 0)
 
-        def whitened(motions: Array) -> Array:
-            out = np.zeros((len(motions), item.residual_dim, motions.shape[2]))
-            apply_observation_matrix(np.ascontiguousarray(motions), observation, out)
-            return out.transpose(2, 1, 0)
-
-        motions = uncertainty.tool_twists(frames, directions).transpose(2, 1, 0)
-        model_std = np.diag(np.repeat(uncertainty.model_std, 3))
-        return whitened(motions).reshape(-1, len(motions)), whitened(np.tile(model_std[..., None], m))
+    @cached_property
+    def origins(self) -> list[Array]:
+        """Whitened effects of a motion of the origin of each joint but the first one, (n, 6) each."""
+        rows = []
+        for item in self.data:
+            frames = self.chain.forward_kinematics(item.conditions())
+            effects = self._observed(item, frames, link_twists(self.chain, frames))
+            rows.append(effects.reshape(-1, effects.shape[2]))
+        # The origin of the first joint moves with the base, and the last link with the tool.
+        return np.split(np.concatenate(rows), len(self.chain.moving_joints) + 1, axis=1)[1:-1]
 
     def _unknown_directions(self, item: Measurement) -> Array:
         """Return the whitened effects of the backlash of joints whose direction is unknown, (m, k, n)."""
@@ -336,6 +399,37 @@ class _CheckModel:
                 out[..., i] = (moved - at).T
         return out
 
+    def _extrapolated_yielding(self, item: Measurement) -> Array:
+        """Return the whitened errors (m, k, 6) of the yielding to what exceeds the calibrated payloads."""
+        conditions = item.conditions()
+        if (mass := conditions.payload) is None or not self._is_extrapolated(item):
+            return np.zeros((len(item.rows), item.residual_dim, 0))
+        calibrated = np.clip(mass, *self.calibrated_payloads)
+        known = replace(conditions, payload=calibrated)
+        moved = se3.inverse(self.chain.poses(known)) @ self.chain.poses(conditions)
+        # Of the size that all samples with such a payload have on average: the centre may be another one.
+        is_beyond = mass != calibrated
+        sizes = [se3.rms_length(part) for part in np.split(se3.log6(moved)[is_beyond], 2, axis=1)]
+        errors = np.diag(EXTRAPOLATION_ERROR * np.repeat(sizes, 3))[..., None] * is_beyond
+        return self._observed(item, self.chain.forward_kinematics(conditions), errors)
+
+    def _is_extrapolated(self, item: Measurement) -> bool:
+        """Return whether a payload, to which the joints yield, is beyond those of the calibration."""
+        mass, (low, high) = item.conditions().payload, self.calibrated_payloads
+        is_elastic = COMPLIANCE in {family.name for family in self.chain.error_families}
+        return is_elastic and mass is not None and bool(np.any((mass < low) | (mass > high)))
+
+    @property
+    def has_extrapolated_payloads(self) -> bool:
+        """Whether a payload, to which the joints yield, is beyond those of the calibration."""
+        return any(self._is_extrapolated(item) for item in self.data)
+
+    @property
+    def calibrated_payloads(self) -> tuple[float, float]:
+        """Smallest and largest payload of the calibration [kg]."""
+        mass = self.chain.payload.mass if self.chain.payload else 0.0
+        return self.payloads or (mass, mass)
+
     def is_unknown(self, item: Measurement, condition: str) -> bool:
         """Return whether a condition of samples, on which the positions of the robot depend, is unknown."""
         known = item.recorded.names if item.recorded else ()
@@ -346,7 +440,7 @@ class _CheckModel:
         """Value of each condition with which the robot is modelled where it is unknown, and its spread."""
         families = {family.name for family in self.chain.error_families}
         mass = self.chain.payload.mass if self.chain.payload else 0.0
-        low, high = self.payloads or (mass, mass)
+        low, high = self.calibrated_payloads
         # A uniform distribution has the standard deviation of its width by √12.
         spread = np.hypot((high - low) / np.sqrt(12), (low + high) / 2 - mass) if high > low else 0.0
         return {
@@ -539,6 +633,32 @@ class _CheckModel:
         expected = np.sqrt(variances.sum() / count) if len(self.noise_factors) == 1 else np.nan
         return float(np.sqrt(np.sum(residual**2) / count)), float(expected)
 
+    def hidden_motion(self) -> float:
+        """Return the RMS motion of the measured point that the residuals leave room for [m]."""
+        (rows, sigma), count = self._positions, self.numbers[-1] + 1
+        rms, expected = self.position_rms()
+        if np.isnan(expected):
+            return rms
+        axes = self.axes[rows] * sigma[:, None]
+        covariance = (axes * self.variances[0]) @ axes.T
+        std = np.sqrt(2 * np.sum(covariance**2)) / count
+        return min(rms, float(np.sqrt(max(rms**2 - expected**2, 0.0) + HIDING_RATIO * std)))
+
+    def place(self, sample: int) -> str:
+        """Return the line of a sample, or its number if it is from no file."""
+        file, line = [(item.source, int(row)) for item in self.data for row in item.rows][sample]
+        return f"line {line} of {file}" if file else f"sample {line}"
+
+    def slip(self) -> Slip:
+        """Find the sample from which on a base that moved explains the residuals best."""
+        *parts, robot = self.blocks
+        base_block = self._block("base")
+        moved = self.rows[:, base_block.columns]
+        others = [self.rows[:, each.columns[each.sizes > 0]] for each in (*parts, robot)]
+        pairs = [np.concatenate([moved, each], 1) for each in others]
+        whitening = self.axes.T / np.sqrt(self.variances[self.usual_noise])[:, None]
+        return find_slip(moved, self.rows[:, -1], whitening, self.numbers, [*others, *pairs, *self.origins])
+
     @cached_property
     def _sigma(self) -> Array:
         """Standard deviation of the position of each sample, (N,) [m]."""
@@ -572,10 +692,13 @@ class _CheckModel:
             size = float(np.linalg.norm(moved))
         return size, std, unit
 
+    def unchanged_p_value(self) -> float:
+        """Return the probability of larger residuals if nothing changed."""
+        chi_square = np.sum(self._scaled(self.rows[:, -1:], self.usual_noise) ** 2)
+        return _p_value(len(self.rows), float(chi_square))
+
     def explained(self, blocks: Sequence[Block], start: Array) -> Explained:
         """Fit several changes, from the values (p,) of the first one, and return what they leave."""
-        from scipy.special import chdtrc  # lazy import: slow
-
         columns, sizes = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("columns", "sizes"))
         values, effects, undone = self.estimate(Block("robot", "", columns, sizes), start)
         used = sizes > 0
@@ -586,7 +709,7 @@ class _CheckModel:
         covariance = np.zeros((len(values),) * 2)
         covariance[np.ix_(used, used)] = inverse @ inverse.T * np.outer(sizes[used], sizes[used])
         freedom, chi_square = len(left) - np.linalg.matrix_rank(a), float(np.sum(r**2))
-        p_value = float(chdtrc(freedom, chi_square / MAX_NOISE_RATIO**2)) if freedom > 0 else 1.0
+        p_value = _p_value(int(freedom), chi_square)
         rows, sigma = self._positions
         rms = float(np.sqrt(np.sum((left[rows] * sigma) ** 2) / (self.numbers[-1] + 1)))
         return Explained(values, covariance, rms, chi_square, p_value)
@@ -595,12 +718,9 @@ class _CheckModel:
         """Return a model with the noise of the calibration where none is stated; None if it is not known."""
         if all(item.has_stated_sigma for item in self.data):
             return self
-        stated = self.uncertainty.fit.residual_std if self.uncertainty and self.uncertainty.fit else None
-        if stated is None or not stated[0]:
+        noise = _calibration_noise(self.uncertainty, self.data)
+        if noise is None:
             return None
-        if not stated[1] and any(hasattr(item, "rotation_sigma") for item in self.data):
-            return None
-        noise = Noise(*(max(each, MIN_NOISE) for each in stated))
         data = [item if item.has_stated_sigma else _with_noise(item, noise) for item in self.data]
         return _CheckModel(self.chain, tuple(data), self.uncertainty, self.known, self.payloads)
 
@@ -618,6 +738,13 @@ class _CheckModel:
         effects = self.rows[rows][:, block.columns] * sigma[:, None] / np.sqrt(self.numbers[-1] + 1)
         r = np.linalg.qr(effects, mode="r")
         return REVEALED_RATIO * float(np.sqrt(max(np.linalg.eigvalsh(r @ covariance @ r.T).max(), 0.0)))
+
+
+def _p_value(freedom: int, chi_square: float) -> float:
+    """Return the probability of a larger chi-square if the noise is the largest one that is possible."""
+    from scipy.special import chdtrc  # lazy import: slow
+
+    return float(chdtrc(freedom, chi_square / MAX_NOISE_RATIO**2)) if freedom > 0 else 1.0
 
 
 def _log_sums(values: Array) -> Array:
@@ -656,10 +783,12 @@ def _answer(
             [f"{n_samples} samples are too few; expected at least {MIN_SAMPLES}."],
         )
     elif total <= limit:
-        verdict, reasons = _unchanged(hypotheses, size, model.hidden_joints)
+        verdict, reasons = _unchanged(model, hypotheses, size)
     elif best.kind == "sample":
         verdict = "cannot say"
         reasons = [f"The sample {best.of} does not fit to the others; measure it again."]
+    elif share < MIN_SHARE and (slipped := _slipped(model)):
+        verdict, reasons, changes, has_several = slipped
     elif share < MIN_SHARE:
         verdict = "cannot say"
         rivals = ", ".join(f"{each.name} ({100 * each.share:.0f} %)" for each in hypotheses[:3])
@@ -671,7 +800,11 @@ def _answer(
         verdict, reasons, changes, has_several = _verified(model, group)
     if verdict == "cannot say" and (columns := model.unknown_columns):
         reasons = [*reasons, f"State the conditions of the samples: {join_names(columns)}."]
-    residual, expected = model.position_rms()
+    if verdict == "cannot say" and model.has_extrapolated_payloads:
+        low, high = model.calibrated_payloads
+        masses = f"{low:g} to {high:g} kg" if low < high else f"{high:g} kg"
+        reasons = [*reasons, f"The payload is beyond that of the calibration; measure with {masses}."]
+    residual, expected = (model.with_known_noise() or model).position_rms()
     return Recheck(
         verdict,
         tuple(reasons),
@@ -708,6 +841,8 @@ def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
                 f"{_text_of_error(alone.rms)} RMS, as noise and uncertainty explain."
             )
         return unverified
+    if slipped := _slipped(judge):
+        return slipped
     trials = [(each, judge.explained([block, each], start)) for each in parts if each is not block]
     trials = sorted(
         (pair for pair in trials if pair[1].p_value >= MAX_FALSE_ALARMS), key=lambda pair: pair[1].chi_square
@@ -717,7 +852,7 @@ def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
         changes = _both_changes(judge, block, *trials[0])
         return "changed", [_sentence([change]) for change in changes], changes, True
     if best.kind == "robot":
-        return unverified
+        return "changed", [_robot_sentence(judge)], tuple(group), False
     expected = _text_of_error(judge.position_rms()[1])
     which = [f"These samples do not show which: {_names(rivals)}."] if rivals else []
     reasons = [
@@ -727,6 +862,41 @@ def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
         "Measure more poses, as `dhcal plan --recheck` chooses them, or calibrate again.",
     ]
     return "cannot say", reasons, (), False
+
+
+def _slipped(model: _CheckModel) -> Finding | None:
+    """Return the answer if only a base that moved during the check explains the samples."""
+    judge = model.with_known_noise()
+    if judge is None:
+        return None
+    slip = judge.slip()
+    if not (slip.is_determined and _is_possible(slip) and slip.lead >= MAX_EQUAL):
+        return None
+    block = next(each for each in judge.blocks if each.kind == "base")
+    size = judge._size(block, slip.values, slip.covariance)
+    place = f"from {judge.place(slip.first)} on"
+    turn = _turn(block, slip.values, slip.covariance)
+    change = Hypothesis("base", place, 1.0, *size, 0.0, (), *turn)
+    reason = "Before and after, the samples fit to the calibrated arm. Fasten both, and measure again."
+    return "changed", [_sentence([change]), reason], (change,), False
+
+
+def _is_possible(slip: Slip) -> bool:
+    """Return whether a base that moved during the check explains the samples."""
+    return _p_value(slip.freedom, slip.chi_square) >= MAX_FALSE_ALARMS
+
+
+def _robot_sentence(judge: _CheckModel | None) -> str:
+    """Say that no single part changed, and whether the base may have moved during the check."""
+    slip = judge and judge.slip()
+    if slip and not (_is_possible(slip) and slip.lead > -MAX_EQUAL):
+        return "More than one part of the robot changed, or the origin of a joint: calibrate again."
+    place = f", from {judge.place(slip.first)} on" if judge and slip else ""
+    return (
+        "More than one part of the robot changed, or the origin of a joint, or the base or the instrument "
+        f"moved during the check{place}. Fasten both, and measure again; with the same answer, calibrate "
+        "again."
+    )
 
 
 def _names(blocks: Sequence[Block]) -> str:
@@ -763,36 +933,64 @@ def _text_of_error(value: float) -> str:
     return format_quantity(value, "m", value / 10)
 
 
-def _unchanged(hypotheses: list[Hypothesis], size: float, hidden_joints: list[str]) -> tuple[str, list[str]]:
+def _unchanged(model: _CheckModel, hypotheses: list[Hypothesis], size: float) -> tuple[str, list[str]]:
     """Return the verdict if nothing is known to have changed: `ok` if the check reveals what matters."""
+    judge = model.with_known_noise()
+    if judge is not None and judge.unchanged_p_value() < MAX_FALSE_ALARMS:
+        return "cannot say", _contradiction(judge, judge is model, size)
     known = [each for each in hypotheses if each.kind in ("joint", "base", "tool")]
     hidden = sorted((each for each in known if each.revealed > size), key=lambda each: -each.revealed)
+    remedy = "measure more poses, as `dhcal plan --recheck` chooses them, or more accurately."
     if hidden:
         worst = hidden[0]
         return "cannot say", [
             f"A change of {worst.name} would be revealed from {1e3 * worst.revealed:.2g} mm at the tool on; "
-            f"expected {1e3 * size:.2g} mm: measure more poses, as `dhcal plan --recheck` chooses them, or "
-            "more accurately."
+            f"expected {1e3 * size:.2g} mm: {remedy}"
         ]
-    largest = max((each.revealed for each in known), default=0.0)
+    largest = max([model.hidden_motion(), *(each.revealed for each in known)])
+    if largest > size:
+        return "cannot say", [
+            f"Changes of several parts would be revealed from {1e3 * largest:.2g} mm at the tool on; "
+            f"expected {1e3 * size:.2g} mm: {remedy}"
+        ]
     moved = format_quantity(largest, "m", largest / 10)
     reasons = [f"Nothing changed that moves the measured point by more than {moved}."]
-    if hidden_joints:
-        reasons.append(f"Zeros of {', '.join(hidden_joints)} do not move it; measure a point off their axes.")
+    if joints := model.hidden_joints:
+        reasons.append(f"Zeros of {', '.join(joints)} do not move it; measure a point off their axes.")
     return "ok", reasons
+
+
+def _contradiction(judge: _CheckModel, is_stated: bool, size: float) -> list[str]:
+    """Say that the residuals are larger than noise and uncertainty, though no change is evident."""
+    rms, expected = (_text_of_error(each) for each in judge.position_rms())
+    if is_stated:
+        return [
+            f"The positions differ by {rms} RMS, and the stated noise and the uncertainty of the calibration "
+            f"explain {expected}. Either the noise is larger, or something changed that is none of the "
+            "changes that are compared."
+        ]
+    answer = _answer(judge, *judge.judged(), size)
+    return [
+        f"The positions differ by {rms} RMS, and noise and uncertainty of the calibration explain "
+        f"{expected}. Either these measurements have more noise, or the robot changed: state their noise by "
+        "`--sigma`.",
+        f"With the noise of the calibration, the answer is `{answer.verdict}`: {answer.reasons[0]}",
+    ]
 
 
 def _sentence(group: list[Hypothesis]) -> str:
     """Say what changed."""
     best, *others = group
     if best.kind == "robot":
-        return "More than one part of the robot changed, or the origin of a joint: calibrate again."
+        return _robot_sentence(None)
     size = format_quantity(abs(best.size), best.unit, best.std, small=best.unit == "m")
     verb = "turned" if best.unit == "rad" else "moved"
     part = "base or the instrument" if best.kind == "base" else best.kind
     what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {part} {verb}"
     if best.unit == "m" and best.angle > max(LARGE_TURN, 5 * best.angle_std):
         size += f" and turned by {format_quantity(best.angle, 'rad', best.angle_std)}"
-    like = ", as after a new set-up of the instrument" if best.kind == "base" else ""
+    like = ", as after a new set-up of the instrument" if best.kind == "base" and not best.of else ""
+    if best.kind == "base" and best.of:
+        like = f" {best.of}"
     rivals = " or ".join(each.name for each in others)
     return f"{what} by {size}{like}." + (f" The same effect has a change of {rivals}." if rivals else "")

@@ -8,8 +8,10 @@ from measurement_files import csv_text_of, frames, joint_positions, real_ur10
 from robots import URDF, paper
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import se3
+from dhcal_pin import se3, select_parameters
 from dhcal_pin.cli.main import main
+from dhcal_pin.diagnostics import find_payload_notes, find_value_warnings
+from dhcal_pin.diagnostics.input_checks import find_payload_warnings
 from dhcal_pin.io import measurement_text, read_measurement_file, read_servos
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, Position, Wires
 from dhcal_pin.robot import Chain, Payload, parse_urdf
@@ -225,13 +227,53 @@ def test_joints_beyond_their_limits(warnings_of, ur10):
         (True, [0, 5000], Payload(5.0), "the payload is 5000 kg in lines 3, 5, 7"),
     ],
 )
-def test_a_payload_that_the_result_does_not_contain(warnings_of, ur10, has_masses, masses, payload, expected):
+def test_a_payload_that_the_result_does_not_contain(tmp_path, ur10, has_masses, masses, payload, expected):
     data = ur10.urdf.data if has_masses else re.sub(rb"(?s)<inertial>.*?</inertial>", b"", ur10.urdf.data)
     arm = Chain.from_urdf(parse_urdf(data, "arm.urdf"), "tool0").with_payload(payload)
     header, *rows = csv_text_of(ur10, joint_positions(ur10)).splitlines()
     lines = [f"{header},payload[kg]", *(f"{row},{masses[i % 2]}" for i, row in enumerate(rows))]
-    found = warnings_of(arm, "\n".join(lines))
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(lines))
+    file = read_measurement_file(path, arm)
+    found = [*find_value_warnings(arm, file), *find_payload_warnings(arm, file)]
     assert [expected in text for text in found] == ([True] if expected else [])
+
+
+@pytest.mark.parametrize(
+    ("masses", "payloads", "parameters", "expected"),
+    [
+        ([5, 0], (0.0, 5.0), "compliance", ""),
+        (
+            [5, 10],
+            (0.0, 5.0),
+            "compliance",
+            "is 10 kg in lines 3, 5, 7, 9, 11 and 5 more, and the calibration has 0 to 5 kg",
+        ),
+        (
+            [1, 10],
+            (2.0, 2.0),
+            "compliance",
+            "is 1 to 10 kg in lines 2, 3, 4, 5, 6 and 15 more, and the calibration has 2 kg",
+        ),
+        (
+            [0, 5],
+            None,
+            "compliance",
+            "and the calibration has no payload: how far the joints yield is extrapolated",
+        ),
+        ([0, 5], None, "", ""),
+        ([0, 5], (0.0, 1.0), "", "the joints of the model do not yield, so that the column has no effect"),
+    ],
+)
+def test_payloads_beyond_those_of_the_calibration(tmp_path, ur10, masses, payloads, parameters, expected):
+    header, *rows = csv_text_of(ur10, joint_positions(ur10)).splitlines()
+    lines = [f"{header},payload[kg]", *(f"{row},{masses[i % 2]}" for i, row in enumerate(rows[:20]))]
+    errors = select_parameters(ur10, "compliance")
+    arm = errors.at(np.full(len(errors.parameters), 1e-5)) if parameters else ur10
+    path = tmp_path / "data.csv"
+    path.write_text("\n".join(lines))
+    found = find_payload_notes(arm, read_measurement_file(path, arm), payloads)
+    assert [expected in text for text in found] == ([True] if expected else []), found
 
 
 def test_repeated_rows_give_a_warning(warnings_of, ur10):

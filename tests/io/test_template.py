@@ -16,6 +16,7 @@ from dhcal_pin.io import convert_robot, read_robot, urdf_files
 from dhcal_pin.io.read_back import _pinocchio_poses
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.formats.mjcf import parse_mjcf
+from dhcal_pin.robot.urdf_edit import with_world
 
 POSES = re.compile(r' (pos|quat|xyz|rpy)="[^"]*"')
 
@@ -138,6 +139,31 @@ def test_another_robot_is_refused(tmp_path, case):
     template = write(tmp_path, "template.xml", change(mjcf_of(nominal, other_frames(nominal, 0, 0))))
     with pytest.raises(DhcalError, match=rf"template\.xml: {words}"):
         convert_robot(UR10, "out.xml", "tool0", template=template)
+
+
+@pytest.mark.parametrize("has_world", [True, False], ids=["world in the robot", "world added"])
+def test_a_base_pose_in_the_urdf_is_named_as_the_reason(tmp_path, has_world):
+    """The robot is written as by `calibrate --world-joint`; without that pose, the file is converted."""
+    text = UR10.read_text()
+    source = write(tmp_path, "nominal.urdf", text if has_world else without_world(text))
+    nominal = read_robot(source, "tool0")
+    template = write(tmp_path, "template.xml", mjcf_of(nominal, other_frames(nominal, 0.3, 0.1)))
+    robot = calibrated(nominal, tmp_path, "calibrated.urdf")
+    base = se3.transform(se3.exp3([0.05, -0.1, 2.0]), np.array([2.5, 1.2, -0.4]))
+    moved = with_world((tmp_path / "calibrated.urdf").read_bytes(), base)
+    write(tmp_path, "world.urdf", moved.decode())
+    words = r"template\.xml: the whole robot of .*world\.urdf is moved by .* in world, as by .*--world-joint"
+    with pytest.raises(DhcalError, match=words):
+        convert_robot(tmp_path / "world.urdf", "out.xml", "tool0", template=template)
+    out = convert_robot(tmp_path / "calibrated.urdf", "out.xml", "tool0", template=template).text
+    by_mujoco = mujoco_poses(out.encode(), "tool0", robot.joint_names, draw(robot))
+    np.testing.assert_allclose(by_mujoco, _pinocchio_poses(robot, draw(robot)), atol=1e-9)
+
+
+def without_world(text: str) -> str:
+    """Return the URDF of a UR10 that begins with its base link."""
+    text = re.sub(r'(?s)<joint name="[^"]*" type="fixed">\s*<parent link="world"\s*/>.*?</joint>', "", text)
+    return re.sub(r'<link name="world"\s*/>', "", text)
 
 
 @pytest.mark.parametrize(("degrees", "is_same"), [(8, True), (15, False)])

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from command_line import error_of, json_of
-from robots import nominal_arm
+from robots import ARMS, nominal_arm, robot_file
 from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
@@ -25,7 +25,7 @@ from dhcal_pin.planning import change_options, plan
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.robot.transmission import Payload
-from dhcal_pin.session import Recheck, recheck
+from dhcal_pin.session import Recheck, find_excess_error, recheck
 from dhcal_pin.session.check import WIDTHS, _CheckModel
 
 STILL = pin.SE3.Identity()
@@ -282,6 +282,168 @@ def test_what_remains_beside_a_named_change_is_no_single_second_change(n_seeds):
         assert "did not change" not in " ".join(result.reasons)
 
 
+def test_residuals_that_noise_does_not_explain_are_not_ok():
+    """The origin of the last joint moved by 0.7 mm, and no noise is stated."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    q = sim.test_q[:12]
+    bent = sim.model.copy()
+    bent.jointPlacements[sim.ids[5]] *= pin.SE3(np.eye(3), np.array([0.0, 0.0, 7e-4]))
+    points = np.array([(sim.base * arm * sim.tool).translation for arm in sim.poses(q, bent)])
+    data = Position(q, points + sim.rng.normal(0, NOISE, points.shape))
+    found = recheck(fit.chain, [data], fit.uncertainty)
+    assert (found.verdict, found.changes) == ("cannot say", ())
+    assert "state their noise by `--sigma`" in found.reasons[0]
+    assert found.residual_rms > 4 * found.expected_rms
+    # The remedy decides it, and the answer that is promised is given.
+    stated = recheck(fit.chain, [data], fit.uncertainty, noise=Noise(NOISE))
+    assert (stated.verdict, stated.what) == ("changed", "robot")
+    assert found.reasons[1].endswith(f"`changed`: {stated.reasons[0]}")
+    # A noise that is larger by far explains it, with a distance that the residuals do not contradict.
+    noisy = recheck(fit.chain, [data], fit.uncertainty, noise=Noise(3e-4), size=2e-3)
+    assert noisy.verdict == "ok"
+    assert stated_distance(noisy) > found.residual_rms / 2
+    # Without a calibration's noise, the residuals may be a change or noise.
+    unknown = recheck(fit.chain, [data], None, size=2e-3)
+    assert (unknown.verdict == "ok") <= (stated_distance(unknown) >= 0.99 * unknown.residual_rms)
+    assert recheck(fit.chain, [data], None, size=0.5 * unknown.residual_rms).verdict != "ok"
+
+
+def stated_distance(result: Recheck) -> float:
+    """Return the distance that a check excludes [m]."""
+    return 1e-3 * float(result.reasons[0].split("more than ")[1].split(" mm")[0])
+
+
+def test_a_noise_that_is_larger_than_stated_is_not_ok():
+    """Ten times the stated noise, which no change explains."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    points = measured(sim, sim.test_q[:14], Position, True)
+    points.positions()[:] += sim.rng.normal(0, 10 * NOISE, (14, 3))
+    assert recheck(fit.chain, [points], fit.uncertainty).verdict != "ok"
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([3, 30], {0}))
+@pytest.mark.parametrize(
+    ("factor", "verdicts"), [(1, {"ok"}), (2, {"ok", "cannot say"}), (5, {"cannot say"})]
+)
+def test_more_noise_than_that_of_the_calibration_is_no_change(factor, verdicts, n_seeds):
+    """An unchanged arm, measured by another instrument whose noise is not stated."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        data = measured(sim, rng.uniform(-2.5, 2.5, (12, 6)), Position, False)
+        more = NOISE * np.sqrt(factor**2 - 1)
+        noisy = Position(data.conditions().q, data.positions() + rng.normal(0, more, (12, 3)))
+        found = recheck(fit.chain, [noisy], fit.uncertainty)
+        assert found.verdict in verdicts
+        if found.verdict == "ok":
+            assert stated_distance(found) >= 0.99 * found.residual_rms
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([2, 20], {0}))
+@pytest.mark.parametrize("size", [8e-4, 2e-3])
+def test_an_instrument_that_moved_during_the_check_is_named_with_its_line(size, n_seeds):
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        first = int(rng.integers(4, 9))
+        data = measured(sim, rng.uniform(-2.5, 2.5, (12, 6)), Position, True)
+        data.positions()[first:] += size * sim.direction()
+        found = recheck(fit.chain, [data], fit.uncertainty)
+        assert (found.verdict, found.what) == ("changed", f"base from sample {first + 1} on")
+        (change,) = found.changes
+        assert abs(change.size - size) < 4 * change.std
+        assert found.reasons[0].endswith(f" from sample {first + 1} on.")
+        assert "the samples fit to the calibrated arm" in found.reasons[1]
+        # The remedy: what was measured before and after has one base each.
+        rest = measured(sim, data.conditions().q, Position, True)
+        assert recheck(fit.chain, [rest], fit.uncertainty).verdict == "ok"
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([2, 20], {0}))
+def test_changes_of_the_arm_are_no_motion_of_the_instrument(n_seeds):
+    """Two zeros, or the origin of a joint, changed before the check."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    for seed in range(n_seeds):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(-2.5, 2.5, (12, 6))
+        zeros = 2e-3 * np.isin(np.arange(6), rng.choice(np.arange(1, 5), 2, replace=False))
+        bent = sim.model.copy()
+        shift = pin.SE3(np.eye(3), 1e-3 * sim.direction())
+        bent.jointPlacements[sim.ids[int(rng.integers(1, 6))]] *= shift
+        points = np.array([(sim.base * arm * sim.tool).translation for arm in sim.poses(q, bent)])
+        for data in (
+            measured(sim, q, Position, True, zeros=zeros),
+            Position(q, points + rng.normal(0, NOISE, points.shape), NOISE),
+        ):
+            found = recheck(fit.chain, [data], fit.uncertainty)
+            assert found.verdict != "ok"
+            assert "the samples fit to the calibrated arm" not in " ".join(found.reasons)
+
+
+def test_a_motion_during_the_check_is_named_as_possible_if_the_samples_do_not_exclude_it():
+    """With two samples after it, a motion of the instrument is one of several explanations."""
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    data = measured(sim, sim.test_q[:5], Position, True)
+    data.positions()[3:] += np.array([2e-3, -1e-3, 3e-3])
+    found = recheck(fit.chain, [data], fit.uncertainty)
+    assert (found.verdict, found.what) == ("changed", "robot")
+    assert "or the base or the instrument moved during the check, from sample 4 on." in found.reasons[0]
+    zeros = np.deg2rad([0.0, 0.5, -0.4, 0.6, 0.5, 0.0])
+    arm = measured(sim, sim.test_q[:10], Position, True, zeros=zeros)
+    assert "instrument" not in recheck(fit.chain, [arm], fit.uncertainty).reasons[0]
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([1, 6], {0}))
+@pytest.mark.parametrize(("arm", "kind"), [("ur10", Position), ("panda", Pose)])
+def test_an_error_that_is_larger_than_that_of_the_calibration(arm, kind, n_seeds):
+    """A zero that is off by 1 mrad; 8 and 14 samples, and more than a check takes."""
+    for seed in range(n_seeds):
+        sim, fit, _ = calibrated(arm, seed, kind)
+        zeros = 1e-3 * np.eye(sim.chain.n_joints)[2]
+        for count, is_stated in product((8, 14, 200), (True, False)):
+            q = sim.test_q[:count]
+            same = measured(sim, q, kind, is_stated)
+            assert find_excess_error(fit.chain, [same], fit.uncertainty) is None
+            other = measured(sim, q, kind, is_stated, zeros=zeros)
+            found = find_excess_error(fit.chain, [other], fit.uncertainty)
+            assert found is not None
+            true = fit.chain.poses(q)[:, :3, 3] - other.positions()
+            assert found[0] == pytest.approx(np.sqrt(np.mean(np.sum(true**2, 1))), rel=0.15)
+            # About the noise, and the uncertainty of 60 samples.
+            assert np.sqrt(3) * 0.8 * NOISE < found[1] < np.sqrt(3) * 1.7 * NOISE
+        # Noise that is stated to be larger explains it.
+        coarse, q = Noise(20 * NOISE, 20 * ANGLE_NOISE), sim.test_q[:14]
+        other = measured(sim, q, kind, False, zeros=zeros)
+        values = other.positions() if kind is Position else other.poses
+        noises = (coarse.position,) if kind is Position else (coarse.position, coarse.rotation)
+        assert find_excess_error(fit.chain, [kind(q, values, *noises)], fit.uncertainty) is None
+
+
+def test_validate_says_that_the_error_is_larger_than_that_of_the_calibration(tmp_path: Path, capsys):
+    sim, fit, _ = calibrated("ur10", 7, Position)
+    robot, file = tmp_path / "cal.urdf", tmp_path / "later.csv"
+    write_urdf(fit, robot)
+    inside = [row for row in sim.test_q if np.abs(row).max() < 2.0][:12]
+    for angle, hints in ((0.0, 0), (1.5e-3, 1)):
+        zeros = angle * np.eye(6)[2]
+        data = measured(sim, np.array(inside), Position, False, zeros=zeros)
+        file.write_text(measurement_text(data, fit.chain, []))
+        args = [str(robot), str(file), "--tip", "tool0", "--json", "-"]
+        assert main(["validate", *args]) == 0
+        answer = json.loads(capsys.readouterr().out)
+        found = [text for text in answer["warnings"] if "times that of the calibration" in text]
+        assert len(found) == hints
+    ratio = float(found[0].split(" is ")[1].split(" times")[0])
+    usual = float(found[0].split("calibration, ")[1].split(" mm")[0])
+    assert ratio * usual == pytest.approx(1e3 * answer["after"]["position_rms_m"], rel=0.1)
+    # The command that it names finds the change.
+    assert main(["recheck", *args, "--sigma", "0.05mm"]) == 1
+    assert json.loads(capsys.readouterr().out)["what"] == "joint elbow_joint"
+    # With base and tool fitted, there is no such comparison.
+    assert main(["validate", *args, "--fit-frames"]) == 0
+    assert "times that of the calibration" not in capsys.readouterr().out
+
+
 def test_missing_columns_are_named():
     """Elasticity needs the payload only if the calibration had several."""
     chain, _ = conditional("compliance", -3e-5)
@@ -334,6 +496,52 @@ def test_unknown_conditions_count_as_uncertainty(family, size, condition, values
             assert recheck(chain, [unstated], size=5e-3).verdict != "ok"
         moved = Position(q, points + np.array([0.02, 0.0, 0.0]), NOISE)
         assert recheck(chain, [moved], **keywords).what == "base"
+
+
+@pytest.mark.parametrize("n_times", some_slow([2, 20], {0}))
+def test_a_payload_beyond_those_of_the_calibration_counts_as_uncertainty(n_times):
+    """Its centre is 80 mm from that of the model, which has no large effect with the calibrated payloads."""
+    chain, rng = conditional("compliance", -3e-5)
+    true = chain.with_payload(Payload(5.0, (0.0, 0.05, 0.18)))
+    keywords = {"payloads": (0.0, 3.0), "size": 5e-3}
+    for _ in range(n_times):
+        q, masses = rng.uniform(-2, 2, (14, 6)), np.full(14, 12.0)
+        points = true.poses(Conditions(q, payload=masses))[:, :3, 3] + rng.normal(0, NOISE, (14, 3))
+        data = Position(q, points, NOISE).with_conditions(payload=masses)
+        assert recheck(chain, [data], **keywords).verdict == "ok"
+        assert recheck(chain, [data], payloads=(0.0, 12.0), size=5e-3).verdict != "ok"
+        moved = Position(q, points + np.array([0.02, 0.0, 0.0]), NOISE).with_conditions(payload=masses)
+        assert recheck(chain, [moved], **keywords).what == "base"
+
+
+def test_a_payload_beyond_those_of_the_calibration_is_no_mistake_of_the_file(tmp_path: Path, capsys):
+    """An elastic arm that was calibrated with 0 to 5 kg, now with 10 kg in all rows."""
+    chain, rng = conditional("compliance", -3e-5)
+    chain = chain.with_payload(None)
+
+    def write(name: str, count: int, masses: np.ndarray) -> str:
+        q = rng.uniform(-2, 2, (count, 6))
+        points = chain.poses(Conditions(q, payload=masses))[:, :3, 3] + rng.normal(0, NOISE, (count, 3))
+        data = Position(q, points, NOISE).with_conditions(payload=masses)
+        (tmp_path / name).write_text(measurement_text(data, chain, []))
+        return str(tmp_path / name)
+
+    fitted = write("fitted.csv", 70, rng.choice([0.0, 2.0, 5.0], 70))
+    robot = str(tmp_path / "cal.urdf")
+    source = str(robot_file(ARMS["ur10"][0]))
+    parameters = "minimal,base,tool,compliance"
+    assert main(["calibrate", source, fitted, "--tip", "tool0", "--parameters", parameters, "-o", robot]) == 0
+    for mass, has_note in ((10.0, True), (5.0, False)):
+        file = write(f"{mass:g}.csv", 12, np.full(12, mass))
+        for command in ("recheck", "validate"):
+            capsys.readouterr()
+            assert main([command, robot, file, "--tip", "tool0", "--json", "-"]) == 0
+            answer = json.loads(capsys.readouterr().out)
+            text = " ".join(answer["warnings"])
+            assert "--payload" not in text
+            assert ("the payload is 10 kg in lines" in text) == has_note
+            assert ("the calibration has 0 to 5 kg" in text) == has_note
+            assert answer.get("verdict", "ok") == "ok" or command == "validate"
 
 
 @pytest.mark.parametrize("n_known", [0, 9, 10])

@@ -6,9 +6,9 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ... import calibration, diagnostics, estimation, io, iso9283, report, robot
+from ... import calibration, diagnostics, estimation, io, iso9283, report, robot, session
 from ...exceptions import InvalidArgumentError
-from ...formatting import list_first, texts_by_file
+from ...formatting import format_quantity, list_first, texts_by_file
 from .. import options, screens
 from ..output_table import Makers, Output
 from ..servo_zeros import other_zeros_warning
@@ -341,7 +341,34 @@ def _input_warnings(
         warnings[args.robot] = [warning]
     elif args.fit_frames and args.iso9283:
         warnings[args.robot] = [diagnostics.ISO_FITTED_WARNING]
+    elif sidecar and not args.fit_frames and not any(warnings.values()):
+        warnings[args.robot] = _excess_warnings(given, io.read_uncertainty(sidecar, given.chain))
     return warnings
+
+
+def _excess_warnings(given: Given, uncertainty: estimation.Uncertainty | None) -> list[str]:
+    """Say if the error in the measured region is larger than that of the calibration."""
+    from ...calibration.evaluation import compute_errors, find_inliers  # lazy import
+
+    region, chain = given.region, given.chain
+    if region is None or uncertainty is None or any(item.configurations_per_row != 1 for item in given.data):
+        return []
+    masks = find_inliers(compute_errors(chain, given.data, given.known))
+    data = [
+        item.take(mask & (region.distances(item.configurations()) <= region.radius))
+        for item, mask in zip(given.data, masks, strict=True)
+    ]
+    data = [item for item in data if len(item.rows)]
+    found = session.find_excess_error(chain, data, uncertainty, known=given.known, payloads=region.payloads)
+    if found is None:
+        return []
+    error, usual = found
+    lengths = [format_quantity(each, "m", each / 10) for each in found]
+    return [
+        f"the error of the positions, {lengths[0]} RMS, is {error / usual:.2g} times that of the "
+        f"calibration, {lengths[1]}: these measurements have more noise, or something changed; "
+        "`dhcal recheck` with `--sigma` finds what"
+    ]
 
 
 def _predictor(chain: robot.Chain, sidecar: str | None, args: Namespace) -> estimation.Predictor:
