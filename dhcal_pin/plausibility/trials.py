@@ -62,8 +62,10 @@ _MAX_ZERO, _ZERO_STEPS, _FINE_ZERO_STEPS = 180.0, (20.0, 4.0, 1.0, 0.2), ((6.0, 
 # the robot, which the calibration corrects.
 _MAX_RATIO, _RATIO_STEPS, _FINE_RATIO_STEPS = 110.0, (5.0, 1.0, 0.2), ((1.5, 0.5), (0.3, 0.1))
 _MIN_RATIO = 4.0
-# Sizes of ratios one of which explains measurements without positions better, if others do.
-_PROBED_RATIOS = (-5.0, 5.0)
+# Without positions each size needs a fit. Only the mistake is measured that explains measurements best with
+# one of these sizes, and zeros only up to a smaller angle, in larger steps [deg].
+_PROBED_RATIOS, _PROBED_ZEROS = (-5.0, 5.0), (-40.0, -20.0, -10.0, 10.0, 20.0, 40.0)
+_MAX_FITTED_ZERO, _FITTED_ZERO_STEPS = 50.0, (10.0, 3.0)
 # A ratio is refined if it brings the nominal robot nearer by this factor.
 _MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
@@ -156,7 +158,7 @@ def try_hypotheses(
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         # The zeros of a hand-built arm are unknown in any case.
         inner = inner_revolute_joints(chain) if sets == MANUFACTURED else []
-        zeros = _measure_zeros(trial, [j for j in inner if misfit or j in changed])
+        zeros = _measure_zeros(trial, inner)
         large = [zero.candidate for zero in zeros if abs(zero.size) >= _MIN_ZERO]
         large += [ratio.candidate for ratio in _measure_ratios(trial)]
         scores += _scores(trial, _near(trial, large), SINGLES)
@@ -197,9 +199,12 @@ def _measured(trial: Trial, of_size: Callable[[float], Hypothesis], size: float)
 def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
     """Return the zeros of joints that are wrong, by the angles of greatest evidence."""
     zeros = []
-    for joint in joints:
-        of_angle = partial(zero_hypothesis, trial.chain, joint)
-        best = _closest(trial, of_angle, _MAX_ZERO, _ZERO_STEPS)
+    kinds = [partial(zero_hypothesis, trial.chain, joint) for joint in joints]
+    reach, steps = _MAX_ZERO, _ZERO_STEPS
+    if not trial.misfit:
+        kinds, reach, steps = _most_explaining(trial, kinds, _PROBED_ZEROS), _MAX_FITTED_ZERO, _FITTED_ZERO_STEPS
+    for of_angle in kinds:
+        best = _closest(trial, of_angle, reach, steps)
         is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
         if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:
             zeros += _measured(trial, of_angle, best)
@@ -212,10 +217,7 @@ def _measure_ratios(trial: Trial) -> list[_Measured]:
     groups = [*groups, revolute] if len(revolute) > 1 else groups
     kinds = [partial(_ratio_of_logarithm, trial.chain, joints) for joints in groups]
     if not trial.misfit:
-        # Without positions, each size needs a fit: only the kind is measured that explains most.
-        costs = [_costs(trial, _with_sizes(trial, kind, _PROBED_RATIOS)).min() for kind in kinds]
-        is_explaining = -min(costs) >= trial.before.log + _MIN_LOG_RATIO
-        kinds = [kinds[int(np.argmin(costs))]] if is_explaining else []
+        kinds = _most_explaining(trial, kinds, _PROBED_RATIOS)
     ratios = []
     for of_logarithm in kinds:
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
@@ -223,6 +225,15 @@ def _measure_ratios(trial: Trial) -> list[_Measured]:
             ratios += _measured(trial, of_logarithm, best)
     near = [each for each in ratios if _MIN_RATIO_GAIN * each.candidate.misfit <= trial.misfit]
     return _refine(trial, near, _FINE_RATIO_STEPS, _MIN_RATIO)
+
+
+def _most_explaining(
+    trial: Trial, kinds: Sequence[Callable[[float], Hypothesis]], sizes: Sequence[float]
+) -> list[Callable[[float], Hypothesis]]:
+    """Return the kind of mistake that explains most at one of several sizes, if it explains anything."""
+    costs = [_costs(trial, _with_sizes(trial, kind, sizes)).min() for kind in kinds]
+    is_explaining = -min(costs, default=np.inf) > trial.before.log + _MAX_LOG_TIE
+    return [kinds[int(np.argmin(costs))]] if is_explaining else []
 
 
 def _ratio_of_logarithm(chain: Chain, joints: Sequence[int], size: float) -> Hypothesis:
