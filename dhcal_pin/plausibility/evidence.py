@@ -161,9 +161,7 @@ def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Eviden
     """Fit errors of a robot to initialized measurements and compute the evidence."""
     is_robot = errors.is_of_arm
     n_rows = sum(item.residual_dim * len(item.rows) for item in data)
-    problem = make_problem(
-        errors, data, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
-    )
+    problem = make_problem(errors, data, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {})
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
     noise = new = _estimate_noise(problem, solution.x)
     for _ in range(_N_ROUNDS):
