@@ -18,8 +18,8 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement, concatenate
 from ..robot.chain import Chain
-from .diagnosis import Diagnosis, leaves_residuals
-from .drawn_samples import fit_drawn_samples
+from .diagnosis import MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .drawn_samples import draw_samples, fit_drawn_samples, fit_samples
 from .evidence import Evidence
 from .hypotheses import BothChanges, Hypothesis, LagChange, RowShift
 
@@ -99,6 +99,21 @@ def confirm(chain: Chain, found: Diagnosis, data: Sequence[Measurement], sets: s
     return replace(
         found, hypotheses=(first, *others), after=fitted, part=None, source=sources.pop(), lines=lines
     )
+
+
+def is_confirmed_by_lengths(
+    chain: Chain, found: Diagnosis, data: Sequence[Measurement], lengths: Sequence[Measurement], sets: str
+) -> bool:
+    """Return whether a mistake in touched points explains the known lengths between them, too."""
+    samples, first = draw_samples(data)[0], found.hypotheses[0]
+    changed = first.apply(samples)
+    if changed is None:
+        return True
+    before = fit_samples(chain, [*samples, *lengths], sets)
+    after = fit_samples(chain, [*changed, *lengths], sets)
+    n_before, n_after = (sum(len(item.rows) for item in (*each, *lengths)) for each in (samples, changed))
+    log = after.log * n_before / n_after + first.log_jacobian(chain, samples)
+    return log >= before.log + MIN_LOG_RATIO and not leaves_residuals(after)
 
 
 def needs_neighbours(hypothesis: Hypothesis) -> bool:

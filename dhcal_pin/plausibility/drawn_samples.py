@@ -9,7 +9,7 @@ import numpy as np
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import NO_EVIDENCE, is_suspicious
-from .evidence import Evidence, fit_evidence
+from .evidence import Evidence, fit_evidence, fit_without_gross_outliers
 
 # Fewer rows for each unknown of frames and instrument fit too many hypotheses. Base and tool have twelve.
 _MIN_ROWS_PER_UNKNOWN, _N_FRAME_UNKNOWNS = 2, 12
@@ -52,6 +52,10 @@ def fit_samples(chain: Chain, samples: Sequence[Measurement], sets: str) -> Evid
     if not has_enough_rows(samples):
         return NO_EVIDENCE
     before = fit_evidence(chain, samples, sets)
+    if is_suspicious(before) and any(item.is_contact for item in samples):
+        # A few outliers are a simpler explanation than a mistake in all samples.
+        robust = fit_without_gross_outliers(chain, samples, sets)
+        before = max(before, robust or before, key=lambda each: each.log)
     if is_suspicious(before) and chain.error_families:
         # The joint errors of the robot may be wrong instead of the measurements.
         return max(before, fit_evidence(chain.urdf_alone, samples, sets), key=lambda each: each.log)

@@ -32,11 +32,14 @@ import numpy as np
 from .._frozen import frozen
 from .._typing import Array
 from ..estimation.contacts import log_volume
+from ..estimation.error_model import ErrorModel
 from ..estimation.initialization import compare_tools, initialize_frames, make_problem
 from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, left_singular_vectors
+from ..estimation.robust import ZERO_WEIGHT
 from ..estimation.solver import minimize
+from ..estimation.trimmed_squares import find_initial_outliers
 from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, residual_of
 from ..measurements.pose import PoseMeasurement
 from ..measurements.position import PointMeasurement
@@ -125,15 +128,40 @@ def with_noise_of(
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
-    errors = initialize_frames(select_parameters(chain, sets), equal, {}, _N_FRAME_ITERATIONS)
-    if any(item.is_contact for item in equal):
-        errors = compare_tools(errors, equal, {}, _N_FRAME_ITERATIONS)
-    equal = tuple(item.initialized(errors.chain) for item in equal)
-    is_robot = errors.is_of_arm
-    n_rows = sum(item.residual_dim * len(item.rows) for item in equal)
-    problem = make_problem(
-        errors, equal, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {}
+    errors = _initialized_frames(chain, equal, sets)
+    return _fit(errors, tuple(item.initialized(errors.chain) for item in equal), sets)
+
+
+def fit_without_gross_outliers(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence | None:
+    """Compute the evidence of a fit that starts without samples that are far off; None without any."""
+    # A fit to few samples for each unknown adapts to an outlier that it starts with.
+    equal = tuple(_with_equal_sigmas(item) for item in data)
+    errors = _initialized_frames(chain, equal, sets)
+    is_gross = find_initial_outliers(select_parameters(chain, sets), equal, {}, errors.chain)
+    if not any(each.any() for each in is_gross):
+        return None
+    kept = tuple(item.take(~each) for item, each in zip(equal, is_gross, strict=True))
+    errors = _initialized_frames(chain, kept, sets)
+    started = tuple(
+        item.initialized_from(errors.chain, ~each).with_weights(np.where(each, ZERO_WEIGHT, 1.0))
+        for item, each in zip(equal, is_gross, strict=True)
     )
+    return _fit(errors, started, sets)
+
+
+def _initialized_frames(chain: Chain, data: tuple[Measurement, ...], sets: str) -> ErrorModel:
+    """Return the unknown errors of a robot with base and tool that are initialized from measurements."""
+    errors = initialize_frames(select_parameters(chain, sets), data, {}, _N_FRAME_ITERATIONS)
+    if any(item.is_contact for item in data):
+        errors = compare_tools(errors, data, {}, _N_FRAME_ITERATIONS)
+    return errors
+
+
+def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Evidence:
+    """Fit errors of a robot to initialized measurements and compute the evidence."""
+    is_robot = errors.is_of_arm
+    n_rows = sum(item.residual_dim * len(item.rows) for item in data)
+    problem = make_problem(errors, data, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {})
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
     noise = new = _estimate_noise(problem, solution.x)
     for _ in range(_N_ROUNDS):

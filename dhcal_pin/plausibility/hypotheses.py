@@ -61,6 +61,8 @@ N_PLACES = 6
 _MIN_MOTION = 1e-3
 # Largest lag that can be undone [rows or s].
 MAX_LAG = 100.0
+# Share of touches from which on a shift of the rows renames the touched points: the others have wrong names.
+_MIN_RENAMED_SHARE = 0.75
 # Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
 _MAX_SMALL_ROTATION = np.pi / ANGLES["deg"]
 
@@ -151,9 +153,13 @@ class RowShift:
 
 
 def _are_renamed(before: Array, after: Array) -> bool:
-    """Return whether labels (m,) are the same ones with other names."""
-    pairs = {*zip(before.tolist(), after.tolist(), strict=True)}
-    return len(pairs) == len({*before.tolist()}) == len({*after.tolist()})
+    """Return whether labels (m,) are the same ones with other names, but for a few samples."""
+    counts = np.zeros((int(before.max()) + 1, int(after.max()) + 1), int)
+    np.add.at(counts, (before, after), 1)
+    pairs = zip(range(len(counts)), counts.argmax(1).tolist(), strict=True)
+    # Label `i` becomes `j`, and no other label does.
+    renamed = [counts[i, j] for i, j in pairs if counts[i, j] and counts[:, j].argmax() == i]
+    return sum(renamed) >= _MIN_RENAMED_SHARE * len(before)
 
 
 @frozen

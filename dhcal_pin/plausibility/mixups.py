@@ -25,7 +25,10 @@ measurement. One event leaves at least two of three parts of the file without a 
 that is found in two of them is therefore reported if it is decisive for the whole file, too, whatever
 residuals the event leaves.
 
-All samples confirm a hypothesis, or it is restricted to a part of them (`confirmation`).
+Robots with large errors, such as a hand-built arm with a wrong gear ratio, fit touches of unknown points and
+few other measurements without positions. A ratio is therefore tried there even if a robot fits. Known
+distances between touched points must leave a hypothesis decisive. All samples confirm it, or it is restricted
+to a part of them (`confirmation`).
 """
 
 from __future__ import annotations
@@ -64,15 +67,24 @@ def diagnose_mixups(
     items = comparable_items(data)
     if not items:
         return Diagnosis(NO_EVIDENCE)
-    found = _diagnose(chain, items, sets, progress or no_progress)
+    lengths = [item for item in data if not item.configurations_per_row]
+    found = _diagnose(chain, items, lengths, sets, progress or no_progress)
     if not (found.hypotheses or found.zero):
         return found
-    from .confirmation import confirm  # lazy import: few measurements have a mistake
+    from .confirmation import confirm, is_confirmed_by_lengths  # lazy import: few measurements have a mistake
 
+    if found.hypotheses and lengths and not is_confirmed_by_lengths(chain, found, items, lengths, sets):
+        return Diagnosis(found.before)
     return confirm(chain, found, [*items, *comparable_items(holdout)], sets)
 
 
-def _diagnose(chain: Chain, items: Sequence[Measurement], sets: str, report: Progress) -> Diagnosis:
+def _diagnose(
+    chain: Chain,
+    items: Sequence[Measurement],
+    lengths: Sequence[Measurement],
+    sets: str,
+    report: Progress,
+) -> Diagnosis:
     """Look for one mistake or two in samples that are drawn from measurements."""
     diagnosis, trial = _find_single(chain, items, sets, report)
     if trial is None:
@@ -86,6 +98,9 @@ def _diagnose(chain: Chain, items: Sequence[Measurement], sets: str, report: Pro
         if not any(one.is_suspicious for _, one in separate):
             return replace(diagnosis, fits_separately=True)
     found = trial.find_pair()
+    if lengths and not found.hypotheses and trial.single.needs_no_larger_errors:
+        # A robot with large errors can touch unknown points after a wrong change: lengths must confirm it.
+        return trial.single
     if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):
         return found
     if len(items[0].rows) < _N_PARTS * _MIN_SAMPLES_PER_PART:
@@ -130,10 +145,13 @@ def _find_single(
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
     before = fit_samples(chain, samples, sets)
-    if not is_suspicious(before):
+    is_fitting = not is_suspicious(before)
+    if is_fitting and (before.chain is None or any(len(item.positions()) for item in samples)):
         return Diagnosis(before), None
-    from .trials import try_hypotheses  # lazy import: few measurements are suspicious
+    from .trials import try_hypotheses, try_ratios  # lazy import: few measurements are suspicious
 
+    if is_fitting:
+        return try_ratios(chain, samples, sets, before, progress), None
     return try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_RATIO, Diagnosis, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -34,8 +34,6 @@ from .hypotheses import (
 )
 from .misfit import MAX_MISFIT, nominal_misfits
 
-# Logarithm of the ratio of evidence above which a hypothesis is decisive. Honest data reach 4.
-_MIN_LOG_RATIO = 15.0
 # Hypotheses within this difference of the best one are reported beside it.
 _MAX_LOG_TIE = 3.0
 # Number of pairs of mistakes with the smallest misfits, and of those among them that change the samples
@@ -62,8 +60,13 @@ _MAX_ZERO, _ZERO_STEPS, _FINE_ZERO_STEPS = 180.0, (20.0, 4.0, 1.0, 0.2), ((6.0, 
 # the robot, which the calibration corrects.
 _MAX_RATIO, _RATIO_STEPS, _FINE_RATIO_STEPS = 110.0, (5.0, 1.0, 0.2), ((1.5, 0.5), (0.3, 0.1))
 _MIN_RATIO = 4.0
-# Sizes of ratios one of which explains measurements without positions better, if others do.
-_PROBED_RATIOS = (-5.0, 5.0)
+# Without positions each size needs a fit. Only the mistake is measured that explains measurements best with
+# one of these sizes, and zeros only up to a smaller angle, in larger steps [deg].
+_PROBED_RATIOS, _PROBED_ZEROS = (-5.0, 5.0), (-40.0, -20.0, -10.0, 10.0, 20.0, 40.0)
+_MAX_FITTED_ZERO, _FITTED_ZERO_STEPS = 50.0, (10.0, 3.0)
+# Without positions, several wrong zeros of a hand-built arm explain much of what one does. One is believed if
+# its evidence exceeds theirs by this logarithm: by 13 where one was wrong, by 3 where several were.
+_MIN_LOG_ADVANTAGE = 6.0
 # A ratio is refined if it brings the nominal robot nearer by this factor.
 _MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
@@ -156,7 +159,7 @@ def try_hypotheses(
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         # The zeros of a hand-built arm are unknown in any case.
         inner = inner_revolute_joints(chain) if sets == MANUFACTURED else []
-        zeros = _measure_zeros(trial, [j for j in inner if misfit or j in changed])
+        zeros = _measure_zeros(trial, inner)
         large = [zero.candidate for zero in zeros if abs(zero.size) >= _MIN_ZERO]
         large += [ratio.candidate for ratio in _measure_ratios(trial)]
         scores += _scores(trial, _near(trial, large), SINGLES)
@@ -170,7 +173,20 @@ def try_hypotheses(
             likely = _decide(trial, [*scores, *_scores(trial, _near(trial, small), SINGLES)])
             if likely.is_certain:
                 return Diagnosis(before, zero=likely), None
+        if not misfit and measured.needs_no_larger_errors:
+            found = measured
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
+
+
+def try_ratios(
+    chain: Chain, samples: Sequence[Measurement], sets: str, before: Evidence, progress: Progress
+) -> Diagnosis:
+    """Look for a wrong gear ratio in samples without positions that a robot fits, with wrong lengths."""
+    misfit = float(nominal_misfits(chain, [samples])[0])
+    trial = Trial(chain, samples, sets, before, misfit, (), Diagnosis(before), progress)
+    ratios = [] if misfit else [each.candidate for each in _measure_ratios(trial)]
+    found = _decide(trial, _scores(trial, ratios, SINGLES))
+    return found if found.is_certain else Diagnosis(before)
 
 
 def _near(trial: Trial, candidates: Sequence[_Candidate]) -> list[_Candidate]:
@@ -197,13 +213,25 @@ def _measured(trial: Trial, of_size: Callable[[float], Hypothesis], size: float)
 def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
     """Return the zeros of joints that are wrong, by the angles of greatest evidence."""
     zeros = []
-    for joint in joints:
-        of_angle = partial(zero_hypothesis, trial.chain, joint)
-        best = _closest(trial, of_angle, _MAX_ZERO, _ZERO_STEPS)
+    kinds = [partial(zero_hypothesis, trial.chain, joint) for joint in joints]
+    reach, steps = _MAX_ZERO, _ZERO_STEPS
+    if not trial.misfit:
+        kinds, reach, steps = (
+            _most_explaining(trial, kinds, _PROBED_ZEROS),
+            _MAX_FITTED_ZERO,
+            _FITTED_ZERO_STEPS,
+        )
+    for of_angle in kinds:
+        best = _closest(trial, of_angle, reach, steps)
         is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
         if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:
             zeros += _measured(trial, of_angle, best)
-    return _refine(trial, zeros, _FINE_ZERO_STEPS, _MIN_LIKELY_ZERO)
+    refined = _refine(trial, zeros, _FINE_ZERO_STEPS, _MIN_LIKELY_ZERO)
+    if refined and not trial.misfit:
+        least = fit_evidence(trial.chain, trial.samples, HAND_BUILT).log + _MIN_LOG_ADVANTAGE
+        logs = [fit_evidence(trial.chain, zero.candidate.changed, trial.sets).log for zero in refined]
+        refined = [zero for zero, log in zip(refined, logs, strict=True) if log >= least]
+    return refined
 
 
 def _measure_ratios(trial: Trial) -> list[_Measured]:
@@ -212,10 +240,7 @@ def _measure_ratios(trial: Trial) -> list[_Measured]:
     groups = [*groups, revolute] if len(revolute) > 1 else groups
     kinds = [partial(_ratio_of_logarithm, trial.chain, joints) for joints in groups]
     if not trial.misfit:
-        # Without positions, each size needs a fit: only the kind is measured that explains most.
-        costs = [_costs(trial, _with_sizes(trial, kind, _PROBED_RATIOS)).min() for kind in kinds]
-        is_explaining = -min(costs) >= trial.before.log + _MIN_LOG_RATIO
-        kinds = [kinds[int(np.argmin(costs))]] if is_explaining else []
+        kinds = _most_explaining(trial, kinds, _PROBED_RATIOS)
     ratios = []
     for of_logarithm in kinds:
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
@@ -223,6 +248,15 @@ def _measure_ratios(trial: Trial) -> list[_Measured]:
             ratios += _measured(trial, of_logarithm, best)
     near = [each for each in ratios if _MIN_RATIO_GAIN * each.candidate.misfit <= trial.misfit]
     return _refine(trial, near, _FINE_RATIO_STEPS, _MIN_RATIO)
+
+
+def _most_explaining(
+    trial: Trial, kinds: Sequence[Callable[[float], Hypothesis]], sizes: Sequence[float]
+) -> list[Callable[[float], Hypothesis]]:
+    """Return the kind of mistake that explains most at one of several sizes, if it explains anything."""
+    costs = [_costs(trial, _with_sizes(trial, kind, sizes)).min() for kind in kinds]
+    is_explaining = -min(costs, default=np.inf) > trial.before.log + _MAX_LOG_TIE
+    return [kinds[int(np.argmin(costs))]] if is_explaining else []
 
 
 def _ratio_of_logarithm(chain: Chain, joints: Sequence[int], size: float) -> Hypothesis:
@@ -330,7 +364,7 @@ def _candidates(chain: Chain, changes: Iterable[_Change]) -> Iterator[_Candidate
 
 def _largest_misfit(trial: Trial, others: Sequence[_Candidate] = ()) -> float:
     """Return the largest misfit of a hypothesis that is tried."""
-    smallest = min(trial.misfit, *(each.misfit for each in (*trial.candidates, *others)))
+    smallest = min([trial.misfit, *(each.misfit for each in (*trial.candidates, *others))])
     return float(np.clip(_MAX_MISFIT_RATIO * smallest, _MIN_MISFIT, _LARGEST_MISFITS[trial.sets]))
 
 
@@ -361,7 +395,7 @@ def _decide(trial: Trial, scored: Sequence[_Score], is_partial: bool = False) ->
     ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
     # If something else is wrong, too (`is_partial`), no robot needs to fit.
     ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]
-    if best - trial.before.log < _MIN_LOG_RATIO or not ties:
+    if best - trial.before.log < MIN_LOG_RATIO or not ties:
         return Diagnosis(trial.before)
     log, _, after = ties[0]
     hypotheses = tuple(hypothesis for _, hypothesis, _ in ties)
