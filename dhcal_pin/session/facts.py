@@ -435,7 +435,10 @@ def describe_lag(causes: tuple[Cause, ...], changes: RobotChanges, timeline: Tim
     edges = [0, *np.searchsorted(numbers, steps).tolist(), len(numbers)]
     parts = tuple(
         LagPart(
-            *(timeline.place(int(numbers[i])) for i in (a, b - 1)), *(float(values[i]) for i in (a, b - 1))
+            timeline.place(int(numbers[a])),
+            timeline.place(int(numbers[b - 1])),
+            float(values[a]),
+            float(values[b - 1]),
         )
         for a, b in pairwise(edges)
     )
