@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ MIN_ANGLE_RATIO = 10.0
 MAX_SCALE_CHANGE = 0.5
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
+# Smallest lag that is stated, in standard deviations.
+NO_LAG = 4.0
 # What a robot touches: its motion has the effect of one of the base.
 TOUCHED = "touched object"
 
@@ -141,27 +144,72 @@ class SlowChange:
 
 
 @frozen
+class LagPart:
+    """Samples of a session with one lag, or with one that changes steadily."""
+
+    first: Place  # Place of the first sample
+    last: Place  # Place of the last sample
+    begin: float  # Lag at the first sample, in the unit of the lag
+    end: float  # Lag at the last sample
+
+
+@frozen
 class Lag:
     """Delay between joint values and measured values."""
 
-    value: float  # Time by which the joint values are too early, in `unit`
+    value: float  # Time by which the joint values are too early at the end, in `unit`
     std: float  # Standard deviation of the value
     unit: str  # "row" or "s"
     is_corrected: bool = True  # Whether the samples are fitted with the joint values of the right time
+    parts: tuple[LagPart, ...] = ()  # Parts of the session; several if the lag changed suddenly
+    rate: float = 0.0  # Steady change of the lag per unit of time
 
     @property
     def finding(self) -> str:
         """What was found."""
+        if self.rate:
+            begin, end = self.parts[0].begin, self.parts[-1].end
+            size = f", {format_fixed(1e6 * abs(self.rate), 0)} ppm" if self.unit == "s" else ""
+            return (
+                "The clocks of joint values and measured values drift apart: the joint values are "
+                f"{self._text(begin)} at the begin, and {self._text(end)} at the end{size}."
+            )
+        text = f"The joint values are {self._text(self.value)}"
+        if len(self.parts) > 1:
+            begun, last = self.parts[-2:]
+            of_file = f" of {last.first.file}" if last.first.file else ""
+            text += f" from line {last.first.line}{of_file} on, and {self._text(begun.end)} before"
+        return f"{text}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the lag for the JSON document."""
+        parts = [{"file": p.first.file, "line": p.first.line, "value": p.begin} for p in self.parts]
+        return {"value": self.value, "std": self.std, "unit": self.unit, "parts": parts, "rate": self.rate}
+
+    def _text(self, value: float) -> str:
+        """Describe the time of the joint values."""
+        if abs(value) < NO_LAG * self.std:
+            return "at the time of the measured values"
         unit = {"row": "rows"}.get(self.unit, self.unit)
-        size = f"{format_fixed(abs(self.value), 3)} {unit}"
-        word = "earlier" if self.value > 0 else "later"
-        return f"The joint values are {size} {word} than the measured values."
+        size = f"{format_fixed(abs(value), 3)} {unit}"
+        return f"{size} {'earlier' if value > 0 else 'later'} than the measured values"
 
     @property
     def consequence(self) -> str:
         """What to do."""
         corrected = "The calibration corrected this. " * self.is_corrected
-        return f"{corrected}Record both at the same time, or add --mend lag:{self.value:.4g}."
+        if self.rate:
+            return f"{corrected}Record both with one clock."
+        if len(self.parts) < 2:
+            return f"{corrected}Record both at the same time, or add --mend lag:{self.value:.4g}."
+        mends = [
+            f"--mend lag:{part.end:.4g}@{part.first.file}:{part.first.line}-{part.last.last_line}"
+            for part in self.parts
+            if abs(part.end) >= NO_LAG * self.std
+        ]
+        is_one_file = len({place.file for part in self.parts for place in (part.first, part.last)}) == 1
+        options = f", or add {' '.join(mends)}" if is_one_file and self.parts[0].first.file else ""
+        return f"{corrected}Record both with one clock{options}."
 
 
 @frozen
@@ -256,7 +304,7 @@ class Session:
         return {
             "events": [event.to_dict() for event in self.events],
             "drift": [drift.to_dict() for drift in self.drifts],
-            "lag": {"value": lag.value, "std": lag.std, "unit": lag.unit} if lag else None,
+            "lag": lag.to_dict() if lag else None,
             "scale": {"factor": scale.factor, "std": scale.std, "axis": scale.axis} if scale else None,
             "unordered": not self.is_ordered,
         }
@@ -304,7 +352,7 @@ def describe_events(
     causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> tuple[Event, ...]:
     """Describe the sudden changes, in the order of measurement."""
-    steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step)]
+    steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step) and c.block.kind != "lag"]
     events = []
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
@@ -374,13 +422,39 @@ def _largest_change(cause: Cause, timeline: Timeline) -> tuple[Array, Array]:
     return values, by_values @ cause.covariance @ by_values.T
 
 
+def describe_lag(causes: tuple[Cause, ...], changes: RobotChanges, timeline: Timeline) -> Lag | None:
+    """Describe the delay of the joint values, which may change suddenly or steadily."""
+    own = [cause for cause in causes if cause.block.kind == "lag"]
+    if not own:
+        return None
+    numbers, times = np.concatenate(timeline.numbers), np.concatenate(timeline.times)
+    order = np.argsort(numbers)[timeline.begin :]
+    numbers, times = numbers[order], times[order]
+    values = changes.lag_at(numbers, times)
+    steps = sorted({c.shape.number for c in own if isinstance(c.shape, Step)})
+    edges = [0, *np.searchsorted(numbers, steps).tolist(), len(numbers)]
+    parts = tuple(
+        LagPart(
+            timeline.place(int(numbers[a])),
+            timeline.place(int(numbers[b - 1])),
+            float(values[a]),
+            float(values[b - 1]),
+        )
+        for a, b in pairwise(edges)
+    )
+    has_drift = any(isinstance(cause.shape, Drift) for cause in own)
+    rate = (parts[-1].end - parts[-1].begin) / (times[-1] - times[edges[-2]]) if has_drift else 0.0
+    std = max(float(np.sqrt(cause.covariance[0, 0])) for cause in own)
+    return Lag(parts[-1].end, std, timeline.unit, parts=parts, rate=float(rate))
+
+
 def describe_drifts(
     causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> Iterator[SlowChange]:
     """Describe the slow changes."""
     for cause in causes:
         shape = cause.shape
-        if isinstance(shape, Drift | FreeDrift):
+        if isinstance(shape, Drift | FreeDrift) and cause.block.kind != "lag":
             constant = shape.time_constant if isinstance(shape, Drift) else np.inf
             law = "linear" if np.isinf(constant) else "exponential"
             yield SlowChange(

@@ -24,7 +24,7 @@ from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from ..robot.joint_path import joint_path
-from .causes import Cause, Change, Constant, Drift, FreeDrift, Step
+from .causes import Cause, Change, Constant, Drift, FreeDrift, Shape, Step
 from .timeline import Timeline
 
 
@@ -71,12 +71,19 @@ class RobotChanges:
     # Changes of the payload: functions of time, and change of the payload times the compliance of each joint,
     # (n,) [kg·rad/Nm].
     payload: tuple[tuple[Change, Array], ...] = ()
-    lag: float = 0.0  # Time by which the joint values are too early, in the unit of the timeline
+    # Times by which the joint values are too early: functions of time, and amplitudes in the unit of the
+    # timeline.
+    lag: tuple[tuple[Shape, float], ...] = ()
 
     @property
     def without_lag(self) -> RobotChanges:
         """The changes without a lag, which is a mistake of the recording and not of the robot."""
-        return replace(self, lag=0.0)
+        return replace(self, lag=())
+
+    def lag_at(self, numbers: Array, times: Array) -> Array:
+        """Return the lag of each sample, (m,), in the unit of the timeline."""
+        parts = [amplitude * shape.values(numbers, times)[:, 0] for shape, amplitude in self.lag]
+        return sum(parts, np.zeros(len(numbers)))
 
     @property
     def of_frames(self) -> RobotChanges:
@@ -93,7 +100,9 @@ class RobotChanges:
         )
 
     def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:
-        """Return the changes with a step of base, tool, payload or a joint at another sample."""
+        """Return the changes with a step of base, tool, payload, lag or a joint at another sample."""
+        if kind == "lag":
+            return replace(self, lag=tuple((Step(new) if f == Step(old) else f, v) for f, v in self.lag))
         if kind == "joint":
             moved = (i == joint and isinstance(f, Step) and f.number == old for i, f, _ in self.zeros)
             zeros = [
@@ -160,15 +169,15 @@ class JointPaths:
         self._starts = np.array(bounds[:-1])
         self._splines = [joint_path(times[a:b], q[a:b]) for a, b in pairwise(bounds)]
 
-    def evaluate(self, numbers: Array, times: Array, lag: float) -> tuple[Array, Array]:
-        """Return the joint positions by a lag later, and their rates, (m, n) each."""
+    def evaluate(self, numbers: Array, times: Array, lag: Array) -> tuple[Array, Array]:
+        """Return the joint positions by the lag of each sample later, and their rates, (m, n) each."""
         files = np.searchsorted(self._starts, numbers, side="right") - 1
         n = self._splines[0](0.0).shape[-1]
         positions, rates = np.zeros((len(numbers), n)), np.zeros((len(numbers), n))
         for i, spline in enumerate(self._splines):
             chosen = files == i
-            positions[chosen] = spline(times[chosen] + lag)
-            rates[chosen] = spline(times[chosen] + lag, 1)
+            positions[chosen] = spline(times[chosen] + lag[chosen])
+            rates[chosen] = spline(times[chosen] + lag[chosen], 1)
         return positions, rates
 
 
@@ -178,7 +187,9 @@ def apply_changes(
     """Return fitted and held-out measurements with the changes as conditions; a lag needs the paths."""
     out = []
     for item, numbers, times in zip(timeline.data, timeline.numbers, timeline.times, strict=True):
-        later = paths.evaluate(numbers, times, changes.lag)[0] if paths and changes.lag else None
+        later = None
+        if paths and changes.lag:
+            later = paths.evaluate(numbers, times, changes.lag_at(numbers, times))[0]
         known = item.recorded or Conditions(item.q)
         out.append(item.replace(recorded=changes.conditions(known, chain, numbers, times, later)))
     return tuple(out[: timeline.n_fitted]), tuple(out[timeline.n_fitted :])
@@ -192,7 +203,7 @@ def update(
     zeros: list[tuple[int, Change, Array]] = []
     growth: list[tuple[Change, Array]] = []
     payload: list[tuple[Change, Array]] = []
-    lag = changes.lag
+    lag: list[tuple[Shape, float]] = []
     for kind, motion in motions.items():
         chosen = [(c.shape, d) for c, d in zip(causes, steps, strict=True) if c.block.kind == kind]
         jumps = [(shape.number, d) for shape, d in chosen if isinstance(shape, Step)]
@@ -213,7 +224,7 @@ def update(
         ]
         motions[kind] = replace(motion, poses=poses, drifts=tuple(drifts))
     of_joints = {(joint, shape): values for joint, shape, values in changes.zeros}
-    of_links, of_payload = dict(changes.growth), dict(changes.payload)
+    of_links, of_payload, of_lag = dict(changes.growth), dict(changes.payload), dict(changes.lag)
     for cause, d in zip(causes, steps, strict=True):
         shape = cause.shape
         if not isinstance(shape, Constant) and cause.block.kind == "joint":
@@ -227,7 +238,6 @@ def update(
         if not isinstance(shape, Constant) and cause.block.kind == "payload":
             payload.append((shape, of_payload.get(shape, 0.0) + d))
         if cause.block.kind == "lag":
-            lag += float(d[0])
-    if not any(cause.block.kind == "lag" for cause in causes):
-        lag = 0.0
-    return RobotChanges(motions["base"], motions["tool"], tuple(zeros), tuple(growth), tuple(payload), lag)
+            lag.append((shape, of_lag.get(shape, 0.0) + float(d[0])))
+    of_robot = motions["base"], motions["tool"], tuple(zeros), tuple(growth), tuple(payload)
+    return RobotChanges(*of_robot, tuple(lag))

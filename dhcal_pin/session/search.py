@@ -41,7 +41,7 @@ from ..measurements.base import Measurement, residual_of
 from ..measurements.configurations import group_by_configuration
 from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import MAX_SCALE_CHANGE, Event, Lag, Scale, Session
+from .facts import MAX_SCALE_CHANGE, Event, Scale, Session, describe_lag
 from .linear_model import Layout, covariance_root, inverse, solve_information, whitened_rows
 from .part_bases import place_parts, starts_of_parts
 from .robot_changes import JointPaths, Motion, RobotChanges, apply_changes, update
@@ -78,6 +78,8 @@ N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 MIN_ORDER_EVIDENCE, MAX_ORDER_CORRELATION = 4.0, 0.9
 # Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
 MAX_OUTLIER_SHARE = 0.25
+# Logarithm of the ratio of the noises from which a search begins with a lag from some sample on.
+MIN_LAG_GAIN = 0.5
 # Smallest lag, relative to the time between samples.
 MIN_LAG = 0.01
 # Time constants of drifts, relative to the duration of the session.
@@ -207,6 +209,15 @@ class _Search:
         self.changes = RobotChanges(base)
         self.first_fit = self._fit()
 
+    def move_lag(self) -> None:
+        """Begin with a lag from some sample on."""
+        block = next(block for block in self.layout.blocks if block.kind == "lag")
+        self.causes = [Cause(block, Constant(), np.zeros(1), np.zeros((1, 1)))]
+        fit = self.iterate(self._fit())
+        if places := self._shapes(Step, ()):
+            self._add(next(self._scores(fit, [block], places, self._products(fit))))
+        self.first_fit = self._settle()
+
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:
         """Return the whitened rows with the current unknowns and changes."""
@@ -214,7 +225,7 @@ class _Search:
         rates = np.zeros((len(self.order), self.chain.n_joints))
         if self.paths is not None:
             numbers, times = self.part.fitted_numbers, self.part.fitted_times
-            rates = self.paths.evaluate(numbers, times, self.changes.lag)[1]
+            rates = self.paths.evaluate(numbers, times, self.changes.lag_at(numbers, times))[1]
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
         for cause in self.causes:
             # A constant payload is part of the model, and changes nothing over time.
@@ -407,6 +418,8 @@ class _Search:
         if block.is_constant:
             is_shown = self.has_different_rows and (block.kind != "lag" or self.paths is not None)
             kinds: list[type[Shape]] = [Constant] if is_shown else []
+            if is_shown and any(cause.block is block for cause in self.causes) and block.kind == "lag":
+                kinds = [Step, Drift]
         else:
             used = {
                 type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)
@@ -874,6 +887,12 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
             starts.append(_Search(moved[0], np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS))
             starts[-1].move_base(moved[1])
     noises = [search.log_noise(search.first_fit) for search in starts]
+    if starts[0].paths is not None and starts[0].has_different_rows:
+        delayed = _Search(problem, np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)
+        delayed.move_lag()
+        # Two more unknowns reduce the noise of anything else a little, too.
+        if (noise := delayed.log_noise(delayed.first_fit)) < min(noises) - MIN_LAG_GAIN:
+            starts, noises = [*starts, delayed], [*noises, noise]
     search = starts[int(np.argmin(noises))]
     search.run()
     # A search that ends in a wrong minimum says nothing.
@@ -888,7 +907,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     constants = [
         (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
         for cause in causes
-        if cause.block.is_constant
+        if isinstance(cause.shape, Constant)
     ]
     return Session(
         timeline,
@@ -897,9 +916,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search.changes,
         causes,
         (other_robot,) if other_robot else (),
-        lag=next(
-            (Lag(value, std, timeline.unit) for kind, value, std, _ in constants if kind == "lag"), None
-        ),
+        lag=describe_lag(causes, search.changes, timeline),
         scales=tuple(
             Scale(1 + value, std, axis)
             for kind, value, std, axis in constants

@@ -311,7 +311,7 @@ def test_paths_of_joints_are_those_of_each_file():
     ]
     timeline = order_samples(items, ())
     numbers = timeline.fitted_numbers
-    found = JointPaths(timeline).evaluate(numbers, timeline.fitted_times, lag)
+    found = JointPaths(timeline).evaluate(numbers, timeline.fitted_times, np.full(len(numbers), lag))
     for i, (t, functions) in enumerate(zip(times, paths, strict=True)):
         for each, f in zip(found, functions, strict=True):
             inner = slice(40 * i + 5, 40 * i + 35)
