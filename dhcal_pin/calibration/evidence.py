@@ -103,6 +103,8 @@ class Evidence(FittedModel):
     #: Function that calibrates with all parameters of the arm, base and tool; None if this calibration did,
     #: or if a smaller choice was deliberate.
     with_full_set: Callable[[], Evidence] | None = None
+    #: Function that calibrates as a hand-built arm; None if this calibration did, or with chosen parameters.
+    with_low_cost: Callable[[], Evidence] | None = None
     has_default_sets: bool = False  #: Whether the parameter sets are the default ones of the robot
     #: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are those
     #: of the URDF.

@@ -185,6 +185,8 @@ def calibrate(
         "has_default_sets": parameters is None,
         "signs": setup.signs,
     }
+    if parameters is None and method == "lm" and not setup.signs and not has_images(setup.data):
+        settings["with_low_cost"] = partial(again, parameters=HAND_BUILT)
     begun = _begin(setup)
     # The confirmation of changes and the calibration itself often need the same fits.
     groups = _prior_groups(begun.fit, setup.priors)

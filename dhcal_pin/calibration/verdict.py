@@ -35,8 +35,10 @@ from ..measurements.contact import PointContact
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
-from ..plausibility.diagnosis import Diagnosis
+from ..plausibility.diagnosis import Diagnosis, is_suspicious
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
+from ..plausibility.drawn_samples import fit_drawn_samples
+from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
 from ..session.linear_model import measures_positions
@@ -666,8 +668,18 @@ def needed_frames(
 
 def _lacks_parameters(fit: Evidence) -> bool:
     """Return whether more parameters of the robot than the estimated ones fit the measurements."""
-    n_minimal = len(select_parameters(fit.errors.chain, "minimal").parameters)
-    return fit.diagnosis.is_explained and fit.errors.is_of_arm.sum() < n_minimal
+    # Base and tool take the place of some errors of the arm.
+    n_minimal = select_parameters(fit.errors.chain, MANUFACTURED).is_of_arm.sum()
+    return fit.diagnosis.is_explained and bool(fit.errors.is_of_arm.sum() < n_minimal)
+
+
+def _is_hand_built(fit: Evidence) -> bool:
+    """Return whether the measurements fit a hand-built arm, and its calibration is not refused."""
+    if fit.with_low_cost is None:
+        return False
+    as_hand_built = fit_drawn_samples(fit.errors.chain, fit.data, HAND_BUILT)
+    is_explaining = as_hand_built.log > fit.diagnosis.before.log and not is_suspicious(as_hand_built)
+    return is_explaining and not judge(fit.with_low_cost()).is_refused
 
 
 def _configuration_checks(fit: Evidence) -> str:
@@ -705,6 +717,10 @@ def _plausible_cause(fit: Evidence) -> str:
         return fit.session.scales[0].finding
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
+    if _is_hand_built(fit):
+        return (
+            "The measurements fit a hand-built arm with larger errors of zeros and lengths: --arm low-cost."
+        )
     tried = "No single mistake that is tried explains it, and no pair. " * fit.diagnosis.is_suspicious
     return (
         f"{tried}Check the robot, its tip, the units, order, signs and zeros of the joints, and the notation "

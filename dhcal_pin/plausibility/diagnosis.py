@@ -130,6 +130,14 @@ class Diagnosis:
             return "Correct these lines."
         if kinds == {"sign"} and not self.source and ALL not in names:
             return f"Add --turned {','.join(sorted({*turned} ^ names)) or 'none'}."
+        if kinds == {"ratio"} and not self.source:
+            # The factor of the joint values is the inverse of that of the counts.
+            factors = [(part.key.split(":")[1], 1 / float(part.key.split(":")[2])) for part in parts]
+            changes = [f"of {'all joints' if name == ALL else name} by {f:.4g}" for name, f in factors]
+            return (
+                f"Multiply counts_per_turn {join_names(changes)} in the servo file (where it is not stated, "
+                "it is the resolution)."
+            )
         if kinds <= {"zero", "ratio"} and not self.source:
             return f"Correct the motors of {join_names(sorted(names))} in the servo file."
         return "Correct the measurements."

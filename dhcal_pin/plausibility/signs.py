@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from ..robot.sampling import random_configurations
 from ..robot.urdf_edit import with_turned_joints
 from .drawn_samples import comparable_items, draw_samples, has_enough_rows
 from .evidence import HAND_BUILT, Evidence, fit_evidence
-from .hypotheses import Hypothesis, JointChange
+from .hypotheses import Hypothesis, JointChange, inner_revolute_joints, zero_hypothesis
 
 # Logarithm of the ratio of evidence above which a sign is decided. Where the signs of simulated arms are
 # decided wrongly, with few or similar poses, it is below 3; with 25 different poses it is above 15.
@@ -48,8 +48,10 @@ _N_CONFIGURATIONS, _MIN_DISTANCE = 1000, 0.01
 _LARGEST_ZEROS = 1.5
 # Play of the joints in simulations [rad].
 _PLAY = np.deg2rad(0.5)
-# Number of open questions that are stated.
-_MAX_LISTED = 3
+# Number of other sets of turned joints that are stated.
+_MAX_LISTED = 7
+# Zeros that may be wrong in place of signs [deg]: quarter turns, as of a URDF with another zero pose.
+_QUARTER_TURNS = (90.0, -90.0, 180.0)
 
 
 @frozen
@@ -105,7 +107,40 @@ class SignDecision:
                 "least 8, or touched points with known distances. Look which joints turn the other way than "
                 "in the URDF, and name them: --turned NAME[,NAME] or --turned none."
             ]
-        return [self._question(each) for each in self.open[:_MAX_LISTED]]
+        if len(self.open) > 1:
+            return [self._common_question()]
+        return [self._question(each) for each in self.open]
+
+    def _common_question(self) -> str:
+        """State several open questions at once: the answer to one changes the options of the others."""
+        sets = [self.turned, *(self._other(each) for each in self.open[:_MAX_LISTED])]
+        names = [name for name in self.joint_names if any(name in each.joints for each in self.open)]
+        options = [f"--turned {','.join(each) or 'none'}" for each in sets]
+        text = (
+            f"The signs of {', '.join(names)} are open: with other zeros, the arm fits the measurements "
+            f"about as well with {', '.join(options[:-1])} or {options[-1]}. Look which joints turn the other"
+            " way than about their axes in the URDF by the right-hand rule. Add the option that names these"
+        )
+        likely = self.open[0]
+        if likely.distance is None or likely.distance <= _MIN_DISTANCE:
+            return f"{text}."
+        return (
+            f"{text}, or measure at {self._pose(likely)}: between the first two, the tools are "
+            f"{_apart(likely.distance)} apart there."
+        )
+
+    def _other(self, open_signs: OpenSigns) -> tuple[str, ...]:
+        """Return the joints that turn the other way if the answer to an open question is the other one."""
+        return tuple(
+            name for name in self.joint_names if (name in self.turned) != (name in open_signs.joints)
+        )
+
+    def _pose(self, open_signs: OpenSigns) -> str:
+        """State the configuration that decides an open question."""
+        values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
+        return ", ".join(
+            f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values
+        )
 
     def _question(self, open_signs: OpenSigns) -> str:
         """State an open question and what decides it."""
@@ -119,21 +154,25 @@ class SignDecision:
         if open_signs.distance is None:
             text += "Look"
         elif open_signs.distance > _MIN_DISTANCE:
-            values = zip(self.joint_names, open_signs.configuration, self.is_prismatic, strict=True)
-            pose = ", ".join(
-                f"{n} {1e3 * v:.0f} mm" if p else f"{n} {np.rad2deg(v):.0f} deg" for n, v, p in values
+            apart = _apart(open_signs.distance)
+            text += (
+                f"A measurement at {self._pose(open_signs)} decides it (the tools are {apart} apart there), "
+                "or look"
             )
-            apart = format_quantity(open_signs.distance, "m", 0.1 * open_signs.distance)
-            text += f"A measurement at {pose} decides it (the tools are {apart} apart there), or look"
         else:
             text += "No position of the tool decides it: look"
-        other = tuple(name for name in self.joint_names if (name in self.turned) != (name in names))
+        other = self._other(open_signs)
         as_in_urdf, reversed_ = (self.turned, other) if first in other else (other, self.turned)
         options = [f"--turned {','.join(each) or 'none'}" for each in (as_in_urdf, reversed_)]
         return (
             f"{text} whether rising values turn {first} about its axis in the URDF by the right-hand rule. "
             f"If so, add {options[0]}; if not, add {options[1]}."
         )
+
+
+def _apart(distance: float) -> str:
+    """State the distance of two tools."""
+    return format_quantity(distance, "m", 0.1 * distance)
 
 
 def known_signs(chain: Chain, turned: Sequence[str]) -> SignDecision:
@@ -164,6 +203,10 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
     limit = fits[ranked[0]].log - MIN_LOG_RATIO
     possible = [turned for turned in ranked if fits[turned].log >= limit]
     chosen = min(possible, key=len)
+    is_plain = possible == [()]
+    if not is_plain and _best_quarter_turn(chain, samples) >= fits[ranked[0]].log + MIN_LOG_RATIO:
+        # The zero of one joint is wrong, and no sign.
+        return replace(undecided, is_compared=True)
     others = [turned for turned in possible if turned != chosen]
     shows_positions = any(len(item.positions()) for item in samples)
     return replace(
@@ -172,6 +215,13 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
         turned=_names(chain, chosen),
         open=tuple(_open_signs(chain, chosen, other, fits, shows_positions) for other in others),
     )
+
+
+def _best_quarter_turn(chain: Chain, samples: Sequence[Measurement]) -> float:
+    """Return the logarithm of the largest evidence with the zero of one joint off by a quarter turn."""
+    zeros = [zero_hypothesis(chain, *each) for each in product(inner_revolute_joints(chain), _QUARTER_TURNS)]
+    changed = [zero.apply(samples) for zero in zeros]
+    return max((fit_evidence(chain, each, HAND_BUILT).log for each in changed if each), default=-np.inf)
 
 
 def _fit_signs(chain: Chain, samples: Sequence[Measurement]) -> dict[tuple[int, ...], Evidence]:

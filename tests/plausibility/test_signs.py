@@ -13,10 +13,13 @@ from touching_arms import TouchingArm
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.exceptions import InvalidArgumentError
-from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.io.servo_file import read_servos
+from dhcal_pin.measurements import Pose, Position, Wires
 from dhcal_pin.plausibility import decide_signs
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
-from dhcal_pin.plausibility.hypotheses import list_hypotheses
+from dhcal_pin.plausibility.evidence import HAND_BUILT, fit_evidence
+from dhcal_pin.plausibility.hypotheses import list_hypotheses, mend, ratio_hypothesis
+from dhcal_pin.plausibility.mixups import diagnose_mixups
 from dhcal_pin.plausibility.signs import known_signs
 from dhcal_pin.robot import Chain, parse_urdf
 
@@ -228,6 +231,51 @@ def test_remedies_of_servos_are_allowed_beside_their_file(key, remedy):
     found = Diagnosis(NO_EVIDENCE, (hypothesis,))
     assert found.for_servos(("elbow_flex",)).remedy == remedy
     assert f"--mend {key}" in found.remedy
+
+
+def string_lengths(seed: int, pitch: float = 0.0) -> Wires:
+    """Return lengths of a string to a hobby arm; the joint values of its pitch are too large by an angle."""
+    rng = np.random.default_rng(seed)
+    truth, q = TouchingArm.random(seed, 8).truth, rng.uniform(-1.4, 1.4, (60, 5))
+    lengths = np.linalg.norm(truth.poses(q)[:, :3, 3] - [0.4, -0.1, 0.2], axis=1)
+    return Wires(q + pitch * np.eye(5)[3], (lengths + 5e-4 * rng.standard_normal(60))[:, None])
+
+
+@pytest.mark.parametrize("seed", some_slow(range(4), {0}))
+def test_a_quarter_turn_of_a_zero_is_no_reversed_joint(seed):
+    """A reversed base with a zero of 85° fitted the string, and a wrong quarter turn was named nowhere."""
+    data = string_lengths(seed, np.pi / 2)
+    signs = decide_signs(TOUCHING, [data])
+    assert (signs.turned, signs.open) == ((), ())
+    (found,) = diagnose_mixups(TOUCHING, [data], HAND_BUILT).hypotheses
+    assert found.key == "zero:pitch:-90deg"
+    # The remedy gives the values of the arm back.
+    np.testing.assert_allclose(mend(TOUCHING, data, found.key).configurations(), string_lengths(seed).q)
+
+
+def test_each_of_several_open_sets_of_signs_is_an_option_that_fits():
+    """Three sentences assumed different answers; an option taken literally was a mirrored arm."""
+    data = string_lengths(0)
+    signs = decide_signs(TOUCHING, [data])
+    (question,) = signs.questions
+    options = re.findall(r"--turned (\S+?)[,.]?(?= |$)", question)
+    assert len(options) == len(signs.open) + 1 > 2
+    assert options[0] == (",".join(signs.turned) or "none")
+    for option in options:
+        arm = known_signs(TOUCHING, [] if option == "none" else option.split(",")).apply(TOUCHING)
+        assert fit_evidence(arm, [data], HAND_BUILT).length_scale < 1e-3
+
+
+def test_a_wrong_ratio_of_a_servo_states_the_factor_of_its_counts(tmp_path):
+    """Values times 0.8 are true: q = (c - zero)·2π/counts_per_turn needs 1.25 times the counts per turn."""
+    found = Diagnosis(NO_EVIDENCE, (ratio_hypothesis(NOMINAL, [2], 0.8),)).for_servos(())
+    assert found.remedy.startswith("Multiply counts_per_turn of elbow_flex by 1.25 in the servo file (")
+    factor = float(re.search(r"by (\S+) in", found.remedy)[1])
+    written = [tmp_path / f"{i}.toml" for i in range(2)]
+    for path, count in zip(written, (4096, 4096 * factor), strict=True):
+        path.write_text(f"[motor.elbow_flex]\nresolution = 4096\ncounts_per_turn = {count}\n")
+    wrong, right = (read_servos(path).servos[0].step for path in written)
+    assert right / wrong == pytest.approx(0.8)
 
 
 def test_counts_of_servos_have_no_wrong_unit():
