@@ -145,7 +145,7 @@ def test_distances_have_no_time():
             10 if item.kind == "point" else 6 for item in data
         ]
         # Paths and directions are those of the touches alone.
-        q, _ = JointPaths(timeline).evaluate(np.arange(6, 36), np.arange(6.0, 36.0), 0.0)
+        q, _ = JointPaths(timeline).evaluate(np.arange(6, 36), np.arange(6.0, 36.0), np.zeros(30))
         np.testing.assert_allclose(q, contacts.q, atol=1e-12)
         (alone,) = order_samples([contacts], ()).directions
         directions = dict(zip([item.kind for item in data], timeline.directions, strict=True))
