@@ -174,7 +174,9 @@ def try_hypotheses(
             if likely.is_certain:
                 return Diagnosis(before, zero=likely), None
         if not misfit and measured.needs_no_larger_errors:
-            found = measured
+            # Several errors of a hand-built arm explain much, too.
+            hand_built = fit_evidence(chain, samples, HAND_BUILT)
+            found = measured if measured.log >= hand_built.log + MIN_LOG_RATIO else found
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
 

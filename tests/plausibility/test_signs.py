@@ -233,24 +233,24 @@ def test_remedies_of_servos_are_allowed_beside_their_file(key, remedy):
     assert f"--mend {key}" in found.remedy
 
 
-def string_lengths(seed: int, pitch: float = 0.0) -> Wires:
-    """Return lengths of a string to a hobby arm; the joint values of its pitch are too large by an angle."""
+def string_lengths(seed: int, wrong: float = 0.0) -> Wires:
+    """Return lengths of a string to a hobby arm; values of its shoulder are too large by an angle [rad]."""
     rng = np.random.default_rng(seed)
-    truth, q = TouchingArm.random(seed, 8).truth, rng.uniform(-1.4, 1.4, (60, 5))
+    truth, q = TouchingArm.random(seed, 8).truth, rng.uniform(-1.4, 1.4, (40, 5))
     lengths = np.linalg.norm(truth.poses(q)[:, :3, 3] - [0.4, -0.1, 0.2], axis=1)
-    return Wires(q + pitch * np.eye(5)[3], (lengths + 5e-4 * rng.standard_normal(60))[:, None])
+    return Wires(q + wrong * np.eye(5)[1], (lengths + 5e-4 * rng.standard_normal(40))[:, None])
 
 
-@pytest.mark.parametrize("seed", some_slow(range(4), {0}))
-def test_a_quarter_turn_of_a_zero_is_no_reversed_joint(seed):
-    """A reversed base with a zero of 85° fitted the string, and a wrong quarter turn was named nowhere."""
-    data = string_lengths(seed, np.pi / 2)
+@pytest.mark.parametrize("angle", [90, -90])
+def test_a_quarter_turn_of_a_zero_is_no_reversed_joint(angle):
+    """Reversed joints with zeros of 85° fitted the string about as well, and the zero was named nowhere."""
+    data = string_lengths(1, np.deg2rad(angle))
     signs = decide_signs(TOUCHING, [data])
-    assert (signs.turned, signs.open) == ((), ())
+    assert (signs.turned, signs.questions) == ((), [])
     (found,) = diagnose_mixups(TOUCHING, [data], HAND_BUILT).hypotheses
-    assert found.key == "zero:pitch:-90deg"
+    assert found.key == f"zero:shoulder:{-angle:+}deg"
     # The remedy gives the values of the arm back.
-    np.testing.assert_allclose(mend(TOUCHING, data, found.key).configurations(), string_lengths(seed).q)
+    np.testing.assert_allclose(mend(TOUCHING, data, found.key).configurations(), string_lengths(1).q)
 
 
 def test_each_of_several_open_sets_of_signs_is_an_option_that_fits():
