@@ -98,7 +98,7 @@ def _diagnose(
         if not any(one.is_suspicious for _, one in separate):
             return replace(diagnosis, fits_separately=True)
     found = trial.find_pair()
-    if lengths and not found.hypotheses and trial.single.needs_no_larger_errors:
+    if lengths and not found.hypotheses and trial.is_likely(trial.single):
         # A robot with large errors can touch unknown points after a wrong change: lengths must confirm it.
         return trial.single
     if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):

@@ -15,7 +15,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -64,9 +64,6 @@ _MIN_RATIO = 4.0
 # one of these sizes, and zeros only up to a smaller angle, in larger steps [deg].
 _PROBED_RATIOS, _PROBED_ZEROS = (-5.0, 5.0), (-40.0, -20.0, -10.0, 10.0, 20.0, 40.0)
 _MAX_FITTED_ZERO, _FITTED_ZERO_STEPS = 50.0, (10.0, 3.0)
-# Without positions, several wrong zeros of a hand-built arm explain much of what one does. One is believed if
-# its evidence exceeds theirs by this logarithm: by 13 where one was wrong, by 3 where several were.
-_MIN_LOG_ADVANTAGE = 6.0
 # A ratio is refined if it brings the nominal robot nearer by this factor.
 _MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
@@ -124,6 +121,13 @@ class Trial(NamedTuple):
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
 
+    def is_likely(self, found: Diagnosis) -> bool:
+        """Return whether a mistake explains samples without positions, and no other errors do."""
+        if found.after is None or found.after.width > self.before.width:
+            return False
+        # Several errors of a hand-built arm explain much, too.
+        return found.log >= fit_evidence(self.chain, self.samples, HAND_BUILT).log + MIN_LOG_RATIO
+
     def find_common(self, parts: Sequence[Diagnosis]) -> Diagnosis:
         """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
         counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
@@ -173,10 +177,8 @@ def try_hypotheses(
             likely = _decide(trial, [*scores, *_scores(trial, _near(trial, small), SINGLES)])
             if likely.is_certain:
                 return Diagnosis(before, zero=likely), None
-        if not misfit and measured.needs_no_larger_errors:
-            # Several errors of a hand-built arm explain much, too.
-            hand_built = fit_evidence(chain, samples, HAND_BUILT)
-            found = measured if measured.log >= hand_built.log + MIN_LOG_RATIO else found
+        if not misfit and trial.is_likely(measured):
+            found = measured
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
 
@@ -230,7 +232,7 @@ def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
             zeros += _measured(trial, of_angle, best)
     refined = _refine(trial, zeros, _FINE_ZERO_STEPS, _MIN_LIKELY_ZERO)
     if refined and not trial.misfit:
-        least = fit_evidence(trial.chain, trial.samples, HAND_BUILT).log + _MIN_LOG_ADVANTAGE
+        least = fit_evidence(trial.chain, trial.samples, HAND_BUILT).log + MIN_LOG_ADVANTAGE
         logs = [fit_evidence(trial.chain, zero.candidate.changed, trial.sets).log for zero in refined]
         refined = [zero for zero, log in zip(refined, logs, strict=True) if log >= least]
     return refined
