@@ -122,8 +122,11 @@ class Trial(NamedTuple):
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
 
     def is_likely(self, found: Diagnosis) -> bool:
-        """Return whether a mistake explains samples without positions, and no other errors do."""
+        """Return whether a ratio explains samples without positions, and no other errors do."""
         if found.after is None or found.after.width > self.before.width:
+            return False
+        if not all(each.key.startswith("ratio:") for each in found.hypotheses):
+            # Units of a joint and quarter turns change the values so far that large errors explain anything.
             return False
         # Several errors of a hand-built arm explain much, too.
         return found.log >= fit_evidence(self.chain, self.samples, HAND_BUILT).log + MIN_LOG_RATIO
