@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from heapq import nsmallest
@@ -166,7 +166,7 @@ def try_hypotheses(
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         # The zeros of a hand-built arm are unknown in any case.
         inner = inner_revolute_joints(chain) if sets == MANUFACTURED else []
-        zeros = _measure_zeros(trial, inner)
+        zeros = _measure_zeros(trial, inner, changed)
         large = [zero.candidate for zero in zeros if abs(zero.size) >= _MIN_ZERO]
         large += [ratio.candidate for ratio in _measure_ratios(trial)]
         scores += _scores(trial, _near(trial, large), SINGLES)
@@ -217,18 +217,17 @@ def _measured(trial: Trial, of_size: Callable[[float], Hypothesis], size: float)
         yield _Measured(of_size, size, candidate)
 
 
-def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
+def _measure_zeros(trial: Trial, joints: Sequence[int], changed: Collection[int]) -> list[_Measured]:
     """Return the zeros of joints that are wrong, by the angles of greatest evidence."""
     zeros = []
-    kinds = [partial(zero_hypothesis, trial.chain, joint) for joint in joints]
-    reach, steps = _MAX_ZERO, _ZERO_STEPS
+    kinds = {joint: partial(zero_hypothesis, trial.chain, joint) for joint in joints}
+    # Zeros that were found to be wrong by a quarter turn may be wrong by any angle.
+    wide = [kind for joint, kind in kinds.items() if trial.misfit or joint in changed]
+    searches = [(kind, _MAX_ZERO, _ZERO_STEPS) for kind in wide]
     if not trial.misfit:
-        kinds, reach, steps = (
-            _most_explaining(trial, kinds, _PROBED_ZEROS),
-            _MAX_FITTED_ZERO,
-            _FITTED_ZERO_STEPS,
-        )
-    for of_angle in kinds:
+        probed = _most_explaining(trial, [*kinds.values()], _PROBED_ZEROS)
+        searches += [(kind, _MAX_FITTED_ZERO, _FITTED_ZERO_STEPS) for kind in probed if kind not in wide]
+    for of_angle, reach, steps in searches:
         best = _closest(trial, of_angle, reach, steps)
         is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
         if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:

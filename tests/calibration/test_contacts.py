@@ -12,7 +12,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import MultiTargetPosition, Noise, PointContact, PointDistance
 from dhcal_pin.plausibility import diagnose_mixups
 from dhcal_pin.plausibility.evidence import HAND_BUILT, MANUFACTURED
-from dhcal_pin.plausibility.hypotheses import RowShift
+from dhcal_pin.plausibility.hypotheses import RowShift, mend
 
 
 def touched(distance_factor=1.0, zero=0.0, sigma=None):
@@ -165,12 +165,15 @@ def test_a_wrong_zero_among_contacts_is_named(joint, angle):
     nominal, contacts, distances = touched()
     wrong = contacts.resample(contacts.q + np.deg2rad(angle) * np.eye(6)[joint])
     found = diagnose_mixups(nominal, [wrong, distances])
-    (hypothesis,) = (found if abs(angle) > 9 else found.zero).hypotheses
+    named = found if abs(angle) > 9 else found.zero
+    assert named is not None
+    (hypothesis,) = named.hypotheses
     kind, name, size = hypothesis.key.split(":")
     assert (kind, name) == ("zero", nominal.joint_names[joint])
     # The calibration corrects the rest.
     assert float(size.removesuffix("deg")) == pytest.approx(-angle, abs=1.5)
-    assert calibrate(nominal, [*hypothesis.apply([wrong]), distances]).verdict.status != "refused"
+    mended = mend(nominal, wrong, hypothesis.key)
+    assert calibrate(nominal, [mended, distances]).verdict.status != "refused"
 
 
 def test_several_wrong_zeros_lead_to_a_hand_built_arm():

@@ -270,7 +270,7 @@ def test_a_wrong_ratio_of_a_servo_states_the_factor_of_its_counts(tmp_path):
     """Values times 0.8 are true: q = (c - zero)·2π/counts_per_turn needs 1.25 times the counts per turn."""
     found = Diagnosis(NO_EVIDENCE, (ratio_hypothesis(NOMINAL, [2], 0.8),)).for_servos(())
     assert found.remedy.startswith("Multiply counts_per_turn of elbow_flex by 1.25 in the servo file (")
-    factor = float(re.search(r"by (\S+) in", found.remedy)[1])
+    (factor,) = map(float, re.findall(r"by (\S+) in", found.remedy))
     written = [tmp_path / f"{i}.toml" for i in range(2)]
     for path, count in zip(written, (4096, 4096 * factor), strict=True):
         path.write_text(f"[motor.elbow_flex]\nresolution = 4096\ncounts_per_turn = {count}\n")
