@@ -18,9 +18,9 @@ import numpy as np
 from .._typing import Array
 from ..measurements.base import Measurement, concatenate
 from ..robot.chain import Chain
-from .diagnosis import MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
 from .drawn_samples import draw_samples, fit_drawn_samples, fit_samples
-from .evidence import Evidence
+from .evidence import HAND_BUILT, Evidence
 from .hypotheses import BothChanges, Hypothesis, LagChange, RowShift
 
 # Samples fit a robot if their residuals are at most this multiple of the noise, and do not if they exceed the
@@ -106,6 +106,8 @@ def is_confirmed_by_lengths(
 ) -> bool:
     """Return whether a mistake in touched points explains the known lengths between them, too."""
     samples, first = draw_samples(data)[0], found.hypotheses[0]
+    if found.log < fit_samples(chain, samples, HAND_BUILT).log + MIN_LOG_ADVANTAGE and sets != HAND_BUILT:
+        return False  # Several errors of a hand-built arm explain the touches as well.
     changed = first.apply(samples)
     if changed is None:
         return True

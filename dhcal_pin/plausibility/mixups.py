@@ -86,7 +86,7 @@ def _diagnose(
     report: Progress,
 ) -> Diagnosis:
     """Look for one mistake or two in samples that are drawn from measurements."""
-    diagnosis, trial = _find_single(chain, items, sets, report)
+    diagnosis, trial = _find_single(chain, items, sets, report, lengths)
     if trial is None:
         return diagnosis
     # The mistake may be in one of several measurements.
@@ -98,7 +98,7 @@ def _diagnose(
         if not any(one.is_suspicious for _, one in separate):
             return replace(diagnosis, fits_separately=True)
     found = trial.find_pair()
-    if lengths and not found.hypotheses and trial.single.needs_no_larger_errors:
+    if lengths and not found.hypotheses and trial.is_likely(trial.single):
         # A robot with large errors can touch unknown points after a wrong change: lengths must confirm it.
         return trial.single
     if found.hypotheses or len(items) > 1 or not leaves_residuals(found.before):
@@ -140,7 +140,11 @@ def _parts(item: Measurement) -> list[Measurement]:
 
 
 def _find_single(
-    chain: Chain, data: Sequence[Measurement], sets: str, progress: Progress
+    chain: Chain,
+    data: Sequence[Measurement],
+    sets: str,
+    progress: Progress,
+    lengths: Sequence[Measurement] = (),
 ) -> tuple[Diagnosis, Trial | None]:
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
@@ -151,6 +155,8 @@ def _find_single(
     from .trials import try_hypotheses, try_ratios  # lazy import: few measurements are suspicious
 
     if is_fitting:
+        samples = [*samples, *lengths]
+        before = fit_samples(chain, samples, sets) if lengths else before
         return try_ratios(chain, samples, sets, before, progress), None
     return try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
 

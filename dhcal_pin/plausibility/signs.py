@@ -203,8 +203,7 @@ def decide_signs(chain: Chain, data: Sequence[Measurement]) -> SignDecision:
     limit = fits[ranked[0]].log - MIN_LOG_RATIO
     possible = [turned for turned in ranked if fits[turned].log >= limit]
     chosen = min(possible, key=len)
-    is_plain = possible == [()]
-    if not is_plain and _best_quarter_turn(chain, samples) >= fits[ranked[0]].log + MIN_LOG_RATIO:
+    if chosen and _best_quarter_turn(chain, samples) >= fits[ranked[0]].log + MIN_LOG_RATIO:
         # The zero of one joint is wrong, and no sign.
         return replace(undecided, is_compared=True)
     others = [turned for turned in possible if turned != chosen]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from heapq import nsmallest
@@ -15,7 +15,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -64,9 +64,6 @@ _MIN_RATIO = 4.0
 # one of these sizes, and zeros only up to a smaller angle, in larger steps [deg].
 _PROBED_RATIOS, _PROBED_ZEROS = (-5.0, 5.0), (-40.0, -20.0, -10.0, 10.0, 20.0, 40.0)
 _MAX_FITTED_ZERO, _FITTED_ZERO_STEPS = 50.0, (10.0, 3.0)
-# Without positions, several wrong zeros of a hand-built arm explain much of what one does. One is believed if
-# its evidence exceeds theirs by this logarithm: by 13 where one was wrong, by 3 where several were.
-_MIN_LOG_ADVANTAGE = 6.0
 # A ratio is refined if it brings the nominal robot nearer by this factor.
 _MIN_RATIO_GAIN = 1.5
 # Smallest difference from a quarter turn [deg]. Quarter turns are hypotheses of their own.
@@ -124,6 +121,16 @@ class Trial(NamedTuple):
         far = [each.hypothesis for each in self.candidates if each.misfit > largest]
         return self.single if set(self.single.hypotheses).isdisjoint(far) else Diagnosis(self.before)
 
+    def is_likely(self, found: Diagnosis) -> bool:
+        """Return whether a ratio explains samples without positions, and no other errors do."""
+        if found.after is None or found.after.width > self.before.width:
+            return False
+        if not all(each.key.startswith("ratio:") for each in found.hypotheses):
+            # Units of a joint and quarter turns change the values so far that large errors explain anything.
+            return False
+        # Several errors of a hand-built arm explain much, too.
+        return found.log >= fit_evidence(self.chain, self.samples, HAND_BUILT).log + MIN_LOG_RATIO
+
     def find_common(self, parts: Sequence[Diagnosis]) -> Diagnosis:
         """Look for one mistake that several parts of the samples show, whatever residuals remain in all."""
         counts = Counter(hypothesis.key for part in parts for hypothesis in part.hypotheses)
@@ -159,7 +166,7 @@ def try_hypotheses(
         changed = {j for hypothesis in found.hypotheses for j in hypothesis.offsets}
         # The zeros of a hand-built arm are unknown in any case.
         inner = inner_revolute_joints(chain) if sets == MANUFACTURED else []
-        zeros = _measure_zeros(trial, inner)
+        zeros = _measure_zeros(trial, inner, changed)
         large = [zero.candidate for zero in zeros if abs(zero.size) >= _MIN_ZERO]
         large += [ratio.candidate for ratio in _measure_ratios(trial)]
         scores += _scores(trial, _near(trial, large), SINGLES)
@@ -173,7 +180,7 @@ def try_hypotheses(
             likely = _decide(trial, [*scores, *_scores(trial, _near(trial, small), SINGLES)])
             if likely.is_certain:
                 return Diagnosis(before, zero=likely), None
-        if not misfit and measured.needs_no_larger_errors:
+        if not misfit and trial.is_likely(measured):
             found = measured
     return (found, None) if found.is_certain else (Diagnosis(before), trial._replace(single=found))
 
@@ -210,25 +217,24 @@ def _measured(trial: Trial, of_size: Callable[[float], Hypothesis], size: float)
         yield _Measured(of_size, size, candidate)
 
 
-def _measure_zeros(trial: Trial, joints: Sequence[int]) -> list[_Measured]:
+def _measure_zeros(trial: Trial, joints: Sequence[int], changed: Collection[int]) -> list[_Measured]:
     """Return the zeros of joints that are wrong, by the angles of greatest evidence."""
     zeros = []
-    kinds = [partial(zero_hypothesis, trial.chain, joint) for joint in joints]
-    reach, steps = _MAX_ZERO, _ZERO_STEPS
+    kinds = {joint: partial(zero_hypothesis, trial.chain, joint) for joint in joints}
+    # Zeros that were found to be wrong by a quarter turn may be wrong by any angle.
+    wide = [kind for joint, kind in kinds.items() if trial.misfit or joint in changed]
+    searches = [(kind, _MAX_ZERO, _ZERO_STEPS) for kind in wide]
     if not trial.misfit:
-        kinds, reach, steps = (
-            _most_explaining(trial, kinds, _PROBED_ZEROS),
-            _MAX_FITTED_ZERO,
-            _FITTED_ZERO_STEPS,
-        )
-    for of_angle in kinds:
+        probed = _most_explaining(trial, [*kinds.values()], _PROBED_ZEROS)
+        searches += [(kind, _MAX_FITTED_ZERO, _FITTED_ZERO_STEPS) for kind in probed if kind not in wide]
+    for of_angle, reach, steps in searches:
         best = _closest(trial, of_angle, reach, steps)
         is_quarter_turn = abs(best) > 45.0 and abs((best + 45.0) % 90.0 - 45.0) < _MIN_TURN_DIFFERENCE
         if abs(best) >= _MIN_LIKELY_ZERO and not is_quarter_turn:
             zeros += _measured(trial, of_angle, best)
     refined = _refine(trial, zeros, _FINE_ZERO_STEPS, _MIN_LIKELY_ZERO)
     if refined and not trial.misfit:
-        least = fit_evidence(trial.chain, trial.samples, HAND_BUILT).log + _MIN_LOG_ADVANTAGE
+        least = fit_evidence(trial.chain, trial.samples, HAND_BUILT).log + MIN_LOG_ADVANTAGE
         logs = [fit_evidence(trial.chain, zero.candidate.changed, trial.sets).log for zero in refined]
         refined = [zero for zero, log in zip(refined, logs, strict=True) if log >= least]
     return refined

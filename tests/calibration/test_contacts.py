@@ -5,12 +5,14 @@ import pytest
 from robots import nominal_arm
 from sessions import Simulation
 from slow_cases import some_slow
-from touching_arms import NOMINAL, TouchingArm
+from touching_arms import JOINTS, NOMINAL, TouchingArm
 
 from dhcal_pin import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import MultiTargetPosition, Noise, PointContact, PointDistance
 from dhcal_pin.plausibility import diagnose_mixups
+from dhcal_pin.plausibility.evidence import HAND_BUILT, MANUFACTURED
+from dhcal_pin.plausibility.hypotheses import RowShift, mend
 
 
 def touched(distance_factor=1.0, zero=0.0, sigma=None):
@@ -108,6 +110,91 @@ def test_outliers_that_fit_another_name_are_named(is_run, with_right_names):
     # The remedy helps.
     assert with_right_names.verdict.reasons == ()
     assert with_right_names.n_outliers == 0
+
+
+def with_wrong_name(touches, row):
+    """Return touches one of which has the name of another point."""
+    names = list(touches.text_values()["point"])
+    names[row] = "p0" if names[row] == "p1" else "p1"
+    return PointContact(touches.q, names)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(4), {0, 1}))
+def test_one_wrong_name_among_points_touched_in_turn_is_no_mistake_in_all_rows(seed):
+    """Rows that are shifted by one have other names, too, and were named."""
+    touches, distances = TouchingArm.random(seed, 48, 8).data
+    wrong = with_wrong_name(touches, 7 + 3 * seed)
+    for sets in (HAND_BUILT, MANUFACTURED) if seed == 0 else (HAND_BUILT,):
+        assert diagnose_mixups(NOMINAL, [wrong, distances], sets).hypotheses == ()
+    # A shift renames all points but those of two rows.
+    assert RowShift(1).apply(wrong) is None
+
+
+def test_one_wrong_name_among_points_touched_in_turn_is_named():
+    touches, distances = TouchingArm.random(1, 48, 8).data
+    fit = calibrate(NOMINAL, [with_wrong_name(touches, 10), distances], HAND_BUILT, turned="none")
+    assert fit.verdict.status == "caution"
+    (found,) = fit.wrong_labels
+    assert (found.fitting, found.rows) == (touches.text_values()["point"][10], (11,))
+
+
+@pytest.mark.parametrize(
+    ("joint", "factor", "sets"),
+    some_slow(
+        [
+            (1, 1.06, HAND_BUILT),
+            (0, 1.06, HAND_BUILT),
+            (2, 0.94, HAND_BUILT),
+            (3, 1.1, HAND_BUILT),
+            (3, 0.94, MANUFACTURED),
+        ],
+        {0},
+    ),
+)
+def test_a_wrong_gear_ratio_of_a_hand_built_arm_among_contacts_is_named(joint, factor, sets):
+    """The arm touched unknown points with other lengths: "ok" with 8 mm of error."""
+    arm = TouchingArm.random(3, 48, 8)
+    touches, distances = arm.data
+    wrong = touches.resample(touches.q * np.where(np.arange(5) == joint, factor, 1.0))
+    (found,) = diagnose_mixups(NOMINAL, [wrong, distances], sets).hypotheses
+    kind, name, ratio = found.key.split(":")
+    assert (kind, name) == ("ratio", JOINTS[joint])
+    assert float(ratio) == pytest.approx(1 / factor, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", some_slow([*range(6), *range(7, 10)], {0, 1}))
+def test_touches_of_a_right_hand_built_arm_have_no_wrong_ratio(seed):
+    found = diagnose_mixups(NOMINAL, TouchingArm.random(seed, 48, 8).data, HAND_BUILT)
+    assert (found.hypotheses, found.zero) == ((), None)
+
+
+@pytest.mark.parametrize(
+    ("joint", "angle"), some_slow([(2, 20), (1, 8), (1, -25), (2, 40), (3, -20), (4, 12)], {0})
+)
+def test_a_wrong_zero_among_contacts_is_named(joint, angle):
+    """An arm with other errors touched unknown points as well, and no mistake was named."""
+    nominal, contacts, distances = touched()
+    wrong = contacts.resample(contacts.q + np.deg2rad(angle) * np.eye(6)[joint])
+    found = diagnose_mixups(nominal, [wrong, distances])
+    named = found if abs(angle) > 9 else found.zero
+    assert named is not None
+    (hypothesis,) = named.hypotheses
+    kind, name, size = hypothesis.key.split(":")
+    assert (kind, name) == ("zero", nominal.joint_names[joint])
+    # The calibration corrects the rest.
+    assert float(size.removesuffix("deg")) == pytest.approx(-angle, abs=1.5)
+    mended = mend(nominal, wrong, hypothesis.key)
+    assert calibrate(nominal, [mended, distances]).verdict.status != "refused"
+
+
+def test_several_wrong_zeros_lead_to_a_hand_built_arm():
+    """The parameters that were suggested were estimated already."""
+    data = TouchingArm.random(0, 48, 8).data
+    (reason,) = calibrate(NOMINAL, data).verdict.reasons
+    assert reason.endswith("--arm low-cost.")
+    assert "--parameters" not in reason
+    # Nothing is suggested that does not help.
+    assert calibrate(NOMINAL, data, HAND_BUILT, turned="none").verdict.status == "ok"
 
 
 def test_other_outliers_have_no_wrong_name():

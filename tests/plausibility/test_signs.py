@@ -233,24 +233,24 @@ def test_remedies_of_servos_are_allowed_beside_their_file(key, remedy):
     assert f"--mend {key}" in found.remedy
 
 
-def string_lengths(seed: int, pitch: float = 0.0) -> Wires:
-    """Return lengths of a string to a hobby arm; the joint values of its pitch are too large by an angle."""
+def string_lengths(seed: int, wrong: float = 0.0) -> Wires:
+    """Return lengths of a string to a hobby arm; values of its shoulder are too large by an angle [rad]."""
     rng = np.random.default_rng(seed)
-    truth, q = TouchingArm.random(seed, 8).truth, rng.uniform(-1.4, 1.4, (60, 5))
+    truth, q = TouchingArm.random(seed, 8).truth, rng.uniform(-1.4, 1.4, (40, 5))
     lengths = np.linalg.norm(truth.poses(q)[:, :3, 3] - [0.4, -0.1, 0.2], axis=1)
-    return Wires(q + pitch * np.eye(5)[3], (lengths + 5e-4 * rng.standard_normal(60))[:, None])
+    return Wires(q + wrong * np.eye(5)[1], (lengths + 5e-4 * rng.standard_normal(40))[:, None])
 
 
-@pytest.mark.parametrize("seed", some_slow(range(4), {0}))
-def test_a_quarter_turn_of_a_zero_is_no_reversed_joint(seed):
-    """A reversed base with a zero of 85° fitted the string, and a wrong quarter turn was named nowhere."""
-    data = string_lengths(seed, np.pi / 2)
+@pytest.mark.parametrize("angle", [90, -90])
+def test_a_quarter_turn_of_a_zero_is_no_reversed_joint(angle):
+    """Reversed joints with zeros of 85° fitted the string about as well, and the zero was named nowhere."""
+    data = string_lengths(1, np.deg2rad(angle))
     signs = decide_signs(TOUCHING, [data])
-    assert (signs.turned, signs.open) == ((), ())
+    assert (signs.turned, signs.questions) == ((), [])
     (found,) = diagnose_mixups(TOUCHING, [data], HAND_BUILT).hypotheses
-    assert found.key == "zero:pitch:-90deg"
+    assert found.key == f"zero:shoulder:{-angle:+}deg"
     # The remedy gives the values of the arm back.
-    np.testing.assert_allclose(mend(TOUCHING, data, found.key).configurations(), string_lengths(seed).q)
+    np.testing.assert_allclose(mend(TOUCHING, data, found.key).configurations(), string_lengths(1).q)
 
 
 def test_each_of_several_open_sets_of_signs_is_an_option_that_fits():
@@ -270,7 +270,7 @@ def test_a_wrong_ratio_of_a_servo_states_the_factor_of_its_counts(tmp_path):
     """Values times 0.8 are true: q = (c - zero)·2π/counts_per_turn needs 1.25 times the counts per turn."""
     found = Diagnosis(NO_EVIDENCE, (ratio_hypothesis(NOMINAL, [2], 0.8),)).for_servos(())
     assert found.remedy.startswith("Multiply counts_per_turn of elbow_flex by 1.25 in the servo file (")
-    factor = float(re.search(r"by (\S+) in", found.remedy)[1])
+    (factor,) = map(float, re.findall(r"by (\S+) in", found.remedy))
     written = [tmp_path / f"{i}.toml" for i in range(2)]
     for path, count in zip(written, (4096, 4096 * factor), strict=True):
         path.write_text(f"[motor.elbow_flex]\nresolution = 4096\ncounts_per_turn = {count}\n")
