@@ -61,6 +61,8 @@ _N_ITERATIONS, _N_FRAME_ITERATIONS = 12, 20
 # Largest number of fits with new noise scales. They end when the scales fall by less than this, on the mean
 # of the logarithms.
 _N_ROUNDS, _MIN_CHANGE = 20, 0.1
+# Largest share of samples that are single errors; more of them are a sign of one mistake in many samples.
+_MAX_GROSS_SHARE = 0.2
 # Smallest and largest scale of the placeholder standard deviations. Residuals below the smallest one count as
 # exact: how small they are says nothing about a hypothesis.
 _MIN_SCALE, _MAX_SCALE = 1e-4, 1e7
@@ -133,12 +135,12 @@ def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Eviden
 
 
 def fit_without_gross_outliers(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence | None:
-    """Compute the evidence of a fit that starts without samples that are far off; None without any."""
+    """Compute the evidence of a fit that starts without a few samples that are far off; None without any."""
     # A fit to few samples for each unknown adapts to an outlier that it starts with.
     equal = tuple(_with_equal_sigmas(item) for item in data)
     errors = _initialized_frames(chain, equal, sets)
     is_gross = find_initial_outliers(select_parameters(chain, sets), equal, {}, errors.chain)
-    if not any(each.any() for each in is_gross):
+    if not 0 < np.mean(np.concatenate(is_gross)) <= _MAX_GROSS_SHARE:
         return None
     kept = tuple(item.take(~each) for item, each in zip(equal, is_gross, strict=True))
     errors = _initialized_frames(chain, kept, sets)
