@@ -14,7 +14,6 @@ from ...diagnostics.inspection import FileInspection, column_table
 from ...formatting import Quantity, Table, format_count, format_lines, list_first, texts_by_file
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
-from ...report.changes import difference_table
 from ...report.provenance import short_names
 from .screen import Block, Screen
 
@@ -379,6 +378,8 @@ def plan_screen(plan: Plan, moves: Sequence[str], files: Iterable[object]) -> Sc
 
 def difference_screen(difference: Difference, files: Iterable[object]) -> Screen:
     """Describe the difference of two calibrations."""
+    from ...report.changes import difference_table  # lazy import: slow, and only this command needs it
+
     style = {"equal": "green", "different": "red"}.get(difference.verdict, "yellow")
     first, *others = difference.sentences
     return Screen(
