@@ -1018,7 +1018,8 @@ def _wrong_labels(fit: Evidence) -> list[Finding]:
     if not fit.wrong_labels:
         return []
     text = " ".join(found.sentence for found in fit.wrong_labels)
-    return [Finding("caution", f"{text} The figures leave them out. Correct the names in these lines.")]
+    text += " Lines with a wrong name are left out of the figures. Correct the names."
+    return [Finding("caution", text)]
 
 
 def _deviating_lines(fit: Evidence) -> list[Finding]:

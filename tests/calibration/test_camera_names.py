@@ -82,7 +82,7 @@ def test_exchanged_cameras_are_named(case, n_exchanged, has_both):
     fit = dh.calibrate(setup.nominal, with_exchanged(setup, is_exchanged), SETS)
     check_named(fit, setup, is_exchanged)
     assert fit.verdict.status == "caution"
-    assert "Correct the names in these lines." in fit.verdict.reasons[0]
+    assert "Correct the names." in fit.verdict.reasons[0]
     # The remedy helps, and the figures without the images are right.
     right = dh.calibrate(setup.nominal, with_exchanged(setup, np.zeros_like(is_exchanged)), SETS)
     assert right.verdict.status == "ok"
