@@ -215,10 +215,10 @@ def calibrate(
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
     if _suggests_full_set(setup):
-        # Nothing is looked for a second time where nothing happened.
+        # If nothing happened during the measurement, the search for it is not repeated.
         has_changes = begun.session is not None and not begun.session.changes.is_empty
-        looked_for = {"session": session if has_changes else "off"}
-        settings["with_full_set"] = partial(again, **looked_for, **_full_set(setup))
+        search = session if has_changes else "off"
+        settings["with_full_set"] = partial(again, session=search, **_full_set(setup))
     if method != "lm":
         result = make_result(begun.fit, 1.0, begun.holdout, method)
     elif has_images(setup.data) and setup.priors != "none":

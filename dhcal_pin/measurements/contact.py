@@ -28,7 +28,7 @@ from .columns import instrument_range, length_columns, point_distance_range, tex
 from .groups import LENGTHS, POSITION, Group
 from .length import images_of_point
 from .mounting import MountedRig
-from .position import PointMeasurement
+from .position import NamedPointMeasurement, PointMeasurement
 from .trilateration import MIN_DIVISOR, locate_point, norm_and_direction
 from .validation import encode_labels, validated_array, validated_joint_positions
 
@@ -37,20 +37,15 @@ _ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class PointContact(PointMeasurement):
+class PointContact(NamedPointMeasurement):
     """Contacts of the tool point with fixed unknown points, such as sockets or pins.
 
     Each point is touched in many configurations. Samples with the same name touch the same point, which has
     three instrument parameters `point_NAME.x, .y, .z` in the measuring frame. The pose of the base is not
     observable, and neither is the scale of the robot unless a `PointDistance` is known.
 
-    Attributes:
-        label: Index of each sample's point in `names`, (m,).
-        names: Names of the points in order of first appearance.
+    The names are in the order of first appearance.
     """
-
-    label: Array
-    names: tuple[str, ...]
 
     kind = "point"
     is_contact = True
@@ -59,7 +54,6 @@ class PointContact(PointMeasurement):
     label_column = "point"
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = text_column("points", "point") + length_columns("", "x", "y", "z", is_implied=True)
-    sample_fields = (*PointMeasurement.sample_fields, "label")
 
     def __init__(self, q: ArrayLike, points: Sequence[str], sigma: ArrayLike | None = None) -> None:
         """Check and store contacts with named points."""
@@ -68,28 +62,6 @@ class PointContact(PointMeasurement):
         parameters = tuple(u for name in names for u in point_parameters(f"point_{name}", _ORIGIN))
         super().__init__(q, np.zeros((len(q), 3)), sigma, parameters)
         self._initialize(label=label, names=names)
-
-    def text_values(self) -> dict[str, Sequence[str]]:
-        """Return the names of the samples' points."""
-        return {"point": [self.names[i] for i in self.label]}
-
-    @property
-    def label_names(self) -> tuple[str, ...]:
-        """Names of the points."""
-        return self.names
-
-    @property
-    def label_numbers(self) -> Array:
-        """Number of each sample's point, (m,)."""
-        return self.label
-
-    def with_label(self, number: int) -> Self:
-        """Return the same samples of one point."""
-        return self.replace(label=np.full(len(self.rows), number))
-
-    def description(self) -> list[str]:
-        """Return what `repr` says besides the number of samples."""
-        return [f"{len(self.names)} points", *super().description()]
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the tool points relative to the touched points, and their derivatives."""

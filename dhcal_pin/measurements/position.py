@@ -130,6 +130,43 @@ class PointMeasurement(Measurement):
         }
 
 
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class NamedPointMeasurement(PointMeasurement):
+    """Measurements of points with names, which the column `label_column` states.
+
+    Attributes:
+        label: Number of each sample's name in `names`, (m,).
+        names: Names of the points.
+    """
+
+    label: Array
+    names: tuple[str, ...]
+
+    sample_fields = (*PointMeasurement.sample_fields, "label")
+
+    def text_values(self) -> dict[str, Sequence[str]]:
+        """Return the name of each sample."""
+        return {self.label_column: [self.names[i] for i in self.label]}
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names that the samples state."""
+        return self.names
+
+    @property
+    def label_numbers(self) -> Array:
+        """Number of the name of each sample, (m,)."""
+        return self.label
+
+    def with_label(self, number: int) -> Self:
+        """Return the same samples with one name."""
+        return self.replace(label=np.full(len(self.rows), number))
+
+    def description(self) -> list[str]:
+        """Return what `repr` says besides the number of samples."""
+        return [f"{len(self.names)} {self.label_column}s", *super().description()]
+
+
 def _noisy_positions(chain: Chain, conditions: Conditions, noise: Noise, rng: np.random.Generator) -> Array:
     """Return positions of the chain's tool point (m, 3) with normal noise on each axis."""
     points = chain.forward_kinematics(conditions).tool[3].T
@@ -250,28 +287,21 @@ class PositionComponents(PointMeasurement):
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class MultiTargetPosition(PointMeasurement):
+class MultiTargetPosition(NamedPointMeasurement):
     """Positions of several targets (reflectors) on the tool in the measuring frame.
 
     The first target in alphabetical order is the tool point itself, whatever the order of the samples is.
     Each other target has three instrument parameters `target_NAME.x, .y, .z`: its position in the tool frame
     relative to the first target. Two targets make the rotation of the tool observable except about the line
     through them, three make all of it observable.
-
-    Attributes:
-        label: Index of each sample's target in `names`, (m,).
-        names: Names of the targets in alphabetical order.
+    The names are in alphabetical order.
     """
-
-    label: Array
-    names: tuple[str, ...]
 
     kind = "targets"
     shows_changes = True
     label_column = "target"
     residual_groups: ClassVar = {"position": POSITION}
     COLUMNS = length_columns("positions", *_AXES) + text_column("targets", "target")
-    sample_fields = (*PointMeasurement.sample_fields, "label")
 
     def __init__(
         self, q: ArrayLike, positions: ArrayLike, targets: Sequence[str], sigma: ArrayLike | None = None
@@ -296,28 +326,6 @@ class MultiTargetPosition(PointMeasurement):
         )
         super().__init__(q, values, sigma, parameters)
         self._initialize(label=label, names=names)
-
-    def text_values(self) -> dict[str, Sequence[str]]:
-        """Return the names of the samples' targets."""
-        return {"target": [self.names[i] for i in self.label]}
-
-    @property
-    def label_names(self) -> tuple[str, ...]:
-        """Names of the targets."""
-        return self.names
-
-    @property
-    def label_numbers(self) -> Array:
-        """Number of each sample's target, (m,)."""
-        return self.label
-
-    def with_label(self, number: int) -> Self:
-        """Return the same samples of one target."""
-        return self.replace(label=np.full(len(self.rows), number))
-
-    def description(self) -> list[str]:
-        """Return what `repr` says besides the number of samples."""
-        return [f"{len(self.names)} targets", *super().description()]
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy in which each further target starts at its mean position in the chain's tool frame.

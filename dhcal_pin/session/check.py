@@ -989,8 +989,8 @@ def _sentence(group: list[Hypothesis]) -> str:
     what = f"The zero of {best.name} changed" if best.kind == "joint" else f"The {part} {verb}"
     if best.unit == "m" and best.angle > max(LARGE_TURN, 5 * best.angle_std):
         size += f" and turned by {format_quantity(best.angle, 'rad', best.angle_std)}"
-    like = ", as after a new set-up of the instrument" if best.kind == "base" and not best.of else ""
-    if best.kind == "base" and best.of:
-        like = f" {best.of}"
+    like = ""
+    if best.kind == "base":
+        like = f" {best.of}" if best.of else ", as after a new set-up of the instrument"
     rivals = " or ".join(each.name for each in others)
     return f"{what} by {size}{like}." + (f" The same effect has a change of {rivals}." if rivals else "")

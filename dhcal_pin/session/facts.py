@@ -27,7 +27,7 @@ MAX_SCALE_CHANGE = 0.5
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
 # Smallest lag that is stated, in standard deviations.
-NO_LAG = 4.0
+MIN_STATED_LAG = 4.0
 # What a robot touches: its motion has the effect of one of the base.
 TOUCHED = "touched object"
 
@@ -172,7 +172,7 @@ class Lag:
             size = f", {format_fixed(1e6 * abs(self.rate), 0)} ppm" if self.unit == "s" else ""
             return (
                 "The clocks of joint values and measured values drift apart: the joint values are "
-                f"{self._text(begin)} at the begin, and {self._text(end)} at the end{size}."
+                f"{self._text(begin)} at the beginning, and {self._text(end)} at the end{size}."
             )
         text = f"The joint values are {self._text(self.value)}"
         if len(self.parts) > 1:
@@ -188,7 +188,7 @@ class Lag:
 
     def _text(self, value: float) -> str:
         """Describe the time of the joint values."""
-        if abs(value) < NO_LAG * self.std:
+        if abs(value) < MIN_STATED_LAG * self.std:
             return "at the time of the measured values"
         unit = {"row": "rows"}.get(self.unit, self.unit)
         size = f"{format_fixed(abs(value), 3)} {unit}"
@@ -205,7 +205,7 @@ class Lag:
         mends = [
             f"--mend lag:{part.end:.4g}@{part.first.file}:{part.first.line}-{part.last.last_line}"
             for part in self.parts
-            if abs(part.end) >= NO_LAG * self.std
+            if abs(part.end) >= MIN_STATED_LAG * self.std
         ]
         is_one_file = len({place.file for part in self.parts for place in (part.first, part.last)}) == 1
         options = f", or add {' '.join(mends)}" if is_one_file and self.parts[0].first.file else ""

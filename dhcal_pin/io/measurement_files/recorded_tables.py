@@ -6,25 +6,21 @@ Both tables have the column `time[s]`. The stops of the arm become the rows of a
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..._typing import Array, PathLike
 from ...exceptions import DhcalError, FileFormatError
-from ...formatting import format_count
+from ...formatting import format_count, list_first
 from ...measurements.pose import Pose
-from ...measurements.position import Position
 from ...robot.chain import Chain
 from ...units import TIMES
 from ..tables import DataTable
 from . import reading
-from .columns import QUATERNION, ROTVEC, check_joint_names, find_kind, value_table
+from .columns import QUATERNION, ROTVEC, check_joint_names
 from .standstills import JointSeries, PoseSeries, describe_stops, find_stops, have_common_times, stops_text
+from .targets import parse_tool_values
 
 _TIME, _XYZ = "time", ("x", "y", "z")
-# Greatest number of columns that a message lists.
-_MAX_LISTED_NAMES = 12
 
 
 def convert_tables(
@@ -42,7 +38,9 @@ def convert_tables(
     joints = JointSeries(
         tuple(chain.joint_names), joint_times, reading.parse_joint_positions(joint_table, chain)
     )
-    poses = replace(_poses(pose_table, chain), times=pose_times)
+    data = parse_tool_values(pose_table, chain)
+    rotations = data.rotations() if isinstance(data, Pose) else None
+    poses = PoseSeries(pose_times, data.positions(), rotations, "")
     try:
         stops = find_stops(joints, poses)
     except DhcalError as error:
@@ -61,7 +59,7 @@ def _read(path: PathLike, chain: Chain, columns: PathLike | None, names: tuple[s
     """Read the rows of a table that have a time and all numbers of some columns, in the order of time."""
     table = reading.open_measurement_table(path, chain, columns)
     if _TIME not in table.columns or table.columns[_TIME].unit not in TIMES:
-        headers = ", ".join(map(repr, table.headers[:_MAX_LISTED_NAMES]))
+        headers = list_first([*map(repr, table.headers)])
         raise FileFormatError(
             f"{table.header_location}: no column `{_TIME}[s]` among {headers}; expected the time of each row "
             f"[{', '.join(TIMES)}], or a column map (--columns) that names it"
@@ -85,19 +83,3 @@ def _times(table: DataTable) -> Array:
     column = table.columns[_TIME]
     # Times of a day or since 1970 are large.
     return table.finite_numbers(column) / column.divisor(TIMES, table.header_location)
-
-
-def _poses(table: DataTable, chain: Chain) -> PoseSeries:
-    """Return the positions or poses of a table."""
-    measured = value_table(table, chain)
-    kind = find_kind(measured)
-    if kind not in (Pose, Position):
-        raise FileFormatError(
-            f"{table.header_location}: the columns are those of kind {kind.kind}; expected "
-            "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz"
-        )
-    placeholder = np.zeros((len(table.lines), chain.n_joints))
-    data = reading.build_measurement(table, kind, [placeholder], reading.parse_values(measured, kind), chain)
-    rotations = data.rotations() if isinstance(data, Pose) else None
-    assert isinstance(data, Pose | Position)
-    return PoseSeries(np.empty(0), data.positions(), rotations, "")

@@ -151,7 +151,7 @@ def stops_text(stops: Stops, names: tuple[str, ...], chain: Chain | None, commen
 
 def _stands_still(times: Array, values: Array, limits: tuple[float, float]) -> Array:
     """Return at which samples no component of a series (k, ·) changes within the window, (k,)."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # lazy import: slow, only for bags
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # lazy import: slow, only for recordings
 
     # Samples that are further apart than the window are measurements of their own.
     size = 1 if _is_sparse(times) else 2 * int(np.ceil(_HALF_WINDOW_S / np.median(np.diff(times)))) + 1

@@ -13,7 +13,7 @@ from ...measurements.pose import Pose
 from ...measurements.position import Position
 from ...robot.chain import Chain
 from ...robot.conditions import Conditions
-from ..tables import TextLayout, read_table
+from ..tables import DataTable, TextLayout, read_table
 from . import reading
 from .columns import check_columns, check_joint_names, find_kind, value_table
 
@@ -52,21 +52,28 @@ def read_targets(path: PathLike, chain: Chain) -> TargetPoses:
     table = read_table(path, TARGETS)
     table.require_good_rows()
     ignored = check_columns(table, chain)
-    measured = value_table(table, chain)
-    kind = find_kind(measured)
-    if kind not in (Pose, Position):
-        raise FileFormatError(
-            f"{table.header_location}: the columns are those of kind {kind.kind}; targets have "
-            "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
-        )
+    data = parse_tool_values(table, chain)
     has_joints = bool(set(chain.joint_names) & set(table.columns))
     near = reading.parse_joint_positions(table, chain) if has_joints else None
-    placeholder = np.zeros((len(table.lines), chain.n_joints))
-    data = reading.build_measurement(table, kind, [placeholder], reading.parse_values(measured, kind), chain)
     values = data.poses if isinstance(data, Pose) else data.positions()
     conditions = reading.with_conditions(data, table, chain).recorded
     notes = (*table.notes, *reading.ignored_columns_note(ignored))
     return TargetPoses(table.source, values, near, reading.column_units(table), data.rows, notes, conditions)
+
+
+def parse_tool_values(table: DataTable, chain: Chain) -> Pose | Position:
+    """Parse the positions or poses of a table, without joint positions."""
+    measured = value_table(table, chain)
+    kind = find_kind(measured)
+    if kind not in (Pose, Position):
+        raise FileFormatError(
+            f"{table.header_location}: the columns are those of kind {kind.kind}; expected "
+            "x[mm],y[mm],z[mm], with or without qw,qx,qy,qz or rx[rad],ry[rad],rz[rad]"
+        )
+    placeholder = np.zeros((len(table.lines), chain.n_joints))
+    data = reading.build_measurement(table, kind, [placeholder], reading.parse_values(measured, kind), chain)
+    assert isinstance(data, Pose | Position)
+    return data
 
 
 def read_configurations(
