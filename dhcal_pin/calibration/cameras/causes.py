@@ -38,7 +38,7 @@ from ...estimation.solver import minimize
 from ...exceptions import DhcalError
 from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners, change_images, select_images
-from ...measurements.images.camera_parameters import POSE_NAMES
+from ...measurements.images.camera_parameters import POINTS_SET, POSE_NAMES
 from ...measurements.images.camera_start import first_values
 from ..reweighting import Fit, reweight
 from .mistakes import held_entries
@@ -103,16 +103,12 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
 
 def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
     """Return images with the rig of some causes and their own joint values."""
+    item = with_sizes(causes.sizes, item) if causes.sizes else item
     cameras, boards = item.rig.cameras, item.rig.boards
     if causes.has_lens:
         cameras = tuple(
             replace(camera, intrinsics="prior") if camera.intrinsics == "fixed" else camera
             for camera in cameras
-        )
-    if causes.sizes:
-        boards = tuple(
-            replace(board, type="points", listed_points=causes.sizes.get(board.name, 1.0) * board.points)
-            for board in boards
         )
     if causes.has_points:
         boards = tuple(replace(board, has_free_points=True) for board in boards)
@@ -122,6 +118,21 @@ def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
     if causes.has_exchanged_links:
         rig = rig.with_exchanged_links()
     return item if rig is item.rig else item.with_rig(rig)
+
+
+def with_sizes(sizes: Mapping[str, float], item: CameraCorners) -> CameraCorners:
+    """Return images of boards whose sizes are those of the rig times a factor, by name."""
+    boards = tuple(
+        replace(board, type="points", listed_points=sizes.get(board.name, 1.0) * board.points)
+        for board in item.rig.boards
+    )
+    entries = {f"board_{board.name}": sizes.get(board.name, 1.0) for board in boards}
+    points = {
+        p.name: entries[p.name.rpartition(".")[0]] * p.nominal
+        for p in item.instrument_parameters
+        if item.set_of(p.name) == POINTS_SET
+    }
+    return item.with_rig(replace(item.rig, boards=boards)).with_values(points)
 
 
 def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> Fit:
