@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from ..plausibility.mixups import diagnose_images, diagnose_mixups
 from ..plausibility.rounding import find_rounding
 from ..session import Session
 from ..session.linear_model import measures_positions
+from ..session.search import can_have_session
 from . import cameras
 from .cameras.arm_types import INDUSTRIAL, ArmType
 from .cross_validation import (
@@ -53,6 +55,11 @@ from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
 from .partition import configuration_groups, count_held_out, is_same_file, k_fold, of_same_files
 
+if TYPE_CHECKING:
+    from ..session.check import Recheck
+
+# Largest number of hold-out samples with which is checked what changed before them.
+MAX_CHECKED = 60
 # Number of random folds of the cross-validation.
 N_FOLDS = 5
 # So few configurations are held out one by one instead.
@@ -423,6 +430,22 @@ class Evidence(FittedModel):
         return _with_servos(self, found) if hypotheses else None
 
     @cached_property
+    def holdout_change(self) -> Recheck | None:
+        """What changed between fitted and hold-out samples; None if they show no change."""
+        holdout = self.holdout
+        if not self.is_holdout_unexplained or self.holdout_mistake:
+            return None
+        is_drawn = any(_alternate(item, other) for item in holdout for other in self.data)
+        if is_drawn or not can_have_session(holdout) or not measures_positions(holdout):
+            return None
+        step = -(-sum(len(item.rows) for item in holdout) // MAX_CHECKED)
+        data = [_with_noise(self, item.take(np.arange(0, len(item.rows), step))) for item in holdout]
+        from ..session.check import recheck  # lazy import: only for hold-out samples
+
+        found = recheck(self.chain, data, self.uncertainty, known=self.instruments)
+        return found if found.verdict == "changed" else None
+
+    @cached_property
     def generalization(self) -> Generalization:
         """Accuracy within the measured region and beyond it, and the shares of the joint space of both."""
         region, comparison = self.measured_region, self.region_comparison
@@ -523,3 +546,21 @@ def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[s
             parts.setdefault(key, []).append(residual[group.rows].ravel())
     squares = {key: float(np.mean(np.concatenate(each) ** 2)) for key, each in parts.items()}
     return {key: value for key, value in squares.items() if value > 0}
+
+
+def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
+    """Return positions or poses with the noise that the fitted samples show."""
+    fields = {"position": "sigma", "orientation": "rotation_sigma"}
+    values = {
+        field: fit.noise_factors.get((item.kind, item.has_stated_sigma, group), 1.0) * getattr(item, field)
+        for group, field in fields.items()
+        if group in item.residual_groups
+    }
+    return item.replace(**values, has_stated_sigma=True)
+
+
+def _alternate(item: Measurement, other: Measurement) -> bool:
+    """Return whether samples of one file were measured between those of the other part of it."""
+    if not is_same_file(item, other):
+        return False
+    return bool(item.rows.min() < other.rows.max() and other.rows.min() < item.rows.max())

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,18 +41,13 @@ from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
-from ..session.linear_model import measures_positions
-from ..session.search import can_have_session
 from . import cameras
 from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
 from .evidence import Evidence, count_geometric_directions, diagnose_joint_values
 from .model_selection import FULL_SET
-from .partition import configuration_groups, is_same_file
+from .partition import configuration_groups
 from .reweighting import Fit
 from .summary import AUTO_OPTIONS, describe_samples, headline, small_sample_note
-
-if TYPE_CHECKING:
-    from ..session.check import Recheck
 
 Status = Literal["ok", "caution", "refused"]
 
@@ -126,8 +121,6 @@ MIN_REFITTED_SHARE = 0.5
 MAX_CHANCE, MIN_T = 0.025, -12.71
 # Outliers spoil a fit if the error without them is smaller by this factor.
 MAX_SPOILED_RATIO = 1.5
-# Largest number of hold-out samples with which is checked what changed before them.
-MAX_CHECKED = 60
 # Largest share of hold-out samples that may be equal to fitted ones.
 MAX_FITTED_SHARE = 0.1
 # Largest error of the zero of a servo that needs no caution [rad].
@@ -778,6 +771,8 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
     paired = fit.held_out_errors
     if paired is None or fit.holdout_mistake or not (fit.shrinkage_factor and fit.errors.has_arm):
         return []
+    if fit.holdout_change and fit.holdout_change.changes[0].kind != "robot":
+        return []  # The base or another part moved before these samples, which neither robot contains.
     head = fit.comparisons[0]
     group, after = next(iter(head.after.groups.items()))
     before, change = head.before.groups[group], paired.t
@@ -832,8 +827,7 @@ def _unexplained_holdout(fit: Evidence) -> list[Finding]:
         f"hold-out samples have {np.sqrt(fit.holdout_chi_square[0]):.1f} times the errors that the noise of "
         "the fitted ones and the uncertainty of the parameters explain."
     )
-    change = _change_before_holdout(fit)
-    if change and change.verdict == "changed":
+    if change := fit.holdout_change:
         text = f"Something changed between the fitted and the hold-out samples: {figures}"
         if change.changes[0].kind == "robot":
             remedy = (
@@ -846,36 +840,6 @@ def _unexplained_holdout(fit: Evidence) -> list[Finding]:
     remedy = "Measure all regions of joint space"
     remedy += ", and allow joint errors (--extend auto)." if fit.extension is None else "."
     return [Finding("caution", f"The model does not explain the arm: {figures} {remedy}")]
-
-
-def _change_before_holdout(fit: Evidence) -> Recheck | None:
-    """Check what changed between the fitted and the hold-out samples; None if they do not show it."""
-    holdout, step = fit.holdout, -(-sum(len(item.rows) for item in fit.holdout) // MAX_CHECKED)
-    is_drawn = any(_alternate(item, other) for item in holdout for other in fit.data)
-    if is_drawn or not can_have_session(holdout) or not measures_positions(holdout):
-        return None
-    data = [_with_noise(fit, item.take(np.arange(0, len(item.rows), step))) for item in holdout]
-    from ..session.check import recheck  # lazy import: only for hold-out samples
-
-    return recheck(fit.chain, data, fit.uncertainty, known=fit.instruments)
-
-
-def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
-    """Return positions or poses with the noise that the fitted samples show."""
-    fields = {"position": "sigma", "orientation": "rotation_sigma"}
-    values = {
-        field: fit.noise_factors.get((item.kind, item.has_stated_sigma, group), 1.0) * getattr(item, field)
-        for group, field in fields.items()
-        if group in item.residual_groups
-    }
-    return item.replace(**values, has_stated_sigma=True)
-
-
-def _alternate(item: Measurement, other: Measurement) -> bool:
-    """Return whether samples of one file were measured between those of the other part of it."""
-    if not is_same_file(item, other):
-        return False
-    return bool(item.rows.min() < other.rows.max() and other.rows.min() < item.rows.max())
 
 
 def _regional_errors(fit: Evidence) -> list[Finding]:

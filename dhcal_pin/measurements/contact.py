@@ -77,7 +77,7 @@ class PointContact(NamedPointMeasurement):
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy in which each point starts at the mean of the chain's tool points that touch it."""
-        tool = chain.poses(self.q)[:, :3, 3]
+        tool = chain.poses(self.conditions())[:, :3, 3]
         parameters: list[InstrumentParameter] = []
         for i, name in enumerate(self.names):
             contacts = tool[self.label == i]
@@ -255,7 +255,7 @@ class PlaneContact(PointMeasurement):
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy whose chart is the plane that fits the chain's tool points best."""
-        points = chain.poses(self.q)[:, :3, 3]
+        points = chain.poses(self.conditions())[:, :3, 3]
         origin = points.mean(0)
         return self.replace(origin=origin, axes=np.linalg.svd(points - origin)[2][::-1])
 
@@ -322,7 +322,7 @@ class SphereContact(PointMeasurement):
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy whose centre fits the chain's tool points best."""
-        centre = locate_point(chain.poses(self.q)[:, :3, 3], self.values[:, 0])
+        centre = locate_point(chain.poses(self.conditions())[:, :3, 3], self.values[:, 0])
         return self.replace(instrument_parameters=point_parameters(f"sphere_{self.name}", centre))
 
     def mirror_images(self, chain: Chain, values: Mapping[str, float]) -> list[dict[str, float]]:

@@ -147,7 +147,7 @@ class Wires(PointMeasurement):
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy whose unknown anchors fit the lengths best at the chain's tool points."""
-        points = chain.poses(self.q)[:, :3, 3]
+        points = chain.poses(self.conditions())[:, :3, 3]
         anchors = np.stack(
             [
                 locate_point(points, length - np.nan_to_num(offset))

@@ -333,7 +333,7 @@ class MultiTargetPosition(NamedPointMeasurement):
         Starting from zero offsets, the first iterations would rotate the tool instead of moving the targets.
         The solver would then have to return along a curved valley, which takes many iterations.
         """
-        tool_from_measuring = se3.inverse(chain.poses(self.q))
+        tool_from_measuring = se3.inverse(chain.poses(self.conditions()))
         rotated = (tool_from_measuring[:, :3, :3] @ self.values[..., None])[..., 0]
         local = tool_from_measuring[:, :3, 3] + rotated
         parameters = []

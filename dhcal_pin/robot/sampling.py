@@ -32,8 +32,10 @@ MAX_DRAWS_PER_SAMPLE = 200
 # turn.
 RAD_PER_METRE = 2 * np.pi
 
-# Range of a joint with wider or without limits, each way from zero [rad and m].
+# Range of a joint without limits, each way from zero [rad and m]. Turns beyond half a turn repeat others.
 _MAX_ANGLE, _MAX_STROKE = np.pi, 0.5
+# Limits of a prismatic joint that are farther apart [m] are no limits.
+_MAX_LENGTH = 100.0
 
 # A change of the tour must shorten it by more than this (rounding).
 _MIN_TOUR_GAIN = 1e-9
@@ -84,10 +86,11 @@ class WorkspaceConstraints:
 
 
 def joint_range(chain: Chain, angle: float = 0.0, length: float = 0.0) -> tuple[Array, Array]:
-    """Return the range of joint positions within the limits and half a turn or half a metre."""
+    """Return the range of joint positions within the limits, at most half a turn each way."""
     # The margins to the limits are an angle [rad] for revolute and a length [m] for prismatic joints.
     low, high = limits_with_margin(chain, angle, length)
-    span = np.where(_is_prismatic(chain), _MAX_STROKE, _MAX_ANGLE)
+    stroke = np.where(high - low <= _MAX_LENGTH, np.inf, _MAX_STROKE)
+    span = np.where(_is_prismatic(chain), stroke, _MAX_ANGLE)
     return (
         np.where(high > -span, np.maximum(low, -span), np.maximum(low, high - 2 * span)),
         np.where(low < span, np.minimum(high, span), np.minimum(high, low + 2 * span)),

@@ -18,7 +18,7 @@ from .._typing import Array
 from ..estimation.initialization import initialize_frames
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
-from ..robot.chain import BASE_FRAME
+from ..robot.chain import BASE_FRAME, Chain
 from .robot_changes import Motion
 from .timeline import Timeline
 
@@ -53,8 +53,20 @@ def place_parts(
     poses = np.array([chain.base @ se3.inverse(last.base) for chain in chains])
     if max(np.linalg.norm(se3.log3(pose[:3, :3])) for pose in poses) < MIN_ROTATION:
         return None
-    moved = replace(errors, chain=errors.chain.with_base_and_tool(last.base, last.tool))
-    return replace(problem, errors=moved), Motion(starts, poses)
+    return _placed(problem, last, parts[-1]), Motion(starts, poses)
+
+
+def _placed(problem: Problem, chain: Chain, part: tuple[Measurement, ...]) -> Problem:
+    """Return a problem with base and tool of a chain, and with first values of instruments in a part."""
+    # Those of all parts together mean nothing.
+    shown = [p for item in part for p in item.initialized(chain).instrument_parameters]
+    first = {p.name: p for p in shown if not np.isnan(p.nominal)}
+    data = tuple(
+        item.replace(instrument_parameters=tuple(first.get(p.name, p) for p in item.instrument_parameters))
+        for item in problem.data
+    )
+    placed = problem.errors.chain.with_base_and_tool(chain.base, chain.tool)
+    return replace(problem, errors=replace(problem.errors, chain=placed), data=data)
 
 
 def _is_base_free(problem: Problem) -> bool:
@@ -83,8 +95,7 @@ def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int
         last = numbers[begin : begin + N_FIRST][-1]
         part = _samples_between(problem.data, timeline, numbers[begin], last + 1)
         chain = initialize_frames(problem.errors, part, problem.known, MAX_ITERATIONS).chain
-        placed = replace(problem, errors=replace(problem.errors, chain=chain))
-        sizes = _mean_squares(placed, np.zeros_like(x), timeline)[begin:]
+        sizes = _mean_squares(_placed(problem, chain, part), np.zeros_like(x), timeline)[begin:]
         limit = MIN_FAR_RATIO**2 * np.median(sizes[:N_FIRST])
         far = np.flatnonzero(np.all(sliding_window_view(sizes > limit, N_FAR), 1))
         far = far[far >= MIN_SAMPLES]

@@ -277,9 +277,11 @@ class _Search:
         freedom = 1.0
         for _ in range(N_PASSES):
             information = information_with(weights)
-            covariance = inverse(information + np.diag(prior**2))
+            posterior = information + np.diag(prior**2)
+            covariance = inverse(posterior)
             right = np.tensordot(residual * weights[:, None] / noise**2, columns, 2)
-            step = covariance @ (right - prior**2 * value)
+            # The inverse times a vector loses the digits of directions that only priors determine.
+            step = solve_information(posterior, right - prior**2 * value)
             after = residual - columns @ step
             freedom = max(1 - float(np.sum(covariance * information)) / is_row.sum(), 0.05)
             last_noise, noise = noise, np.ones(residual.shape)
@@ -883,9 +885,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     ]
     parts = starts_of_parts(problem, x, timeline) if is_ordered else ()
     for each in dict.fromkeys((timeline.file_starts, parts)):
-        if moved := place_parts(problem, timeline, each):
-            starts.append(_Search(moved[0], np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS))
-            starts[-1].move_base(moved[1])
+        if placed := place_parts(problem, timeline, each):
+            moved, motion = placed
+            fitted = timeline.with_fitted(moved.data)
+            starts.append(_Search(moved, np.zeros_like(x), fitted, is_ordered, MAX_SAMPLES, MAX_CELLS))
+            starts[-1].move_base(motion)
     noises = [search.log_noise(search.first_fit) for search in starts]
     if starts[0].paths is not None and starts[0].has_different_rows:
         delayed = _Search(problem, np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)

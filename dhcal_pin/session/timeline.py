@@ -101,6 +101,10 @@ class Timeline:
         directions[order] = np.concatenate([directions_in_order(each) for each in files])
         return tuple(np.split(directions, np.cumsum([len(each) for each in self.numbers])[:-1]))
 
+    def with_fitted(self, data: Sequence[Measurement]) -> Timeline:
+        """Return the timeline with other values of the fitted samples."""
+        return replace(self, data=(*data, *self.data[self.n_fitted :]))
+
     def thinned(self, count: int) -> Timeline:
         """Return the timeline of at most `count` fitted samples of the robot, evenly spaced."""
         order = self._counted

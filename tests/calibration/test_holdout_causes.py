@@ -52,6 +52,17 @@ def test_a_change_before_the_hold_out_samples_is_named(what, changes, seed):
     assert sim.true_error(both.chain) < 2e-4
 
 
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_hold_out_samples_of_another_set_up_do_not_judge_the_robot(kind):
+    """They fit neither robot, so that the nominal one was kept."""
+    sim = Simulation("xarm7", 90, 3)
+    fitted, holdout = halves(sim.measure(kind, Changes("base", 1.0)))
+    fit = calibrate(sim.chain, fitted, holdout=holdout)
+    assert "The base or the instrument moved" in text_of(fit)
+    assert not fit.verdict.keeps_nominal
+    assert sim.true_error(fit.chain) < 2e-4
+
+
 @pytest.mark.parametrize("seed", some_slow(range(10), [0]))
 def test_an_unstated_payload_of_the_hold_out_samples_is_proposed(seed):
     sim = Simulation("ur10", 160, seed)

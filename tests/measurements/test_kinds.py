@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from robots import URDF
 
+from dhcal_pin import se3
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.evaluation import fit_instrument_parameters
 from dhcal_pin.cli.main import main
@@ -15,6 +16,7 @@ from dhcal_pin.estimation.problem import linearize_and_factor
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.measurements import KINDS, Noise, PlaneContact, PointContact, PointDistance, Pose
 from dhcal_pin.measurements.base import concatenate, whitened_jacobian
+from dhcal_pin.robot.conditions import Conditions
 
 KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -95,6 +97,20 @@ def truth_of(kind, chain, m, noise=None, seed=0):
     data = kind.simulate(chain, q, noise or Noise(), rng).initialized(chain)
     names = fit_instrument_parameters(chain, [data], {})
     return data, np.array([names[unknown.name] for unknown in data.instrument_parameters])
+
+
+@KIND
+def test_first_values_are_those_of_the_moved_base(kind, sim_6dof_actual):
+    chain, rng, m = sim_6dof_actual, np.random.default_rng(4), 12
+    data = kind.simulate(chain, rng.uniform(-2.5, 2.5, (m, chain.n_joints)), Noise(), rng)
+    motion = se3.exp6(np.array([0.5, -0.3, 0.8, 0.4, -0.6, 1.0]))
+    moved = chain.with_base_and_tool(motion @ chain.base, chain.tool)
+    recorded = data.replace(recorded=Conditions(data.q, base_motion=np.tile(motion, (len(data.rows), 1, 1))))
+    found, expected = (
+        [parameter.nominal for parameter in item.instrument_parameters]
+        for item in (recorded.initialized(chain), data.initialized(moved))
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 # Distances between points do not determine where the points are.

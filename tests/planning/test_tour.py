@@ -10,6 +10,7 @@ from dhcal_pin.planning import plan
 from dhcal_pin.planning.tour import find_tour, find_way, is_move_free
 from dhcal_pin.robot import Chain, CollisionChecker, Obstacle, WorkspaceConstraints, parse_urdf
 from dhcal_pin.robot.collision import CLEARANCE
+from dhcal_pin.robot.sampling import joint_range, random_configurations
 
 RADIUS = 0.02
 # A horizontal bar of 0.8 m that turns about a vertical axis and slides up and down.
@@ -172,3 +173,20 @@ def test_plans_have_free_moves_around_obstacles(candidates):
     if result.index is not None:
         # Given candidates keep their values.
         np.testing.assert_array_equal(result.q, candidates[result.index])
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [((0.1, 4.1), (0.1, 4.1)), ((-1e4, 1e4), (-0.5, 0.5)), ((2.0, 1e4), (2.0, 3.0))],
+)
+def test_configurations_use_the_whole_stroke_within_limits(limits, expected):
+    """Limits that are kilometres apart are no limits; a joint without limits moves half a metre."""
+    low, high = limits
+    text = ARM.replace('lower="0.1" upper="1.1"', f'lower="{low}" upper="{high}"')
+    chain = Chain.from_urdf(parse_urdf(text.encode(), "r"))
+    found = [each[0] for each in joint_range(chain)]
+    np.testing.assert_allclose(found, expected)
+    drawn = random_configurations(chain, 1000)[:, 0]
+    share = (drawn - expected[0]) / (expected[1] - expected[0])
+    assert share.min() < 0.01
+    assert share.max() > 0.99

@@ -1,5 +1,7 @@
 """Measurements of different kinds that contradict each other, simulated with a joint zero that differs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import nominal_arm
@@ -69,3 +71,15 @@ def test_the_ratio_is_that_of_two_calibrations():
     freedom = (len(item.rows) - alone.rank) / len(item.rows)
     expected = errors[0] / errors[1] * np.sqrt(freedom)
     assert own_fit_ratio(both.inlier_problem, both.solution.x, item) == pytest.approx(expected, rel=0.2)
+
+
+def test_the_ratio_does_not_depend_on_first_values_of_instruments():
+    """Each file has first values of its own; the calibration takes those of the first file."""
+    chain, _, data = measured("sphere", np.random.default_rng(3), np.deg2rad(0.3))
+    fit = calibrate(chain, data, extend="none", session="off")
+    problem, x, item = fit.inlier_problem, fit.solution.x, fit.inlier_problem.data[1]
+    moved = [replace(p, nominal=p.nominal + 0.1) for p in item.instrument_parameters]
+    other = item.replace(instrument_parameters=tuple(moved))
+    expected = own_fit_ratio(problem, x, item)
+    assert expected > 1.1
+    assert own_fit_ratio(problem, x, other) == pytest.approx(expected, rel=1e-6)

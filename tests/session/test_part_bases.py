@@ -9,7 +9,7 @@ from sessions import Changes, Simulation, session_of
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
-from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.measurements import MultiTargetPosition, Pose, Position
 
 
 def files(sim: Simulation, kind: type, frames: list[pin.SE3]):
@@ -57,6 +57,28 @@ def test_each_file_has_its_own_pose_of_the_base(arm, angles, kind):
     np.testing.assert_allclose(found, true, atol=1e-3)
     assert fit.verdict.status == "caution"
     assert sim.true_error(fit.chain) < 1e-4
+
+
+@pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 2), ("panda", 3), ("xarm7", 2)], {0}))
+def test_targets_on_the_tool_show_the_base_of_each_file(arm, count):
+    """The places of two targets in the tool mean nothing before the base of each file is known."""
+    sim = Simulation(arm, 40 * count, 8)
+    offsets = np.array([[0.06, 0.0, 0.02], [-0.05, 0.08, -0.03]])
+    label = np.arange(len(sim.q)) % 2
+    data, items = sim.measure(Pose), []
+    poses = data.poses[:, :3, 3] + np.einsum("mij,mj->mi", data.poses[:, :3, :3], offsets[label])
+    for i, part in enumerate(np.array_split(np.arange(len(sim.q)), count)):
+        frame = pin.SE3(pin.exp3(sim.rng.normal(0, 1, 3)), sim.rng.normal(0, 3, 3))
+        values = poses[part] @ frame.rotation.T + frame.translation
+        names = [f"r{number + 1}" for number in label[part]]
+        items.append(MultiTargetPosition(data.q[part], values, names).replace(source=f"{i}.csv"))
+    fit = calibrate(sim.chain, items, extend="none")
+    assert [(event.kind, event.after.file) for event in session_of(fit).events] == [
+        ("base", f"{i}.csv") for i in range(1, count)
+    ]
+    assert len(fit.verdict.reasons) == count - 1, fit.verdict.reasons
+    found = np.array([fit.instruments[f"target_r2.{axis}"] for axis in "xyz"])
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(offsets[1] - offsets[0]), abs=1e-4)
 
 
 ONE_FILE = [("ur10", 60, (0.6, 1.0), 0), ("panda", 180, (0.25, 1.0), 0), ("xarm7", 100, (0.3, 0.7), 3)]
