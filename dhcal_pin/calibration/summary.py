@@ -91,7 +91,10 @@ def position_notes(std: float | None) -> list[str]:
     if std is None or not np.isfinite(std):
         return []
     size = Quantity.error(std, "m")
-    return [f"Positions of camera and board relative to the arm: standard deviation {size}."]
+    return [
+        f"Positions of camera and board relative to the arm: standard deviation {size}, without errors of "
+        "the arm that no image shows, such as the length of its last link."
+    ]
 
 
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:

@@ -95,7 +95,7 @@ def test_rotations_mend_what_the_reason_names(is_on_wrist):
     assert photographer.camera_error(mended) < 1e-3
     assert result_to_dict(mended, {}, {})["hand_eye_std_m"] == mended.hand_eye_std
     (note,) = summary.position_notes(mended.hand_eye_std)
-    assert note.endswith(f"{Quantity.error(mended.hand_eye_std, 'm')}.")
+    assert f"standard deviation {Quantity.error(mended.hand_eye_std, 'm')}, without" in note
 
 
 CASES = [(name, is_on_wrist) for name in ("panda", "ur10", "xarm7") for is_on_wrist in (False, True)]

@@ -49,6 +49,8 @@ MIN_SHARE = 0.1
 MAX_REJECTED_SHARE = 0.5
 # Largest ratio of the squared residuals to the noise that is left where another size explains such corners.
 MAX_COST_RATIO = 2.0
+# What else explains a change of the size by more than MAX_SIZE_STEP.
+OTHER_ROBOT = " Or the URDF is that of a robot of another size."
 # Largest number of iterations of one solution.
 _MAX_ITERATIONS = 40
 
@@ -91,6 +93,7 @@ class BoardSize:
             f"{start}: with {join_names(self._texts)}, the corrections of the lengths of the arm fall from "
             f"{self.stated:.2g} to {self.found:.2g} times what manufacturing errors would be. Measure "
             f"{boards} over the whole length, and correct the size in the rig file."
+            f"{OTHER_ROBOT if max(abs(np.log(size)) for size in self.wrong.values()) > MAX_SIZE_STEP else ''}"
         )
 
     @property

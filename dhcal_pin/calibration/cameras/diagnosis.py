@@ -213,11 +213,12 @@ class HandEyeDiagnosis:
             parts.append(f" {start}: {trial.text}.")
             if trial.cause != DISPLACEMENT:
                 parts.append(f" If that is estimated, too, {_mm(trial.error.distance)} remain.")
-        first = self.causes[0]
         if self.alternatives:
             others = " or ".join(f"{trial.text} ({_mm(trial.error.distance)})" for trial in self.alternatives)
             parts.append(f" Not distinguishable from: {others}.")
-        parts.append(f" {first.remedy}")
+        # What is wrong beside the arm is mended first.
+        ordered = sorted(self.causes, key=lambda trial: trial.cause in ARM_SETS)
+        parts += [f" {remedy}" for remedy in dict.fromkeys(trial.remedy for trial in ordered)]
         return "".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
@@ -699,7 +700,7 @@ def _arm_text(hand_eye: HandEyeData, state: _State) -> tuple[str, str]:
     x = state.fit.solution.x[: len(errors.parameters)]
     remedy = "Estimate the arm, too, without --parameters."
     if hand_eye.is_arm_tried:
-        remedy = "The calibration estimated the arm, too: the images do not decide that."
+        remedy = "The arm was estimated, too; left-out images do not show that its correction is right."
     if state.causes.arm == ARM_SETS[OFFSETS]:
         offsets = {p.name: v for p, v in zip(errors.parameters, x, strict=True) if p.name.endswith("offset")}
         name = max(offsets, key=lambda each: abs(offsets[each]))
