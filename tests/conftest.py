@@ -19,6 +19,8 @@ from robots import missing, nominal_arm, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
+from dhcal_pin.calibration.cameras import diagnosis
+from dhcal_pin.calibration.cameras.mistakes import rig
 from dhcal_pin.cli import main
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
 from dhcal_pin.robot.chain import Chain
@@ -124,6 +126,26 @@ def uneventful(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     """
     if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr(procedure, "can_have_session", lambda _: False)
+
+
+@pytest.fixture
+def untried(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the trials of causes of errors in images, unless a test is slow.
+
+    They take most of the time of a calibration of images. `calibration/test_hand_eye.py` is about them.
+    """
+    if not request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(diagnosis, "_try_causes", lambda *_: {})
+
+
+@pytest.fixture
+def ordered_axes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the trials of other orders of image axes, unless a test is slow.
+
+    Each takes a calibration of the camera. `calibration/test_cameras.py` is about them.
+    """
+    if not request.node.get_closest_marker("slow"):
+        monkeypatch.setattr(rig, "exchange_axes", lambda _, data: (tuple(data), ()))
 
 
 @pytest.fixture(scope="module")

@@ -64,7 +64,9 @@ def ur10(dhcal, series, sets, folder, *more):
     return dhcal("calibrate", robot, SERIES[series], *options, *SESSION, *more), output
 
 
-@pytest.mark.parametrize(("series", "frames", "best"), [("B", 1.083e-3, 0.450e-3), ("D", 0.774e-3, 0.412e-3)])
+@pytest.mark.parametrize(
+    ("series", "frames", "best"), some_slow([("B", 1.083e-3, 0.450e-3), ("D", 0.774e-3, 0.412e-3)], {0})
+)
 def test_tracker_series_of_a_ur10(dhcal, tmp_path, series, frames, best):
     placed, _ = ur10(dhcal, series, "base,tool", tmp_path, "--holdout", "0.5")
     # The reference is one split; another draws other rows.
@@ -419,7 +421,7 @@ REAL_SERIES = {
 }
 
 
-@pytest.mark.parametrize("name", some_slow(list(REAL_SERIES), {1, 2, 4, 5}))
+@pytest.mark.parametrize("name", some_slow(list(REAL_SERIES), {1, 4, 5}))
 def test_no_real_series_is_refused(tmp_path, capsys, name):
     robot, files, options, columns = REAL_SERIES[name]
     output = tmp_path / "result.json"

@@ -18,7 +18,7 @@ from dhcal_pin.estimation.initialization import align
 from dhcal_pin.estimation.problem import whitened_residuals
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried", "ordered_axes")
 
 
 def photograph(seed, error, is_on_wrist=True):

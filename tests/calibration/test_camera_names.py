@@ -14,7 +14,7 @@ import dhcal_pin as dh
 from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried", "ordered_axes")
 
 SETS = "camera,board,intrinsics"
 

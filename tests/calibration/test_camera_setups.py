@@ -14,7 +14,7 @@ from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.cameras import Board
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried", "ordered_axes")
 
 
 def image_rms(fit, data):
@@ -39,7 +39,7 @@ def converges(seed):
     assert image_rms(fit, setup.images) < limit
 
 
-@pytest.mark.parametrize("seed", some_slow([0, 5, 8, 13, 18, 23], {1, 2, 5}))
+@pytest.mark.parametrize("seed", some_slow([0, 5, 8, 13, 18, 23], {2, 5}))
 def test_setups_converge_without_a_guess(seed):
     converges(seed)
 
@@ -69,7 +69,7 @@ def test_boards_of_points_near_a_plane_converge_without_a_guess(depth, is_lens_k
     assert image_rms(fit, images) < 1.1 * setup.sigma
 
 
-@pytest.mark.parametrize("seed", some_slow(range(21), {3, 5}))
+@pytest.mark.parametrize("seed", some_slow(range(21), {3}))
 def test_small_boards_of_wrong_points_converge(seed, monkeypatch):
     """Eight points of a small board, flat or not, that are 1 to 3 mm from where the rig states them."""
     error, depth = (1e-3, 2e-3, 3e-3)[seed // 2 % 3], (0.8, 0.1, 0.0)[seed % 3]
@@ -94,9 +94,7 @@ def test_small_boards_of_wrong_points_converge(seed, monkeypatch):
     assert image_rms(fit, images) < 1.1 * setup.sigma
 
 
-@pytest.mark.parametrize(
-    "seed", [50, 76, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(30))]
-)
+@pytest.mark.parametrize("seed", some_slow([50, 76, *range(30)], {1}))
 def test_strong_distortion_without_focal_lengths_converges(seed, monkeypatch):
     true_lens = camera_setups.true_lens
 

@@ -82,6 +82,7 @@ def test_a_usual_lens_is_neither_another_resolution_nor_far(focal, shift, is_exp
     assert not is_far(replace(camera, intrinsics="free"), found)
 
 
+@pytest.mark.usefixtures("untried")
 @pytest.mark.parametrize(
     ("seed", "factor", "size"),
     some_slow(
@@ -99,6 +100,7 @@ def test_another_resolution_is_named_and_its_correction_helps(seed, factor, size
     assert right.verdict.status == "ok"
 
 
+@pytest.mark.usefixtures("untried")
 @pytest.mark.parametrize(
     ("seed", "factor", "size"), some_slow([(0, 1 / 2, "640 x 480"), (1, 2.0, "2560 x 1920")], {0})
 )
@@ -117,12 +119,14 @@ def test_a_lens_of_another_resolution_is_named_and_its_correction_helps(seed, fa
     assert right.verdict.status == "ok"
 
 
+@pytest.mark.usefixtures("untried")
 @pytest.mark.parametrize("seed", some_slow(range(6), {0}))
 def test_a_lens_that_is_wrong_by_2_percent_is_no_reason(seed):
     arm, images = photograph(seed, intrinsics_error=0.02)
     assert dh.calibrate(arm, images, loss="linear").verdict.status == "ok"
 
 
+@pytest.mark.usefixtures("untried")
 def test_a_lens_of_another_camera_is_named():
     """The rig states a lens with a focal length that is 1.4 times the true one."""
     arm, images = photograph(0, intrinsics_error=0.0)

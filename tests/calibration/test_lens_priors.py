@@ -11,7 +11,7 @@ from dhcal_pin.calibration.cameras.lens_priors import lens_prior_groups
 from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation.initialization import make_problem
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried", "ordered_axes")
 
 SETS = "camera,board,intrinsics"
 

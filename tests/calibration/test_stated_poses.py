@@ -15,7 +15,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.mistakes import PoseDifference
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "ordered_axes")
 
 AS_IT_IS, INVERSE = (lambda pose: pose), se3.inverse
 # What is stated of the pose of the camera, and of that of the board.
@@ -41,6 +41,7 @@ def with_stated(setup, of_camera, of_board):
 CASES = list(product([("ur10", 5, True), ("panda", 4, False), ("xarm7", 2, True)], STATED))
 
 
+@pytest.mark.usefixtures("untried")
 @pytest.mark.parametrize(("case", "which"), some_slow(CASES, {0, 6}))
 def test_inverse_first_values_are_named_and_not_used(case, which):
     name, seed, is_on_wrist = case
@@ -62,6 +63,7 @@ def test_inverse_first_values_are_named_and_not_used(case, which):
     assert found == pytest.approx(true, abs=2e-3)
 
 
+@pytest.mark.usefixtures("untried")
 @pytest.mark.parametrize("seed", some_slow(range(20, 32), {0, 1}))
 def test_right_first_values_are_never_inverse(seed):
     """An arm with errors of centimetres and degrees displaces the images by hundreds of pixels."""

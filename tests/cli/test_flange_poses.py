@@ -8,17 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate
+from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.io.rig_file import rig_text
 
-pytestmark = pytest.mark.usefixtures("uneventful")
+pytestmark = pytest.mark.usefixtures("uneventful", "ordered_axes")
 
 
-def write_images(seed: int, is_on_wrist: bool, arm: str = "ur10", of_poses=lambda poses: poses):
+def write_images(
+    seed: int, is_on_wrist: bool, arm: str = "ur10", of_poses=lambda poses: poses, n_images: int = 20
+):
     """Write simulated images with a function of the poses of the flange, and their rig; return the truth."""
     chain, rng = ARMS[arm](), np.random.default_rng(seed)
-    setup = simulate(chain, chain, rng, is_on_wrist=is_on_wrist, n_images=20, sigma=0.1)
+    setup = simulate(chain, chain, rng, is_on_wrist=is_on_wrist, n_images=n_images, sigma=0.1)
     images = setup.images
     lines = ["x[m],y[m],z[m],rx[rad],ry[rad],rz[rad],u[px],v[px],corner"]
     for pose, pixels, corner in zip(
@@ -94,13 +97,15 @@ def written_position(rig_name: str) -> np.ndarray:
     return np.array(camera["xyz_m"])
 
 
-@pytest.mark.parametrize(("arm", "seed", "is_on_wrist"), [("ur10", 5, True), ("panda", 4, False)])
+@pytest.mark.parametrize(
+    ("arm", "seed", "is_on_wrist"), some_slow([("ur10", 5, True), ("panda", 4, False)], {1})
+)
 def test_inverse_flange_poses_are_named_beside_exchanged_links(
     run, tmp_path, monkeypatch, arm, seed, is_on_wrist
 ):
     """Both give the same images; the distances to the stated links let a user decide."""
     monkeypatch.chdir(tmp_path)
-    true = write_images(seed, is_on_wrist, arm, se3.inverse).camera_in_end(0)[:3, 3]
+    true = write_images(seed, is_on_wrist, arm, se3.inverse, 12).camera_in_end(0)[:3, 3]
     status, _, err = run(*CALIBRATE)
     assert status == 3
     assert not Path("out.urdf").exists()
@@ -124,7 +129,7 @@ def test_inverse_flange_poses_are_named_beside_exchanged_links(
 
 def test_exchanged_links_are_named_beside_inverse_flange_poses(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    true = write_images(5, is_on_wrist=True).camera_in_end(0)[:3, 3]
+    true = write_images(5, is_on_wrist=True, n_images=12).camera_in_end(0)[:3, 3]
     right = Path("rig.toml").read_text()
     exchanged = right.replace('"tip"', '"none"').replace('"world"', '"tip"').replace('"none"', '"world"')
     Path("rig.toml").write_text(exchanged)

@@ -15,7 +15,7 @@ def test_unchanged_files_are_read(case):
     assert not heard
 
 
-@settings(max_examples=100, deadline=None, derandomize=True, suppress_health_check=LENIENT)
+@settings(max_examples=50, deadline=None, derandomize=True, suppress_health_check=LENIENT)
 @given(**EXAMPLES)
 def test_commands_survive_any_file(case, mutations):
     survive(case, mutated(case.data, mutations, WORD))

@@ -14,7 +14,7 @@ from dhcal_pin.cameras import Rig
 from dhcal_pin.detection import ImageQuality, render_images
 from dhcal_pin.io.rig_file import rig_text
 
-pytestmark = pytest.mark.usefixtures("uneventful")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
 
 cv2 = pytest.importorskip("cv2")
 

@@ -12,7 +12,7 @@ from dhcal_pin.io import read_configurations, read_robot
 from dhcal_pin.io.rig_file import read_rig
 from dhcal_pin.measurements import ViewLimits, is_board_in_view, mount_rig
 
-pytestmark = pytest.mark.usefixtures("uneventful")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
 
 RIG = (
     f"{CAMERA_TABLE}xyz_m = [0.0, 0.06, 0.03]\nrotvec_rad = [0.0, 0.0, 0.0]\n"

@@ -1,6 +1,8 @@
 """A mistake that begins or ends within a file is stated for its lines only, with a remedy for these."""
 
 import re
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +29,12 @@ CASES = [(arm, key, seed) for seed in range(5) for arm in ARMS for key in MISTAK
 FAST = [0, 6, 11]
 
 
+def at_places(places: Sequence[slice | np.ndarray]) -> list[Any]:
+    """Return all cases at all places, which are slow, and fast ones at one place each."""
+    fast = [(*CASES[i], [place]) for i, place in zip(FAST, places[-3:], strict=True)]
+    return some_slow([*fast, *((*case, places) for case in CASES)], range(3))
+
+
 def spoiled(
     sim: Simulation, data: Measurement, key: str, inside: slice | np.ndarray
 ) -> tuple[str, Measurement]:
@@ -48,7 +56,7 @@ def calibrate_parts(sim: Simulation, data: Measurement) -> Result:
     return calibrate(sim.chain, fitted, holdout=holdout)
 
 
-@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
+@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST[::2]))
 def test_a_mistake_in_most_rows_is_stated_for_their_lines(arm, key, seed):
     sim = Simulation(arm, COUNT, seed)
     name, wrong = spoiled(sim, sim.measure(), key, slice(30, None))
@@ -65,10 +73,13 @@ def test_a_mistake_in_most_rows_is_stated_for_their_lines(arm, key, seed):
         assert sim.true_error(again.chain) < 2e-4
 
 
-@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
-def test_no_change_of_a_whole_file_is_advised_if_a_part_is_right(arm, key, seed):
+@pytest.mark.parametrize(
+    ("arm", "key", "seed", "places"),
+    at_places([slice(50, None), slice(0, 50), slice(20, 70), np.arange(COUNT) % 2 == 0]),
+)
+def test_no_change_of_a_whole_file_is_advised_if_a_part_is_right(arm, key, seed, places):
     sim = Simulation(arm, COUNT, seed)
-    for inside in (slice(50, None), slice(0, 50), slice(20, 70), np.arange(COUNT) % 2 == 0):
+    for inside in places:
         _, wrong = spoiled(sim, sim.measure(), key, inside)
         text = " ".join(calibrate_parts(sim, wrong).verdict.reasons)
         rows = np.arange(1, COUNT + 1)[inside]
@@ -104,10 +115,12 @@ def test_the_command_names_lines_and_mends_them(tmp_path, capsys):
     assert "expected a whole file, without lines" in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.parametrize(("arm", "key", "seed"), some_slow(CASES, FAST))
-def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed):
+@pytest.mark.parametrize(
+    ("arm", "key", "seed", "places"), at_places([slice(55, None), slice(0, 40), slice(30, 70)])
+)
+def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed, places):
     sim = Simulation(arm, COUNT, seed)
-    for inside in (slice(55, None), slice(0, 40), slice(30, 70)):
+    for inside in places:
         name, wrong = spoiled(sim, sim.measure(), key, inside)
         first, last, _ = inside.indices(COUNT)
         fit = calibrate_parts(sim, wrong)

@@ -25,6 +25,8 @@ from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.measurements.images import image_pose
 from dhcal_pin.measurements.mounting import mount_rig
 
+pytestmark = pytest.mark.usefixtures("untried", "ordered_axes")
+
 NOISE = 0.3
 NONE = np.empty(0)
 

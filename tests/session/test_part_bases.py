@@ -1,6 +1,8 @@
 """Parts of a session whose measuring frames differ by large rotations, against the true arm and motions."""
 
+from collections.abc import Collection, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -34,10 +36,17 @@ def sim_poses(data, part: np.ndarray) -> list[np.ndarray]:
     return list(poses)
 
 
-@pytest.mark.parametrize("kind", [Position, Pose])
+def for_both_kinds(cases: Sequence[tuple[Any, ...]], fast: Collection[int]) -> list[Any]:
+    """Return each case with positions and with poses; those at the given places are not slow."""
+    return some_slow([(*case, kind) for case in cases for kind in (Position, Pose)], fast)
+
+
 @pytest.mark.parametrize(
-    ("arm", "angles"),
-    [("ur10", (20, 0)), ("panda", (180, 0)), ("xarm7", (60, -100, 0)), ("ur10", (5, 12, 0))],
+    ("arm", "angles", "kind"),
+    for_both_kinds(
+        [("ur10", (20, 0)), ("panda", (180, 0)), ("xarm7", (60, -100, 0)), ("ur10", (5, 12, 0))],
+        {0, 3, 4, 7},
+    ),
 )
 def test_each_file_has_its_own_pose_of_the_base(arm, angles, kind):
     rng = np.random.default_rng(len(angles) + abs(angles[0]))
@@ -84,8 +93,9 @@ def test_targets_on_the_tool_show_the_base_of_each_file(arm, count):
 ONE_FILE = [("ur10", 60, (0.6, 1.0), 0), ("panda", 180, (0.25, 1.0), 0), ("xarm7", 100, (0.3, 0.7), 3)]
 
 
-@pytest.mark.parametrize("kind", [Position, Pose])
-@pytest.mark.parametrize(("arm", "angle", "shares", "n_outliers"), ONE_FILE)
+@pytest.mark.parametrize(
+    ("arm", "angle", "shares", "n_outliers", "kind"), for_both_kinds(ONE_FILE, {0, 3, 4})
+)
 def test_a_base_that_turned_far_within_a_file_is_found(arm, angle, shares, n_outliers, kind):
     """The base turns at a share of the rows and, in one case, back again."""
     sim = Simulation(arm, 80, 6)
@@ -106,8 +116,9 @@ def test_a_base_that_turned_far_within_a_file_is_found(arm, angle, shares, n_out
     assert sim.true_error(fit.chain) < 1e-4
 
 
-@pytest.mark.parametrize("kind", [Position, Pose])
-@pytest.mark.parametrize(("arm", "count"), some_slow([("ur10", 2), ("panda", 3), ("ur5", 5)], {0, 1}))
+@pytest.mark.parametrize(
+    ("arm", "count", "kind"), for_both_kinds([("ur10", 2), ("panda", 3), ("ur5", 5)], {0, 3})
+)
 def test_equal_parts_of_a_file_have_their_own_pose_of_the_base(arm, count, kind):
     """One base fits no part, so that there are no outliers."""
     sim = Simulation(arm, 40 * count, 7)
@@ -121,8 +132,7 @@ def test_equal_parts_of_a_file_have_their_own_pose_of_the_base(arm, count, kind)
     assert sim.true_error(fit.chain) < 1e-4
 
 
-@pytest.mark.parametrize("count", [1, 2, 6])
-@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize(("count", "kind"), for_both_kinds([(1,), (2,), (6,)], {0, 3, 4}))
 def test_a_file_with_few_rows_moves_nothing(kind, count):
     sim = Simulation("ur10", 60, 5)
     data = sim.measure(kind)

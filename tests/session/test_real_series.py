@@ -59,7 +59,7 @@ def test_nothing_is_found_in_a_real_series(seed):
 
 
 @pytest.mark.parametrize(
-    ("seed", "degrees"), some_slow([(seed, size) for seed in range(12) for size in (0.1, 0.2, 0.4)], {7, 24})
+    ("seed", "degrees"), some_slow([(seed, size) for seed in range(12) for size in (0.1, 0.2, 0.4)], {7})
 )
 def test_a_zero_that_changes_in_a_real_series_is_found_with_its_size(seed, degrees):
     """A wrong size is left in the robot: 0.05° of one of the first joints are errors of 0.5 to 1 mm."""

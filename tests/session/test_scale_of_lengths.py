@@ -32,7 +32,7 @@ def measured(kind, seed, factor):
     return nominal, item.replace(values=factor * item.values)
 
 
-@pytest.mark.parametrize(("kind", "seed"), some_slow(CASES, {0, 6}))
+@pytest.mark.parametrize(("kind", "seed"), some_slow(CASES, {0}))
 def test_a_wrong_scale_of_lengths_is_found_and_mended(kind, seed):
     nominal, data = measured(kind, seed, FACTOR)
     fit = calibrate(nominal, data)
@@ -45,7 +45,7 @@ def test_a_wrong_scale_of_lengths_is_found_and_mended(kind, seed):
     assert mended.verdict.status == "ok"
 
 
-@pytest.mark.parametrize(("kind", "seed"), some_slow(CASES, {1, 7}))
+@pytest.mark.parametrize(("kind", "seed"), some_slow(CASES, {7}))
 def test_lengths_of_a_right_scale_show_none(kind, seed):
     fit = calibrate(*measured(kind, seed, 1.0))
     assert not (fit.session and fit.session.scales)

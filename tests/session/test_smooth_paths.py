@@ -59,7 +59,7 @@ class ElasticArm:
 CASES = [(name, seed) for seed in range(20) for name in ("ur5", "ur10")]
 
 
-@pytest.mark.parametrize(("name", "seed"), some_slow(CASES, {0, 15}))
+@pytest.mark.parametrize(("name", "seed"), some_slow(CASES, {0}))
 def test_nothing_changes_along_a_smooth_path(name, seed):
     arm = ElasticArm(name, seed)
     times = np.linspace(0, 1, N_SAMPLES)
@@ -103,7 +103,7 @@ def test_most_changes_are_found_along_smooth_paths():
     assert np.mean(found) >= 0.75
 
 
-@pytest.mark.parametrize("seed", some_slow(range(8), {0, 2}))
+@pytest.mark.parametrize("seed", some_slow(range(8), {0}))
 def test_no_joint_errors_explain_what_the_reflector_did_along_a_short_path(seed):
     """The tool moves by 0.54 mm; harmonics and coupling of the joints explain most of it, too."""
     arm = ElasticArm("ur10", seed, is_rigid=True)

@@ -28,7 +28,7 @@ CHANGES = {
 }
 # Arm, number of samples, of points and of touches in a row.
 SETTINGS = list(zip(3 * NAMES, *zip(*product((40, 100), (2, 4, 6), (1, 5)), strict=True), strict=True))
-FAST = {"joint 1": 0, "joint 3": 7, "tool": 2, "plate": 3}
+FAST = {"joint 3": 7, "tool": 2, "plate": 3}
 CASES = [(name, *each) for name in CHANGES for each in SETTINGS]
 FAST_CASES = [len(SETTINGS) * list(CHANGES).index(name) + i for name, i in FAST.items()]
 

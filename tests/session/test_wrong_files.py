@@ -44,11 +44,14 @@ def judge(arm: str, seed: int, kind: type[Measurement], name: str, joint: int, e
 
 @pytest.mark.parametrize(
     ("arm", "kind", "name", "joint", "event"),
-    [
-        ("ur10", Pose, "sign", 3, ""),
-        ("panda", Pose, "zero", 3, ""),
-        ("panda", Position, "sign", 4, "base"),
-    ],
+    some_slow(
+        [
+            ("ur10", Pose, "sign", 3, ""),
+            ("panda", Pose, "zero", 3, ""),
+            ("panda", Position, "sign", 4, "base"),
+        ],
+        {0, 2},
+    ),
 )
 def test_a_mistake_is_named_in_place_of_false_events(arm, kind, name, joint, event):
     fit = judge(arm, 0, kind, name, joint, event)
