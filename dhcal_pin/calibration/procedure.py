@@ -189,8 +189,8 @@ def calibrate(
         settings["with_low_cost"] = partial(again, parameters=HAND_BUILT)
     begun = _begin(setup)
     # The confirmation of changes and the calibration itself often need the same fits.
-    groups = _prior_groups(begun.fit, setup.priors)
-    reweighted = cache(lambda fit, stages: reweight(fit, stages, groups, max_iterations, progress))
+    groups_of = partial(_prior_groups, priors=setup.priors)
+    reweighted = cache(lambda fit, stages: reweight(fit, stages, groups_of(fit), max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
 
     @cache
@@ -214,6 +214,7 @@ def calibrate(
             HAND_BUILT if setup.signs else MANUFACTURED,
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
+    groups = groups_of(begun.fit)
     if _suggests_full_set(setup):
         # If nothing happened during the measurement, the search for it is not repeated.
         has_changes = begun.session is not None and not begun.session.changes.is_empty

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,8 +34,9 @@ from .._typing import Array, Progress
 from ..estimation.error_model import ErrorModel
 from ..estimation.priors import effective_parameters
 from ..estimation.problem import Problem
+from ..estimation.qr import rank
 from ..estimation.robust import MAD_TO_STD
-from ..estimation.solver import SolverResult, minimize
+from ..estimation.solver import minimize
 from ..estimation.uncertainty import FamilyGain
 from ..measurements.base import Measurement, known_conditions
 from ..plausibility.diagnosis import Diagnosis, is_suspicious, leaves_residuals
@@ -42,7 +44,7 @@ from ..plausibility.displacement import workspace_radius
 from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import Evidence
 from ..plausibility.mixups import diagnose_mixups
-from ..robot.chain import Chain
+from ..robot.chain import BASE_FRAME, Chain
 from ..robot.error_families import BACKLASH, FAMILIES
 from ..session import Session, find_session
 from ..session.causes import Cause, Step
@@ -174,14 +176,38 @@ class _Search:
 
     def find(self, problem: Problem, x: Array) -> SessionFit:
         """Find what happened, from a solution, and fit again with the changes."""
-        chain = self.fit.problem.errors.chain
+        chain, errors = self.fit.problem.errors.chain, self.models.errors
+        if self.relative_base:
+            problem, x = _with_held_base(problem, x, self.relative_base)
+            placed = chain.with_base_and_tool(problem.errors.chain.base, chain.tool)
+            errors = replace(_with_held(errors, self.relative_base), chain=placed)
         session = replace(find_session(problem, x, self.holdout, self.is_ordered), chain=chain)
         if session.changes.is_empty:
             return SessionFit(self.fit, self.holdout, session)
         changed, changed_holdout = session.applied(self.data, self.holdout)
-        errors = self.models.errors
-        held = errors if session.changes.tool.is_identity else _with_held_axes(errors, self.fit.solution)
-        return SessionFit(self.models.start(changed, held), changed_holdout, session)
+        if not session.changes.tool.is_identity:
+            # Changes act in the axes of base and tool, which would turn by chance where no row shows them.
+            errors = _with_held(errors, self._unseen_axes)
+        return SessionFit(self.models.start(changed, errors), changed_holdout, session)
+
+    @cached_property
+    def relative_base(self) -> frozenset[str]:
+        """Names of the parameters of a base that turns with instruments at unknown places, if it does."""
+        # A motion of the base would turn with them.
+        problem, r = self.fit.problem, self.fit.solution.system.r
+        names = frozenset(p.name for p in problem.errors.parameters if p.error_frame == BASE_FRAME)
+        is_base = np.array([p.name in names for p in problem.parameters], bool)
+        is_instrument = np.arange(len(is_base)) >= len(problem.errors.parameters)
+        is_relative = rank(r[:, is_base | is_instrument]) == rank(r[:, is_instrument])
+        return names if names and is_relative else frozenset()
+
+    @property
+    def _unseen_axes(self) -> frozenset[str]:
+        """Names of the parameters of base and tool that no row shows."""
+        errors, system = self.models.errors, self.fit.solution.system
+        n = len(errors.parameters)
+        is_unseen = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
+        return frozenset(errors.parameters[i].name for i in np.flatnonzero(is_unseen))
 
     def find_beside(self, extended: Fit, found: SessionFit) -> SessionFit:
         """Find what happened beside the joint errors of a fit, which are fitted again with what was found."""
@@ -242,12 +268,21 @@ def _log_noise(fit: Fit) -> float:
     return float(np.mean(np.log(sizes)) - 0.5 * np.log(max(freedom, MIN_FREEDOM)))
 
 
-def _with_held_axes(errors: ErrorModel, solution: SolverResult) -> ErrorModel:
-    """Hold what no row shows of base and tool: changes act in these axes, which would turn by chance."""
-    system, n = solution.system, len(errors.parameters)
-    is_held = ~errors.is_of_arm & (system.column_norms[:n] <= system.roundoff)
-    held, free = ([errors.parameters[i] for i in np.flatnonzero(each)] for each in (is_held, ~is_held))
-    return replace(errors, parameters=tuple(free), fixed=(*errors.fixed, *held), undetermined=tuple(held))
+def _with_held(errors: ErrorModel, names: frozenset[str]) -> ErrorModel:
+    """Hold parameters that the measurements do not determine."""
+    held, free = (tuple(p for p in errors.parameters if (p.name in names) is each) for each in (True, False))
+    undetermined = (*errors.undetermined, *held)
+    return replace(errors, parameters=free, fixed=(*errors.fixed, *held), undetermined=undetermined)
+
+
+def _with_held_base(problem: Problem, x: Array, names: frozenset[str]) -> tuple[Problem, Array]:
+    """Return a problem and unknowns x (p,) with the base held where it is at x."""
+    errors = problem.errors
+    chain = errors.chain.with_base_and_tool(problem.chain(x).base, errors.chain.tool)
+    kept = np.array([p.name not in names for p in problem.parameters], bool)
+    bounds = None if problem.bounds is None else problem.bounds[:, kept]
+    errors = replace(_with_held(errors, names), chain=chain)
+    return replace(problem, errors=errors, weights=problem.weights[kept], bounds=bounds), x[kept]
 
 
 def _compare_with_mistakes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from numbers import Real
 from typing import Any
 
 from ..exceptions import InvalidArgumentError
@@ -38,6 +39,8 @@ def as_measurements(
                 hint = "; the chain comes first, then the measurements"
             elif isinstance(item, str | os.PathLike):
                 hint = "; read a file with read_measurements(path, chain)"
+            elif isinstance(item, Real) and name == "holdout":
+                hint = "; dhcal_pin.split(data, fraction) holds out a fraction of the samples"
             raise InvalidArgumentError(f"{name}: expected measurements, got {_describe(item)}{hint}")
     return items
 

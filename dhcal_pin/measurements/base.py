@@ -26,6 +26,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
+from numbers import Real
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
@@ -77,6 +78,14 @@ class Noise:
 
     position: float = 0.0
     rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the standard deviations."""
+        for name, value in vars(self).items():
+            if not (isinstance(value, Real) and 0 <= value < np.inf):
+                raise InvalidArgumentError(
+                    f"Noise: {name} is {value!r}; expected a finite number of at least 0, in m or rad"
+                )
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)

@@ -221,13 +221,24 @@ class _Search:
     # ------------------------------------------------------------------------------------------- fit
     def linearize(self) -> Array:
         """Return the whitened rows with the current unknowns and changes."""
-        data, _ = apply_changes(self.changes, self.chain, self.part, self.paths)
+        return self._linearized(self.changes, self.causes)
+
+    def _linearized_without(self, i: int) -> Array:
+        """Return the whitened rows with the current unknowns and all changes but those of a cause."""
+        # Linear models at different motions of base or tool differ where only priors determine a direction.
+        values = [-c.values if k == i else np.zeros_like(c.values) for k, c in enumerate(self.causes)]
+        changes = update(self.changes, self.causes, values, self._base(), self.layout.links)
+        return self._linearized(changes, [*self.causes[:i], *self.causes[i + 1 :]])
+
+    def _linearized(self, changes: RobotChanges, causes: Sequence[Cause]) -> Array:
+        """Return the whitened rows with the current unknowns and some changes and causes."""
+        data, _ = apply_changes(changes, self.chain, self.part, self.paths)
         rates = np.zeros((len(self.order), self.chain.n_joints))
         if self.paths is not None:
             numbers, times = self.part.fitted_numbers, self.part.fitted_times
-            rates = self.paths.evaluate(numbers, times, self.changes.lag_at(numbers, times))[1]
+            rates = self.paths.evaluate(numbers, times, changes.lag_at(numbers, times))[1]
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
-        for cause in self.causes:
+        for cause in causes:
             # A constant payload is part of the model, and changes nothing over time.
             if isinstance(cause.shape, Constant) and cause.block.kind != "lag":
                 rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
@@ -365,7 +376,7 @@ class _Search:
         # they change slowly over time, too.
         without = copy.copy(self)
         without.causes = [*self.causes[:i], *self.causes[i + 1 :]]
-        fit = self.solve(self._undone(rows, self.causes[i]), without.causes)
+        fit = self.solve(self._linearized_without(i), without.causes)
         # The order of the samples does not change it.
         root = fit.test_root
 
@@ -657,14 +668,18 @@ class _Search:
     def _judge(self, rows: Array, full: LinearFit, i: int) -> Cause:
         """Return a cause with the evidence for it, given all others."""
         cause, others = self.causes[i], [*self.causes[:i], *self.causes[i + 1 :]]
-        without = self.solve(self._undone(rows, cause), others)
+        rows_without = self._linearized_without(i)
+        without = self.solve(rows_without, others)
         # The same noise and weights for both.
-        stack = self._weighted_columns(full, cause, rows, [*others, cause])
+        root = (np.sqrt(full.weights)[:, None] / full.noise)[..., None]
+        stacks = (
+            root * self._columns(rows_without, others, rows_without[..., -1:]),
+            self._weighted_columns(full, cause, rows, [*others, cause]),
+        )
         prior = self._prior([*others, cause])
         count = len(rows) - self.begin
         length = min(count / N_BLOCKS, count * self._concerned(cause) / MIN_BLOCKS)
-        timeless, timed = stack[: self.begin], stack[self.begin :]
-        inside, predicted = _predicted_gain(timeless, timed, len(prior) - len(cause.values), prior, length)
+        inside, predicted = _predicted_gain(stacks, prior, self.begin, length)
         effect = float(np.sqrt(max(inside, 0.0) / (np.sum(self.groups >= 0) * self._concerned(cause))))
         is_supported = predicted >= MIN_PREDICTED_SHARE * inside and effect >= MIN_EFFECT
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
@@ -825,22 +840,21 @@ def _information(columns: Array, root: Array) -> Array:
 
 
 def _predicted_gain(
-    timeless: Array, stack: Array, p: int, prior: Array, length: float
+    stacks: tuple[Array, Array], prior: Array, begin: int, length: float
 ) -> tuple[float, float]:
-    """Return how much the columns from p on reduce the cost: of all samples, and of left-out blocks."""
-    count = int(np.clip(len(stack) / max(length, 1.0), 2, MAX_BLOCKS))
-    edges = np.unique(np.linspace(0, len(stack), count + 1).astype(int))
-    parts = _cell_products(stack, edges)
-    flat = timeless.reshape(-1, timeless.shape[-1])
-    total = parts.sum(0) + flat.T @ flat
-
-    without, with_all = np.arange(p), np.arange(len(prior))
-    inside = _cost(total, total, prior, without) - _cost(total, total, prior, with_all)
-    predicted = sum(
-        _cost(total - part, part, prior, without) - _cost(total - part, part, prior, with_all)
-        for part in parts
-    )
-    return inside, predicted
+    """Return how much a cause reduces the cost: of all samples, and of left-out blocks of timed ones."""
+    # Rows without the cause, and with its columns behind those of the others.
+    inside, predicted = [], []
+    for stack in stacks:
+        timeless, timed = stack[:begin].reshape(-1, stack.shape[-1]), stack[begin:]
+        count = int(np.clip(len(timed) / max(length, 1.0), 2, MAX_BLOCKS))
+        edges = np.unique(np.linspace(0, len(timed), count + 1).astype(int))
+        parts = _cell_products(timed, edges)
+        total = parts.sum(0) + timeless.T @ timeless
+        used = np.arange(stack.shape[-1] - 1)
+        inside.append(_cost(total, total, prior, used))
+        predicted.append(sum(_cost(total - part, part, prior, used) for part in parts))
+    return inside[0] - inside[1], predicted[0] - predicted[1]
 
 
 def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:

@@ -10,7 +10,7 @@ from robots import paper
 from dhcal_pin.calibration import accuracy, calibrate, calibrate_stream, cross_validate, k_fold, split
 from dhcal_pin.exceptions import InvalidArgumentError, UnknownNameError
 from dhcal_pin.io import read_measurements
-from dhcal_pin.measurements import Position
+from dhcal_pin.measurements import Noise, Position
 from dhcal_pin.paper import error_factors
 from dhcal_pin.robot import Chain
 
@@ -106,6 +106,17 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
 def test_wrong_values_are_named(kwargs: dict[str, Any], error: type[Exception], message: str):
     with pytest.raises(error, match=message):
         calibrate(CHAIN, DATA, **{"parameters": "dh", **kwargs})
+
+
+def test_a_share_of_held_out_samples_is_that_of_split():
+    with pytest.raises(InvalidArgumentError, match=r"holdout: .*dhcal_pin.split\(data, fraction\) holds out"):
+        calibrate(CHAIN, DATA, "dh", holdout=0.3)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("values", [(-1e-4, 0.0), (0.0, np.nan), ("1mm", 0.0), ((1e-4, 2e-4), 0.0)])
+def test_noise_is_a_finite_number(values: tuple[Any, Any]):
+    with pytest.raises(InvalidArgumentError, match="expected a finite number of at least 0"):
+        Noise(*values)
 
 
 def test_one_measurement_needs_no_list(sim_6dof, sim_6dof_actual):

@@ -11,7 +11,7 @@ from sessions import Changes, Simulation, session_of
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
-from dhcal_pin.measurements import MultiTargetPosition, Pose, Position
+from dhcal_pin.measurements import MultiTargetPosition, Pose, Position, Wires
 
 
 def files(sim: Simulation, kind: type, frames: list[pin.SE3]):
@@ -88,6 +88,23 @@ def test_targets_on_the_tool_show_the_base_of_each_file(arm, count):
     assert len(fit.verdict.reasons) == count - 1, fit.verdict.reasons
     found = np.array([fit.instruments[f"target_r2.{axis}"] for axis in "xyz"])
     assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(offsets[1] - offsets[0]), abs=1e-4)
+
+
+@pytest.mark.parametrize(("seed", "size"), some_slow([(0, 5e-3), (0, 0.3), (1, 5e-3), (1, 0.3)], {0, 3}))
+def test_a_device_with_wires_at_unknown_places_that_moved_between_files_is_found(seed, size):
+    """Base and device can turn together, which only priors decide; a motion of the base turned with them."""
+    sim = Simulation("ur10", 120, seed)
+    positions, anchors = sim.measure(Position).positions(), sim.rng.uniform(-2, 2, (3, 3))
+    motion, items = size * sim.direction(), []
+    for i, part in enumerate(np.array_split(np.arange(120), 2)):
+        length = np.linalg.norm(positions[part][:, None] - (anchors + i * motion), axis=2)
+        items.append(Wires(sim.q[part], length).replace(source=f"{i}.csv"))
+    fit = calibrate(sim.chain, items, extend="none")
+    (event,) = session_of(fit).events
+    assert (event.kind, event.after.file) == ("base", "1.csv")
+    assert event.size == pytest.approx(size, abs=1e-3)
+    assert len(fit.verdict.reasons) == 1, fit.verdict.reasons
+    assert sim.true_error(fit.chain) < 2e-4
 
 
 ONE_FILE = [("ur10", 60, (0.6, 1.0), 0), ("panda", 180, (0.25, 1.0), 0), ("xarm7", 100, (0.3, 0.7), 3)]
