@@ -394,15 +394,10 @@ def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[
         log = after.log * _count(trial.samples) / _count(changed)
         log += hypothesis.log_jacobian(trial.chain, trial.samples)
         is_decisive = log >= trial.before.log + MIN_LOG_RATIO
-        if is_decisive and _shifts_rows(hypothesis) and not _exceeds_pairings(trial, changed, after):
+        if is_decisive and hypothesis.row_step and not _exceeds_pairings(trial, changed, after):
             continue
         scored.append((log, hypothesis, after))
     return scored
-
-
-def _shifts_rows(hypothesis: Hypothesis) -> bool:
-    """Return whether one of the mistakes pairs the joint values with the measured values of other rows."""
-    return any(isinstance(part.change, RowShift) for part in hypothesis.parts)
 
 
 def _exceeds_pairings(trial: Trial, changed: Sequence[Measurement], after: Evidence) -> bool:
