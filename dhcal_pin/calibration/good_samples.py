@@ -160,7 +160,7 @@ def find_hidden_majority(problem: Problem, x: Array, groups: Array) -> tuple[int
         cores.append(core := _extend(rows, is_good, noise, redundancy))
         chosen = core.t <= robust.REJECTION_THRESHOLD
         square, freedom = mean_square(chosen, core.scales)
-        if freedom < 1 or not square < total:
+        if chosen.all() or freedom < 1 or not square < total:
             continue
         chance = float(gammainc(freedom / 2, freedom * square / total / 2))
         log_chance = math.log(max(chance, 1e-300)) + _log_choices(len(chosen), int(chosen.sum()))

@@ -129,6 +129,13 @@ def fit_session(
     extended, extension = models.supported(fit)
     found = _find_confirmed(_Search(fit, data, holdout, models, is_ordered, extended, extension.families))
     session = found.session
+    if (
+        session is not None
+        and session.has_two_robots
+        and _has_mistake_on_one_side(session, data, models.sets)
+    ):
+        session = replace(session, events=()).described()
+        found = replace(found, session=session)
     if session is None or not _has_changes(found):
         return found
     is_likely, diagnosis = _compare_with_mistakes(
@@ -136,8 +143,26 @@ def fit_session(
     )
     if not is_likely:
         nothing = Session(session.timeline, session.chain, session.is_ordered)
+        if session.has_two_robots and not (diagnosis and diagnosis.hypotheses):
+            # The second robot leaves residuals with all other changes.
+            nothing = replace(nothing, events=session.events)
         return SessionFit(fit, holdout, nothing, diagnosis)
     return replace(found, diagnosis=diagnosis)
+
+
+def _has_mistake_on_one_side(session: Session, data: Sequence[Measurement], sets: str) -> bool:
+    """Return whether a mistake in the samples of one of two robots explains what differs."""
+    start = session.timeline.number_of(session.events[0].after)
+    numbers = session.timeline.numbers[: len(data)]
+    sides = [
+        [
+            item.take(mask)
+            for item, each in zip(data, numbers, strict=True)
+            if (mask := choose(each, start)).any()
+        ]
+        for choose in (np.less, np.greater_equal)
+    ]
+    return any(diagnose_mixups(session.chain, side, sets).hypotheses for side in sides)
 
 
 def _find_confirmed(search: _Search) -> SessionFit:

@@ -10,18 +10,20 @@ the lines between which no sample is right. It is not stated if right and wrong 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from .._typing import Array
+from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, concatenate
 from ..robot.chain import Chain
 from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
 from .drawn_samples import draw_samples, fit_drawn_samples, fit_samples
 from .evidence import HAND_BUILT, Evidence
-from .hypotheses import BothChanges, Hypothesis, LagChange, RowShift
+from .hypotheses import Hypothesis
 
 # Samples fit a robot if their residuals are at most this multiple of the noise, and do not if they exceed the
 # second one. Between both they decide nothing.
@@ -71,7 +73,7 @@ def confirm(chain: Chain, found: Diagnosis, data: Sequence[Measurement], sets: s
         return found
     model, first = found.part or found.after, found.hypotheses[0]
     assert model is not None
-    items = [item for item in data if not found.source or item.source == found.source]
+    items = join_parts([item for item in data if not found.source or item.source == found.source])
     pairs = _pairs(model, items, first)
     if not pairs or sum(np.count_nonzero(pair.is_nearer_as_read) for pair in pairs) < _MIN_RIGHT:
         return found
@@ -85,9 +87,9 @@ def confirm(chain: Chain, found: Diagnosis, data: Sequence[Measurement], sets: s
     if len(right) < _MIN_RIGHT:
         return found
     sources = {item.source for item in items}
-    if len(sources) > 1 or not len(wrong) or needs_neighbours(first):
+    if len(sources) > 1 or not len(wrong):
         return unexplained
-    lines = int(wrong.min()), int(wrong.max())
+    lines = _lines_of(first, wrong, np.concatenate([item.rows for item in items]))
     if np.any((right >= lines[0]) & (right <= lines[1])):
         return unexplained
     # Equivalent hypotheses have to explain the same lines.
@@ -118,12 +120,26 @@ def is_confirmed_by_lengths(
     return log >= before.log + MIN_LOG_RATIO and not leaves_residuals(after)
 
 
-def needs_neighbours(hypothesis: Hypothesis) -> bool:
-    """Return whether a change needs the rows beside a sample, so that it cannot begin within a file."""
-    change = hypothesis.change
-    if isinstance(change, BothChanges):
-        return needs_neighbours(change.first) or needs_neighbours(change.second)
-    return isinstance(change, RowShift | LagChange)
+def join_parts(data: Sequence[Measurement]) -> list[Measurement]:
+    """Join fitted and held-out samples of each file, in which a shift of the rows needs neighbouring ones."""
+    joined: list[Measurement] = []
+    for item in data:
+        for i, other in enumerate(joined):
+            is_part = item.source == other.source and not np.intersect1d(item.rows, other.rows).size
+            if is_part and type(item) is type(other):
+                with suppress(InvalidArgumentError):
+                    joined[i] = concatenate([other, item])
+                    break
+        else:
+            joined.append(item)
+    return joined
+
+
+def _lines_of(hypothesis: Hypothesis, wrong: Array, rows: Array) -> tuple[int, int]:
+    """Return the first and the last line of wrong samples, and of what a shift pairs with them."""
+    step, rows = hypothesis.row_step, np.unique(rows)
+    first, last = np.searchsorted(rows, [wrong.min(), wrong.max()])
+    return int(rows[max(first - max(step, 0), 0)]), int(rows[min(last - min(step, 0), len(rows) - 1)])
 
 
 def _pairs(evidence: Evidence, data: Sequence[Measurement], hypothesis: Hypothesis) -> list[_Pair]:

@@ -100,11 +100,11 @@ def find_mistake(
     sets: str,
 ) -> Diagnosis | None:
     """Find the mistake in deviating lines, from the parts of their file and the good samples of the fit."""
-    from .confirmation import confirm, needs_neighbours  # lazy import, as the following: rarely needed
+    from .confirmation import confirm, join_parts  # lazy import, as the following: rarely needed
     from .hypotheses import list_hypotheses
 
     # `fitted` is the calibrated chain and the instrument parameters by name.
-    parts = comparable_items(parts)
+    parts = join_parts(comparable_items(parts))
     wrong = [item.take(lines.contains(item)) for item in parts]
     wrong = [item for item in wrong if len(item.rows)]
     model, before = with_noise_of(*fitted, good), with_noise_of(*fitted, wrong)
@@ -113,7 +113,7 @@ def find_mistake(
     explaining = []
     for hypothesis in list_hypotheses(nominal, wrong):
         changed = [hypothesis.change.apply(item) for item in wrong]
-        if needs_neighbours(hypothesis) or any(item is None for item in changed):
+        if any(item is None for item in changed):
             continue
         misfits = [model.misfits(item) for item in changed if item is not None]
         values = np.concatenate([each for each in misfits if each is not None] or [np.full(1, np.inf)])

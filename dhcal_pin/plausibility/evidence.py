@@ -38,7 +38,7 @@ from ..estimation.parameters import LOW_COST, select_parameters
 from ..estimation.problem import Problem
 from ..estimation.qr import RANK_RTOL, TriangularSystem, left_singular_vectors
 from ..estimation.robust import ZERO_WEIGHT
-from ..estimation.solver import minimize
+from ..estimation.solver import SolverResult, minimize
 from ..estimation.trimmed_squares import find_initial_outliers
 from ..measurements.base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, residual_of
 from ..measurements.pose import PoseMeasurement
@@ -61,6 +61,9 @@ _N_ITERATIONS, _N_FRAME_ITERATIONS = 12, 20
 # Largest number of fits with new noise scales. They end when the scales fall by less than this, on the mean
 # of the logarithms.
 _N_ROUNDS, _MIN_CHANGE = 20, 0.1
+# Fits whose evidence is smaller than that of an earlier one by more than this logarithm have not converged:
+# few rows are fitted exactly, so that their scales fall to the smallest one.
+_MAX_LOSS = 1.0
 # Largest share of samples that are single errors; more of them are a sign of one mistake in many samples.
 _MAX_GROSS_SHARE = 0.2
 # Smallest and largest scale of the placeholder standard deviations. Residuals below the smallest one count as
@@ -165,21 +168,26 @@ def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Eviden
     n_rows = sum(item.residual_dim * len(item.rows) for item in data)
     problem = make_problem(errors, data, 1 / (errors.priors * np.where(is_robot, _FIT_WIDTHS[sets], 1.0)), {})
     solution = minimize(problem, max_iterations=_N_ITERATIONS, loose=True)
-    noise = new = _estimate_noise(problem, solution.x)
+    noise, best = _estimate_noise(problem, solution.x), None
+    prior_std = np.pad(np.where(is_robot, errors.priors, 0.0), (0, len(solution.x) - len(is_robot)))
     for _ in range(_N_ROUNDS):
-        noise = new
         weighted = problem.with_data(noise.data)
         solution = minimize(weighted, x=solution.x, max_iterations=_N_ITERATIONS, loose=True)
+        found = _evidence_of(problem, solution, noise, prior_std)
+        if best is None or found.log >= best.log - _MAX_LOSS:
+            best = found
         new = _estimate_noise(problem, solution.x)
         if new.log_determinant > noise.log_determinant - _MIN_CHANGE * n_rows:
             break
-    log, width, factor = _maximize(
-        solution.system,
-        solution.x,
-        np.pad(np.where(is_robot, errors.priors, 0.0), (0, len(solution.x) - len(is_robot))),
-        n_rows,
-        noise.min_factor,
-    )
+        noise = new
+    assert best is not None
+    return best
+
+
+def _evidence_of(problem: Problem, solution: SolverResult, noise: _Noise, prior_std: Array) -> Evidence:
+    """Compute the evidence of a fit with the noise that it was made with."""
+    n_rows = sum(item.residual_dim * len(item.rows) for item in problem.data)
+    log, width, factor = _maximize(solution.system, solution.x, prior_std, n_rows, noise.min_factor)
     # The joint values of contacts contain the noise.
     log += sum(log_volume(problem, solution.x, item) for item in problem.data if item.is_contact)
     return Evidence(
@@ -188,7 +196,7 @@ def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Eviden
         factor * noise.length_scale,
         factor * noise.angle_scale,
         problem.chain(solution.x),
-        dict(zip((p.name for p in errors.parameters), solution.x.tolist(), strict=False)),
+        dict(zip((p.name for p in problem.errors.parameters), solution.x.tolist(), strict=False)),
         problem.instruments(solution.x),
     )
 

@@ -432,6 +432,11 @@ class Hypothesis:
         """Whether one of its mistakes is about the joint columns."""
         return any(isinstance(part.change, JointChange) for part in self.parts)
 
+    @property
+    def row_step(self) -> int:
+        """Number of rows by which the joint positions are moved."""
+        return sum(part.change.step for part in self.parts if isinstance(part.change, RowShift))
+
     def log_jacobian(self, chain: Chain, data: Sequence[Measurement]) -> float:
         """Return the logarithm of the determinant of the change of the measured values."""
         if isinstance(self.change, BothChanges):
@@ -562,10 +567,7 @@ def mend_lines(
     parts = mend_files(chain, [item.take(mask) for item, mask in zip(data, inside, strict=True)], key)
     mended = []
     for item, part, mask in zip(data, parts, inside, strict=True):
-        if len(part.rows) != np.count_nonzero(mask):
-            raise InvalidArgumentError(
-                f"--mend {key!r}: needs the rows beside each sample; expected a whole file, without lines"
-            )
+        # A shift of the rows leaves out the sample at one end.
         whole = concatenate([part, item.take(~mask)])
         mended.append(whole.take(np.argsort(whole.rows, kind="stable")))
     return mended

@@ -8,6 +8,10 @@ from the measured poses than another one does: undoing a mistake takes its error
 hypothesis is decisive if its evidence exceeds that of the file by the factor exp(15), and if the robot fits
 the changed samples as it fits ordinary measurements, with errors of ordinary size.
 
+A robot with large errors fits a few rows with any joint values. A shift of the rows is therefore kept only if
+its evidence exceeds by the same factor that of the same measured values with the joint values as they were
+read, and with those of other rows at random.
+
 If none is, the angle by which the zero of each joint is off is measured, and the factor that the values of
 each joint or of all need, as with a wrong gear ratio. Each of them is a hypothesis, too: with
 zeros that are wrong by tens of degrees a robot fits the measurements after a wrong quarter turn as well. A

@@ -51,6 +51,8 @@ _LARGEST_MISFITS = {MANUFACTURED: 0.2, HAND_BUILT: MAX_MISFIT}
 MIN_PARTS = 2
 # A shift of the rows is tried if at least this share of the samples has a neighbouring row.
 _MIN_SHIFTED_SHARE = 0.25
+# Number of random pairings of measured and joint values that a shift of the rows has to exceed.
+_N_PAIRINGS = 10
 # Smallest angle by which the zero of a joint is called wrong [deg]. Smaller ones are errors of the robot,
 # which the calibration corrects; from the second angle on they are named if its correction is implausible.
 _MIN_ZERO, _MIN_LIKELY_ZERO = 9.0, 3.0
@@ -391,8 +393,28 @@ def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[
         after = fit_evidence(trial.chain, changed, trial.sets)
         log = after.log * _count(trial.samples) / _count(changed)
         log += hypothesis.log_jacobian(trial.chain, trial.samples)
+        is_decisive = log >= trial.before.log + MIN_LOG_RATIO
+        if is_decisive and hypothesis.row_step and not _exceeds_pairings(trial, changed, after):
+            continue
         scored.append((log, hypothesis, after))
     return scored
+
+
+def _exceeds_pairings(trial: Trial, changed: Sequence[Measurement], after: Evidence) -> bool:
+    """Return whether a shift of the rows explains the same measured values better than other pairings do."""
+    # A robot with large errors fits a few rows with any joint values. One pairing is that which was read.
+    pairs = zip(trial.samples, changed, strict=True)
+    pairings = [[item.take(np.isin(item.rows, each.rows)) for item, each in pairs]]
+    rng = np.random.default_rng(0)
+    pairings += [[_shuffled(item, rng) for item in changed] for _ in range(_N_PAIRINGS)]
+    least = after.log - MIN_LOG_RATIO
+    return all(fit_evidence(trial.chain, each, trial.sets).log <= least for each in pairings)
+
+
+def _shuffled(item: Measurement, rng: np.random.Generator) -> Measurement:
+    """Return the measured values with the joint values of other rows."""
+    q = item.configurations().reshape(item.configurations_per_row, len(item.rows), -1)
+    return item.resample(rng.permutation(q, axis=1).reshape(-1, q.shape[-1]))
 
 
 def _decide(trial: Trial, scored: Sequence[_Score], is_partial: bool = False) -> Diagnosis:

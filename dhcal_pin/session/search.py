@@ -102,7 +102,8 @@ MIN_NOISE = 1e-3
 PASS_TOL = 0.01
 # Share of the information about a cause that the fit leaves even if it can explain all of it.
 MIN_UNEXPLAINED = 1e-8
-# Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do.
+# Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do, and
+# that of the residuals of the robot with fewer samples, too.
 MIN_ROBOT_GAIN = 0.3
 # Fewer rows for each unknown show nothing but the unknowns.
 MIN_ROWS_PER_UNKNOWN = 1.5
@@ -794,13 +795,23 @@ class _Search:
             number, fit = place, solve(place)
         return number, fit
 
+    def _gain_of_side(self, one: LinearFit, two: LinearFit, number: int, n_unknowns: int) -> float:
+        """Return by how much a second robot lowers the logarithm of the residuals on the shorter side."""
+        is_after = self.numbers >= number
+        side = is_after if 2 * is_after.sum() < len(is_after) else ~is_after
+        is_row = self.groups[side] >= 0
+        sizes = [np.median(np.abs(fit.residual * fit.noise)[side][is_row]) for fit in (one, two)]
+        freedom = max(1 - n_unknowns / is_row.sum(), 0.05)
+        return float(np.log(sizes[0] / max(sizes[1], MIN_NOISE)) + 0.5 * np.log(freedom))
+
     def other_robot(self) -> Event | None:
         """Describe where the samples of a second robot begin, and what differs most; None for one robot."""
-        steps = sorted({c.shape.number for c in self.causes if isinstance(c.shape, Step)})
-        if not steps:
-            return None
         rows = self.linearize()
         one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
+        # Where robots differ much, no single cause explains the second one, so that none was kept.
+        nearest = [c for c in self._candidates(one) if isinstance(c.shape, Step)]
+        likely = [max(nearest, key=lambda cause: cause.log_evidence)] if nearest else []
+        steps = sorted({c.shape.number for c in (*self.causes, *likely) if isinstance(c.shape, Step)})
         geometric = [c for c in self.layout.model if c < len(names) and names[c].coefficient_index is None]
         # The prior is that of one robot, see `solve`.
         sizes = np.array([names[c].prior for c in geometric])
@@ -814,7 +825,8 @@ class _Search:
             others = [c for c in self.causes if c.shape != Step(first)]
             number, two = self._second_robot(rows, others, block, first)
             gain = count * float(np.mean(np.log(one.noise / two.noise)))
-            if gain > max(needed, best[0] if best else 0.0):
+            is_explained = self._gain_of_side(one, two, number, len(sizes)) > MIN_ROBOT_GAIN
+            if is_explained and gain > max(needed, best[0] if best else 0.0):
                 best = gain, number, two
         if best is None:
             return None

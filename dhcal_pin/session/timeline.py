@@ -134,6 +134,13 @@ class Timeline:
                 return Place(item.source, int(rows.min()), int(rows.max()), str(item.photographs()[found][0]))
         raise IndexError(number)
 
+    def number_of(self, place: Place) -> int:
+        """Return the number of the first sample that stands at a place."""
+        of_file = [each for each in zip(self.data, self.numbers, strict=True) if each[0].source == place.file]
+        return min(
+            int(numbers[item.rows == place.line].min(initial=np.iinfo(int).max)) for item, numbers in of_file
+        )
+
 
 def order_samples(data: Sequence[Measurement], holdout: Sequence[Measurement]) -> Timeline:
     """Put the samples of measurements into the order of measurement."""

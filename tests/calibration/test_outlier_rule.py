@@ -383,6 +383,18 @@ def test_no_outlier_among_few_samples_is_ok_and_harmful(seeds):
                 assert status != "ok" or ratio < 1.5, (arm, mode, seed)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_all_samples_are_no_majority_of_them(seed):
+    """Only the scales of the noise differ from those of the fit: the sentence named 40 of 40 samples."""
+    simulation = Simulation(("ur10", "panda")[seed % 4 // 2], 40, seed, errors=(2e-2, 4e-2))
+    simulation.add_eccentricities(1e-2)
+    data = simulation.measure(Position)
+    stated = data.replace(sigma=np.full_like(data.sigma, 1.4e-4), has_stated_sigma=True)
+    fit = calibrate(simulation.chain, stated)
+    assert fit.hidden_majority is None
+    assert "by themselves" not in " ".join(fit.verdict.reasons)
+
+
 def test_a_majority_that_agrees_far_better_shows_outliers_to_which_a_fit_adapts():
     """10 of 26 positions of a UR10 are 1.2 mm away, though no sample has a large residual."""
     simulation = Simulation("ur10", 26, 704)

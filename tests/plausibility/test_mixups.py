@@ -10,9 +10,11 @@ import pytest
 from measurement_files import frames, joint_positions, real_ur10
 from robots import nominal_arm
 from scipy.spatial.transform import Rotation
+from sessions import NAMES as SESSIONS
+from sessions import Simulation
 from slow_cases import some_slow
 
-from dhcal_pin import se3
+from dhcal_pin import se3, split
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import UnknownNameError
@@ -480,6 +482,35 @@ def test_rows_shifted_by_one_are_named(ur10, kind, step, key):
     mended = mend(ur10, wrong, key)
     assert len(mended.rows) == 148
     np.testing.assert_allclose(mended.q, data.take(np.isin(data.rows, mended.rows + (step < 0))).q)
+
+
+@pytest.mark.parametrize("seed", some_slow([15, 17, 22, 25, 38, 47, 48, 51, 54, 55], {0, 3}))
+def test_few_rows_that_fit_any_pairing_show_no_shift(seed):
+    """Eight of twelve positions are fitted; half of them have a neighbouring row."""
+    sim = Simulation(SESSIONS[seed % 4], 12, seed, errors=(8e-3, 8e-3))
+    rounded = np.deg2rad(np.round(np.rad2deg(sim.q), 1))
+    (fitted,), (holdout,) = split([sim.measure().replace(q=rounded)], 0.3, 0)
+    found = diagnose_mixups(sim.chain, [fitted], holdout=[holdout])
+    assert not [each.key for each in found.hypotheses if "rows:" in each.key]
+
+
+@pytest.mark.parametrize("count", [12, 15, 20])
+@pytest.mark.parametrize(("kind", "step"), [(Pose, 1), (Position, -1), (Position, 1)])
+@pytest.mark.parametrize("seed", some_slow(list(range(5)), {0}))
+def test_a_shift_of_few_rows_is_named(count, kind, step, seed):
+    sim = Simulation(SESSIONS[seed % 4], count, seed)
+    wrong = sim.measure(kind).replace(q=np.roll(sim.q, step, 0))
+    found = diagnose_mixups(sim.chain, [wrong])
+    assert [each.key for each in found.hypotheses] == [{1: "rows:above", -1: "rows:below"}[step]]
+
+
+@pytest.mark.parametrize("seed", some_slow([2, 19, 27, 40], {0}))
+def test_an_exact_fit_of_few_rows_is_no_evidence_of_a_mistake(seed):
+    """The evidence of 24 values fell with the noise, so that a wrong ratio seemed to explain them better."""
+    sim = Simulation(SESSIONS[seed % 4], 12, seed, errors=(8e-3, 8e-3))
+    rounded = np.deg2rad(np.round(np.rad2deg(sim.q), 1))
+    (fitted,), _ = split([sim.measure().replace(q=rounded)], 0.3, 0)
+    assert not diagnose_mixups(sim.chain, [fitted]).hypotheses
 
 
 @pytest.mark.parametrize("kind", some_slow([Distance, Wires, PointContact], {0}))

@@ -111,8 +111,6 @@ def test_the_command_names_lines_and_mends_them(tmp_path, capsys):
     ):
         assert main([*command, "--mend", f"{name}@{target}"]) != 0
         assert text in " ".join(capsys.readouterr().err.split())
-    assert main([*command, "--mend", f"rows:above@{path}:52-101"]) != 0
-    assert "expected a whole file, without lines" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(
@@ -143,6 +141,28 @@ def test_a_mistake_in_some_rows_is_found_by_the_fit_of_the_others(arm, key, seed
         for change, lines in remedies(fit):
             (mended,) = mend_lines(sim.chain, [wrong], change, lines)
             assert calibrate_parts(sim, mended).verdict.status == "ok"
+
+
+@pytest.mark.parametrize("step", [1, -1])
+@pytest.mark.parametrize("inside", [slice(60, None), slice(0, 40), slice(30, 70)])
+@pytest.mark.parametrize("seed", some_slow(range(5), [0]))
+def test_a_shift_of_some_rows_is_named_for_their_lines(step, inside, seed):
+    sim = Simulation(ARMS[seed % 4], COUNT, seed)
+    data, key = sim.measure(), {1: "rows:above", -1: "rows:below"}[step]
+    q = data.q.copy()
+    q[inside] = np.roll(q[inside], step, 0)
+    wrong = Position(q, data.positions()).replace(source="m.csv")
+    fit = calibrate_parts(sim, wrong)
+    assert fit.verdict.status == "caution"
+    first, last, _ = inside.indices(COUNT)
+    ((found, lines),) = remedies(fit)
+    assert (found, lines) == (key, (first + 1, last))
+    # The sample without joint values is left out.
+    (mended,) = mend_lines(sim.chain, [wrong], found, lines)
+    kept = np.delete(np.arange(COUNT), last - 1 if step > 0 else first)
+    np.testing.assert_array_equal(mended.rows, kept + 1)
+    np.testing.assert_array_equal(mended.q, data.q[kept])
+    assert calibrate_parts(sim, mended).verdict.status == "ok"
 
 
 UNKNOWN = {

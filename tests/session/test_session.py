@@ -19,6 +19,7 @@ from dhcal_pin.estimation.parameters import ANGLE_PRIOR, LENGTH_PRIOR, select_pa
 from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.io import read_measurements
 from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
@@ -527,6 +528,21 @@ def test_two_robots_are_refused():
     assert "Two robots were measured" in fit.verdict.reasons[0]
     (event,) = [event for event in session_of(fit).events if event.kind == "robot"]
     assert (event.before.line, event.after.line) == (50, 51)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "count"), [(Pose, 3e-4, 25), (Pose, 8e-3, 40), (Position, 8e-3, 60)]
+)
+@pytest.mark.parametrize("n_files", [1, 2])
+def test_two_robots_of_any_difference_are_refused(kind, size, count, n_files):
+    simulation = Simulation("xarm7", 120, 7, errors=(size, 2 * size))
+    first = simulation.measure(kind).take(np.arange(120 - count)).replace(source="1.csv")
+    simulation.disturb(simulation.model)
+    second = simulation.measure(kind).take(np.arange(120 - count, 120)).replace(source=f"{n_files}.csv")
+    data = [first, second] if n_files == 2 else [concatenate([first, second])]
+    fit = calibrate(simulation.chain, data)
+    assert fit.verdict.is_refused
+    assert f"Two robots were measured: from line {121 - count} of {n_files}.csv" in fit.verdict.reasons[0]
 
 
 def test_a_lag_is_found_and_mended():
