@@ -82,7 +82,7 @@ class Noise:
     def __post_init__(self) -> None:
         """Check the standard deviations."""
         for name, value in vars(self).items():
-            if not (isinstance(value, Real) and 0 <= value < np.inf):
+            if not (isinstance(value, Real) and 0 <= float(value) < np.inf):
                 raise InvalidArgumentError(
                     f"Noise: {name} is {value!r}; expected a finite number of at least 0, in m or rad"
                 )
