@@ -800,8 +800,10 @@ class _Search:
         is_after = self.numbers >= number
         side = is_after if 2 * is_after.sum() < len(is_after) else ~is_after
         is_row = self.groups[side] >= 0
+        if is_row.sum() < MIN_ROWS_PER_UNKNOWN * n_unknowns:
+            return -np.inf  # So few rows fit any robot.
         sizes = [np.median(np.abs(fit.residual * fit.noise)[side][is_row]) for fit in (one, two)]
-        freedom = max(1 - n_unknowns / is_row.sum(), 0.05)
+        freedom = 1 - n_unknowns / is_row.sum()
         return float(np.log(sizes[0] / max(sizes[1], MIN_NOISE)) + 0.5 * np.log(freedom))
 
     def other_robot(self) -> Event | None:
