@@ -105,6 +105,8 @@ MIN_UNEXPLAINED = 1e-8
 # Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do, and
 # that of the residuals of the robot with fewer samples, too.
 MIN_ROBOT_GAIN = 0.3
+# Smallest number of rows of the robot with fewer samples for each unknown of its geometry.
+MIN_ROBOT_ROWS = 2.5
 # Fewer rows for each unknown show nothing but the unknowns.
 MIN_ROWS_PER_UNKNOWN = 1.5
 # The same for rows of different configurations with which scales and a lag are looked for.
@@ -800,7 +802,7 @@ class _Search:
         is_after = self.numbers >= number
         side = is_after if 2 * is_after.sum() < len(is_after) else ~is_after
         is_row = self.groups[side] >= 0
-        if is_row.sum() < MIN_ROWS_PER_UNKNOWN * n_unknowns:
+        if is_row.sum() < MIN_ROBOT_ROWS * n_unknowns:
             return -np.inf  # So few rows fit any robot.
         sizes = [np.median(np.abs(fit.residual * fit.noise)[side][is_row]) for fit in (one, two)]
         freedom = 1 - n_unknowns / is_row.sum()

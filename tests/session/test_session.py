@@ -530,6 +530,23 @@ def test_two_robots_are_refused():
     assert (event.before.line, event.after.line) == (50, 51)
 
 
+@pytest.mark.parametrize("seed", some_slow([103, 123, 131, 153], {0}))
+def test_few_poses_of_one_robot_are_not_those_of_two(seed):
+    """Half of 20 poses with noise fit any robot. Gear ratios are wrong, too."""
+    rng = np.random.default_rng(seed)
+    size = 10 ** rng.uniform(-3.6, -2.5)
+    sim = Simulation("xarm7", 20, seed, errors=(size, size))
+    gains, poses = 1 + rng.normal(0, size, sim.chain.n_joints), sim.poses
+    sim.poses = lambda q, model=None: poses(q * gains, model)
+    measured = sim.measure(Pose).poses.copy()
+    measured[:, :3, 3] += 1.5e-4 * rng.standard_normal((20, 3))
+    turns = [pin.exp3(3e-4 * rng.standard_normal(3)) for _ in measured]
+    measured[:, :3, :3] = measured[:, :3, :3] @ np.array(turns)
+    fit = calibrate(sim.chain, Pose(sim.q, measured))
+    assert not session_of(fit).has_two_robots
+    assert fit.verdict.status != "refused", fit.verdict.reasons
+
+
 @pytest.mark.parametrize(
     ("kind", "size", "count"), [(Pose, 3e-4, 25), (Pose, 8e-3, 40), (Position, 8e-3, 60)]
 )
