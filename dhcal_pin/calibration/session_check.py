@@ -144,7 +144,7 @@ def fit_session(
     if not is_likely:
         nothing = Session(session.timeline, session.chain, session.is_ordered)
         if session.has_two_robots and not (diagnosis and diagnosis.hypotheses):
-            # The second robot leaves residuals with all other changes.
+            # The other changes do not explain the samples of the second robot.
             nothing = replace(nothing, events=session.events)
         return SessionFit(fit, holdout, nothing, diagnosis)
     return replace(found, diagnosis=diagnosis)
@@ -212,13 +212,13 @@ class _Search:
         changed, changed_holdout = session.applied(self.data, self.holdout)
         if not session.changes.tool.is_identity:
             # Changes act in the axes of base and tool, which would turn by chance where no row shows them.
-            errors = _with_held(errors, self._unseen_axes)
+            errors = _with_held(errors, self.unseen_axes)
         return SessionFit(self.models.start(changed, errors), changed_holdout, session)
 
     @cached_property
     def relative_base(self) -> frozenset[str]:
-        """Names of the parameters of a base that turns with instruments at unknown places, if it does."""
-        # A motion of the base would turn with them.
+        """Names of the parameters of a base with which instruments at unknown places can move, or none."""
+        # The axes of a motion of the base would then turn by chance.
         problem, r = self.fit.problem, self.fit.solution.system.r
         names = frozenset(p.name for p in problem.errors.parameters if p.error_frame == BASE_FRAME)
         is_base = np.array([p.name in names for p in problem.parameters], bool)
@@ -227,7 +227,7 @@ class _Search:
         return names if names and is_relative else frozenset()
 
     @property
-    def _unseen_axes(self) -> frozenset[str]:
+    def unseen_axes(self) -> frozenset[str]:
         """Names of the parameters of base and tool that no row shows."""
         errors, system = self.models.errors, self.fit.solution.system
         n = len(errors.parameters)

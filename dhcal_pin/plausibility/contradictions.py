@@ -49,9 +49,7 @@ def own_fit_ratio(problem: Problem, x: Array, item: Measurement) -> float:
     used = [n_errors + names.index(u.name) for u in own.instrument_parameters]
     values, weights = (each[[*range(len(geometric)), *used]] for each in (x, problem.weights))
     # Each measurement has first values of its own.
-    current = problem.instruments(x)
-    differences = [current[u.name] - u.nominal for u in own.instrument_parameters]
-    start = np.concatenate([np.zeros(len(geometric)), differences])
+    start = np.concatenate([np.zeros(len(geometric)), own.instrument_start(problem.instruments(x))])
     system = linearize_and_factor(own, start, small_angle=False)
     n_rows, effects = item.residual_dim * len(item.rows), system.column_norms
     smallest = np.where(effects > 0, MIN_WEIGHT * effects, 1.0)

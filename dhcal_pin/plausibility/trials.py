@@ -402,7 +402,7 @@ def _scores(trial: Trial, candidates: Sequence[_Candidate], phase: str) -> list[
 
 def _exceeds_pairings(trial: Trial, changed: Sequence[Measurement], after: Evidence) -> bool:
     """Return whether a shift of the rows explains the same measured values better than other pairings do."""
-    # A robot with large errors fits a few rows with any joint values. One pairing is that which was read.
+    # A robot with large errors fits a few rows with any joint values. The first pairing is that of the file.
     pairs = zip(trial.samples, changed, strict=True)
     pairings = [[item.take(np.isin(item.rows, each.rows)) for item, each in pairs]]
     rng = np.random.default_rng(0)

@@ -373,7 +373,7 @@ class _Search:
             if shapes := self._shapes(kind, taken):
                 yield from self._scores(fit, blocks, shapes, products)
 
-    def _follows_configuration(self, rows: Array, i: int) -> bool:
+    def _follows_configuration(self, i: int) -> bool:
         """Return whether a function of the configuration explains the samples as well as a cause does."""
         # Errors of the arm that the model does not contain depend on the configuration. Along a smooth path
         # they change slowly over time, too.
@@ -662,7 +662,7 @@ class _Search:
             if judged[worst].log_evidence >= MIN_LOG_EVIDENCE:
                 self.causes = judged
                 changes = (i for i in judged_ones if not judged[i].block.is_constant)
-                imitated = next((i for i in changes if self._follows_configuration(rows, i)), None)
+                imitated = next((i for i in changes if self._follows_configuration(i)), None)
                 if imitated is None:
                     break
                 worst = imitated
@@ -813,8 +813,8 @@ class _Search:
         rows = self.linearize()
         one, names = self.solve(rows, self.causes), self.layout.problem.errors.parameters
         # Where robots differ much, no single cause explains the second one, so that none was kept.
-        nearest = [c for c in self._candidates(one) if isinstance(c.shape, Step)]
-        likely = [max(nearest, key=lambda cause: cause.log_evidence)] if nearest else []
+        tried = [c for c in self._candidates(one) if isinstance(c.shape, Step)]
+        likely = [max(tried, key=lambda cause: cause.log_evidence)] if tried else []
         steps = sorted({c.shape.number for c in (*self.causes, *likely) if isinstance(c.shape, Step)})
         geometric = [c for c in self.layout.model if c < len(names) and names[c].coefficient_index is None]
         # The prior is that of one robot, see `solve`.
@@ -861,11 +861,12 @@ def _predicted_gain(
     """Return how much a cause reduces the cost: of all samples, and of left-out blocks of timed ones."""
     # Rows without the cause, and with its columns behind those of the others.
     inside, predicted = [], []
+    n_timed = len(stacks[0]) - begin
+    count = int(np.clip(n_timed / max(length, 1.0), 2, MAX_BLOCKS))
+    edges = np.unique(np.linspace(0, n_timed, count + 1).astype(int))
     for stack in stacks:
-        timeless, timed = stack[:begin].reshape(-1, stack.shape[-1]), stack[begin:]
-        count = int(np.clip(len(timed) / max(length, 1.0), 2, MAX_BLOCKS))
-        edges = np.unique(np.linspace(0, len(timed), count + 1).astype(int))
-        parts = _cell_products(timed, edges)
+        timeless = stack[:begin].reshape(-1, stack.shape[-1])
+        parts = _cell_products(stack[begin:], edges)
         total = parts.sum(0) + timeless.T @ timeless
         used = np.arange(stack.shape[-1] - 1)
         inside.append(_cost(total, total, prior, used))

@@ -60,9 +60,7 @@ class BoardSize:
     """Sizes of the boards that make the correction of the arm far smaller."""
 
     sizes: Mapping[str, float]  # Size relative to the stated one, by the name of the board
-    squares: Mapping[
-        str, float
-    ]  # Stated size of the squares [m], by the name of the board; 0 without squares
+    squares: Mapping[str, float]  # Stated size of the squares [m], by name; 0 for boards without squares
     # RMS correction of the lengths of the arm in prior standard deviations, with the stated size.
     stated: float
     found: float  # The same with the other size
@@ -124,9 +122,11 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     squares = {board.name: board.square for item in select_images(problem.data) for board in item.rig.boards}
     best = [x]
 
+    def by_name(log_sizes: Array) -> dict[str, float]:
+        return dict(zip(squares, np.exp(log_sizes).tolist(), strict=True))
+
     def solve(log_sizes: Array) -> tuple[Problem, Array]:
-        sizes = dict(zip(squares, np.exp(log_sizes).tolist(), strict=True))
-        scaled = problem.with_data(change_images(problem.data, partial(with_sizes, sizes)))
+        scaled = problem.with_data(change_images(problem.data, partial(with_sizes, by_name(log_sizes))))
         return scaled, minimize(scaled, "lm", best[0], _MAX_ITERATIONS, loose=True).x
 
     log_sizes = np.zeros(len(squares))
@@ -145,8 +145,7 @@ def find_board_size(fit: Fit) -> BoardSize | None:
     root = complete.solution.system.sqrt_covariance(weights)[0][: len(lengths)][lengths]
     count = np.sum(1 - np.sum((root * weights[: len(lengths)][lengths, None]) ** 2, 1))
     ratio = count * np.log(stated / max(found, 1e-9))
-    sizes = dict(zip(squares, np.exp(log_sizes).tolist(), strict=True))
-    board_size = BoardSize(sizes, squares, stated, found, float(ratio))
+    board_size = BoardSize(by_name(log_sizes), squares, stated, found, float(ratio))
     return board_size if ratio >= MIN_DOUBTFUL_LOG_RATIO and board_size.wrong else None
 
 
