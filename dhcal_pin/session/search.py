@@ -25,7 +25,7 @@ Shapes: N samples in the order of measurement, K cells of consecutive samples, k
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
@@ -266,8 +266,11 @@ class _Search:
         return columns
 
     def solve(self, rows: Array, causes: Sequence[Cause]) -> LinearFit:
-        """Fit unknowns and causes to linearized rows, with weights of bounded influence."""
-        columns = self._columns(rows, causes)
+        """Fit unknowns and causes to linearized rows."""
+        return self._solve(rows, self._columns(rows, causes), causes)
+
+    def _solve(self, rows: Array, columns: Array, causes: Sequence[Cause]) -> LinearFit:
+        """Fit unknowns and causes with given columns (N, k, p), with weights of bounded influence."""
         residual, prior = rows[..., -1], self._prior(causes)
         value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
@@ -374,7 +377,7 @@ class _Search:
                 yield from self._scores(fit, blocks, shapes, products)
 
     def _follows_configuration(self, i: int) -> bool:
-        """Return whether a function of the configuration explains the samples as well as a cause does."""
+        """Return whether a function of the configuration explains as much as a cause and what it explains."""
         # Errors of the arm that the model does not contain depend on the configuration. Along a smooth path
         # they change slowly over time, too.
         without = copy.copy(self)
@@ -383,13 +386,12 @@ class _Search:
         # The order of the samples does not change it.
         root = fit.test_root
 
-        def evidence(order: Array) -> float:
-            """Return the greatest evidence of a change over the samples in an order."""
+        def changes(order: Array) -> list[Cause]:
+            """Return the changes over the samples in an order."""
             names = ("rows", "columns", "residual", "weights", "noise")
             ordered = replace(fit, **{name: getattr(fit, name)[order] for name in names})
             vars(ordered)["test_root"] = root
-            changes = (c for c in without._candidates(ordered) if not c.block.is_constant)
-            return max((c.log_evidence for c in changes), default=-np.inf)
+            return [cause for cause in without._candidates(ordered) if not cause.block.is_constant]
 
         q = np.concatenate([item.q for item in self.part.data])[self.order]
         frames = [self.chain.forward_kinematics(item.conditions()) for item in self.part.data]
@@ -408,8 +410,21 @@ class _Search:
         others = [
             each for each, c in zip(orders, correlations, strict=True) if abs(c) < MAX_ORDER_CORRELATION
         ]
-        needed = evidence(in_time) - MIN_ORDER_EVIDENCE
-        return any(evidence(each) > needed for each in others)
+        over_time = changes(in_time)
+        needed = max((cause.log_evidence for cause in over_time), default=-np.inf) - MIN_ORDER_EVIDENCE
+        own = _evidence_of(self.causes[i].block, over_time)
+        for order in others:
+            found = max(changes(order), key=lambda cause: cause.log_evidence, default=None)
+            if found is None or found.log_evidence <= needed:
+                continue
+            # The evidence of a true change remains beside errors of the arm.
+            columns = np.empty((*fit.residual.shape, len(found.values)))
+            columns[order] = found.columns_of(fit.rows[order], self.numbers, self.times)
+            added = replace(found, values=np.zeros_like(found.values))
+            both = self._solve(fit.rows, np.concatenate([fit.columns, columns], -1), [*without.causes, added])
+            if _evidence_of(self.causes[i].block, without._candidates(both)) < own:
+                return True
+        return False
 
     def _effect(self, fit: LinearFit, cause: Cause) -> float:
         """Return the RMS effect of a cause on the residuals that it concerns, which other unknowns leave."""
@@ -842,6 +857,11 @@ class _Search:
         name, unit = names[geometric[worst]].name, names[geometric[worst]].unit
         size = abs(float(difference[worst]))
         return Event("robot", name, before, after, size, float(std[worst]), unit)
+
+
+def _evidence_of(block: Block, causes: Iterable[Cause]) -> float:
+    """Return the greatest evidence of a change of a block."""
+    return max((cause.log_evidence for cause in causes if cause.block == block), default=-np.inf)
 
 
 def _is_part_of_model(cause: Cause) -> bool:
