@@ -76,6 +76,9 @@ N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 # Smallest logarithm of the ratio of the evidences of a change over time and over the configuration, and
 # largest correlation of both orders that are compared.
 MIN_ORDER_EVIDENCE, MAX_ORDER_CORRELATION = 4.0, 0.9
+# Largest share of its evidence that a change over time keeps beside a function of the configuration which
+# explains it. It was 0.96 to 2.2 where the base moved, and mostly below 0.9 along smooth paths.
+MAX_REMAINING_SHARE = 0.9
 # Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
 MAX_OUTLIER_SHARE = 0.25
 # Logarithm of the ratio of the noises from which a search begins with a lag from some sample on.
@@ -422,7 +425,7 @@ class _Search:
             columns[order] = found.columns_of(fit.rows[order], self.numbers, self.times)
             added = replace(found, values=np.zeros_like(found.values))
             both = self._solve(fit.rows, np.concatenate([fit.columns, columns], -1), [*without.causes, added])
-            if _evidence_of(self.causes[i].block, without._candidates(both)) < own:
+            if _evidence_of(self.causes[i].block, without._candidates(both)) < MAX_REMAINING_SHARE * own:
                 return True
         return False
 
