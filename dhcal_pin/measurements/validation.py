@@ -20,6 +20,8 @@ MAX_ROTATION_DEVIATION = 1e-6
 def _as_numbers(value: Any, where: str, expected: str) -> Array:
     """Return a value as an array of floats of any shape."""
     try:
+        if np.iscomplexobj(value):
+            raise TypeError  # NumPy drops imaginary parts with a warning only
         return np.asarray(value, float)
     except (TypeError, ValueError):
         problem = f"{where} of type {type(value).__name__} is not an array of numbers"

@@ -297,8 +297,8 @@ def _signs_note(chain: Chain, q: Array, rng: np.random.Generator) -> str:
 
 def _require_enough(count: int, candidates: int | Array) -> None:
     """Require at least one pose, and a possible number of candidates to draw."""
-    if count < 1:
-        raise InvalidArgumentError(f"{count} poses: expected at least 1")
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise InvalidArgumentError(f"{count!r} poses: expected a whole number from 1 on")
     if isinstance(candidates, int) and not count <= candidates <= MAX_CANDIDATES:
         raise InvalidArgumentError(
             f"{candidates} candidates for {count} poses: expected from {count} to {MAX_CANDIDATES}"

@@ -72,6 +72,7 @@ def test_kinds_are_constructed_directly(data, text):
         (lambda: Pose("arm.csv", POSES), "Pose: q of type str is not an array of numbers; expected"),
         (lambda: Pose(Q, WRONG_TYPE), "Pose: poses of type WrongType is not an array of numbers"),
         (lambda: Pose([[0.0, 1.0], [0.0]], POSES), "Pose: q of type list is not an array of numbers"),
+        (lambda: Pose(Q + 0j, POSES), "Pose: q of type ndarray is not an array of numbers"),
         (lambda: Pose(Q, SCALED), "R of sample 1 is not a rotation .*; expected orthonormal"),
         (lambda: Pose(Q, LEFT_HANDED), "det R is -1.*right-handed"),
         (lambda: Pose(Q, POSES, 1e-3), "only one of sigma and rotation_sigma is given; expected both"),
