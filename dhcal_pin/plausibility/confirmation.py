@@ -20,7 +20,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..measurements.base import Measurement, concatenate
 from ..robot.chain import Chain
-from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, is_fitted
 from .drawn_samples import draw_samples, fit_drawn_samples, fit_samples
 from .evidence import HAND_BUILT, Evidence
 from .hypotheses import Hypothesis
@@ -79,7 +79,7 @@ def confirm(chain: Chain, found: Diagnosis, data: Sequence[Measurement], sets: s
         return found
     unexplained = replace(found, hypotheses=(), after=None, part=None, source="", gain=0.0)
     fitted = fit_drawn_samples(chain, [pair.nearer for pair in pairs], sets)
-    if fitted.chain is None or leaves_residuals(fitted):
+    if fitted.chain is None or not is_fitted(fitted):
         # Something else is wrong, too, if all samples left residuals before.
         return found if found.part else unexplained
     pairs = _pairs(fitted, items, first)
@@ -117,7 +117,7 @@ def is_confirmed_by_lengths(
     after = fit_samples(chain, [*changed, *lengths], sets)
     n_before, n_after = (sum(len(item.rows) for item in (*each, *lengths)) for each in (samples, changed))
     log = after.log * n_before / n_after + first.log_jacobian(chain, samples)
-    return log >= before.log + MIN_LOG_RATIO and not leaves_residuals(after)
+    return log >= before.log + MIN_LOG_RATIO and is_fitted(after)
 
 
 def join_parts(data: Sequence[Measurement]) -> list[Measurement]:

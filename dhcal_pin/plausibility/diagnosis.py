@@ -60,7 +60,7 @@ class Diagnosis:
     @property
     def is_certain(self) -> bool:
         """Whether a robot with errors of ordinary size fits the measurements after the change."""
-        return self.after is not None and not is_suspicious(self.after)
+        return self.after is not None and self.after.width < _SUSPICIOUS_WIDTH and is_fitted(self.after)
 
     @property
     def is_explained(self) -> bool:
@@ -147,5 +147,15 @@ def is_suspicious(evidence: Evidence) -> bool:
 
 
 def leaves_residuals(evidence: Evidence) -> bool:
-    """Return whether no robot fits the measurements, however large its errors are."""
+    """Return whether no manufactured robot fits the measurements, however large its errors are."""
     return evidence.length_scale > _SUSPICIOUS_LENGTH or evidence.angle_scale > _SUSPICIOUS_ANGLE
+
+
+def is_fitted(evidence: Evidence) -> bool:
+    """Return whether a robot fits measurements after a change, with the residuals that it may leave."""
+    factor = evidence.residual_factor
+    is_far = (
+        evidence.length_scale > factor * _SUSPICIOUS_LENGTH,
+        evidence.angle_scale > factor * _SUSPICIOUS_ANGLE,
+    )
+    return not any(is_far)

@@ -54,6 +54,8 @@ _LOG_WIDTH_STD = 1.5
 # Width of the priors while the robot is fitted: errors of some centimetres and degrees. The priors of a
 # low-cost arm are as wide as its errors.
 _FIT_WIDTHS = {MANUFACTURED: 4.0, HAND_BUILT: 1.0}
+# Residuals of a robot, relative to those of a manufactured one: joints of a hand-built arm have play.
+_RESIDUAL_FACTORS = {MANUFACTURED: 1.0, HAND_BUILT: 2.0}
 # Noise scales σ around the residuals of the fit.
 _NOISE_SCALES = 10.0 ** np.arange(-1, 5.01, 0.25)
 # Largest number of iterations of a fit, and of one of base and tool alone.
@@ -88,6 +90,7 @@ class Evidence:
     errors: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
     #: Values of the instrument parameters by name [m or rad].
     instruments: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
+    residual_factor: float = 1.0  #: Residuals that such a robot may leave, relative to a manufactured one.
 
     def residuals(self, item: Measurement) -> list[tuple[str, Array]] | None:
         """Compute unit and rows (k, m) of each group of residuals, relative to the noise."""
@@ -181,7 +184,7 @@ def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Eviden
             break
         noise = new
     assert best is not None
-    return best
+    return replace(best, residual_factor=_RESIDUAL_FACTORS[sets])
 
 
 def _evidence_of(problem: Problem, solution: SolverResult, noise: _Noise, prior_std: Array) -> Evidence:

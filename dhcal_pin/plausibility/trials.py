@@ -15,7 +15,7 @@ import numpy as np
 from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
-from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, leaves_residuals
+from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, is_fitted, leaves_residuals
 from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
 from .hypotheses import (
     AxisChange,
@@ -101,6 +101,11 @@ class Trial(NamedTuple):
     candidates: Sequence[_Candidate]
     single: Diagnosis  # Decisive hypotheses, with which the robot needs large errors, if any
     progress: Progress
+
+    @property
+    def compares_nominal(self) -> bool:
+        """Whether the nominal robot shows sizes: not without positions, nor with zeros that are unknown."""
+        return bool(self.misfit) and self.sets == MANUFACTURED
 
     def find_pair(self) -> Diagnosis:
         """Look for two mistakes in measurements with positions, by which pairs are compared."""
@@ -247,15 +252,16 @@ def _measure_ratios(trial: Trial) -> list[_Measured]:
     groups, revolute = [[j] for j in range(trial.chain.n_joints)], revolute_joints(trial.chain)
     groups = [*groups, revolute] if len(revolute) > 1 else groups
     kinds = [partial(_ratio_of_logarithm, trial.chain, joints) for joints in groups]
-    if not trial.misfit:
+    if not trial.compares_nominal:
         kinds = _most_explaining(trial, kinds, _PROBED_RATIOS)
     ratios = []
     for of_logarithm in kinds:
         best = _closest(trial, of_logarithm, _MAX_RATIO, _RATIO_STEPS)
         if abs(best) >= _MIN_RATIO:
             ratios += _measured(trial, of_logarithm, best)
-    near = [each for each in ratios if _MIN_RATIO_GAIN * each.candidate.misfit <= trial.misfit]
-    return _refine(trial, near, _FINE_RATIO_STEPS, _MIN_RATIO)
+    if trial.compares_nominal:
+        ratios = [each for each in ratios if _MIN_RATIO_GAIN * each.candidate.misfit <= trial.misfit]
+    return _refine(trial, ratios, _FINE_RATIO_STEPS, _MIN_RATIO)
 
 
 def _most_explaining(
@@ -282,7 +288,7 @@ def _with_sizes(
 def _closest(
     trial: Trial, of_size: Callable[[float], Hypothesis], reach: float, steps: Sequence[float]
 ) -> float:
-    """Return the size of a mistake, up to a reach, with which the nominal robot is nearest to the samples."""
+    """Return the size of a mistake, up to a reach, with which the samples fit best."""
     best = 0.0
     for step in steps:
         sizes = np.arange(best - reach, best + reach, step).round(1).tolist()
@@ -311,8 +317,8 @@ def _refine(
 
 
 def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
-    """Return the misfits of variants of the samples, or without positions their negative evidence."""
-    if trial.misfit:
+    """Return the misfits of variants of the samples, or else their negative evidence."""
+    if trial.compares_nominal:
         return nominal_misfits(trial.chain, variants)
     return np.array([-fit_evidence(trial.chain, each, trial.sets).log for each in variants])
 
@@ -422,7 +428,7 @@ def _decide(trial: Trial, scored: Sequence[_Score], is_partial: bool = False) ->
     best = max((log for log, _, _ in scored), default=-np.inf)
     ties = [each for each in scored if each[0] >= best - _MAX_LOG_TIE]
     # If something else is wrong, too (`is_partial`), no robot needs to fit.
-    ties = [each for each in ties if is_partial or not leaves_residuals(each[2])]
+    ties = [each for each in ties if is_partial or is_fitted(each[2])]
     if best - trial.before.log < MIN_LOG_RATIO or not ties:
         return Diagnosis(trial.before)
     log, _, after = ties[0]

@@ -278,6 +278,39 @@ def test_a_wrong_ratio_of_a_servo_states_the_factor_of_its_counts(tmp_path):
     assert right / wrong == pytest.approx(0.8)
 
 
+RATIOS = [
+    (joint, factor, play, seed)
+    for seed in range(4)
+    for joint, factor, play in ((2, 1.1, 0.5), (3, 1.3, 1.0), (1, 0.9, 1.0))
+]
+
+
+@pytest.mark.parametrize(("joint", "factor", "play", "seed"), some_slow(RATIOS, {0, 1}))
+def test_a_wrong_gear_ratio_of_a_hand_built_arm_is_named(joint, factor, play, seed):
+    """The zeros of the arm are unknown, and its joints have play."""
+    rng = np.random.default_rng(seed)
+    arm = ServoArm.random(rng, zero_deg=8.0, wrong=0)
+    q = arm.configurations(rng, 30, 0.8)
+    poses = arm.poses(q + np.deg2rad(play) / 2 * rng.choice([-1.0, 1.0], q.shape))
+    reported = q - arm.zeros
+    reported[:, joint] *= factor
+    data = Position(reported, poses[:, :3, 3] + rng.normal(0, 5e-4, (30, 3)))
+    (found,) = diagnose_mixups(NOMINAL, [data], HAND_BUILT).hypotheses
+    kind, name, size = found.key.split(":")
+    assert (kind, name) == ("ratio", JOINTS[joint])
+    assert float(size) == pytest.approx(1 / factor, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(8), {0, 1}))
+def test_play_of_a_hand_built_arm_is_no_gear_ratio(seed):
+    rng = np.random.default_rng(seed)
+    arm = ServoArm.random(rng, zero_deg=8.0, wrong=0)
+    q = arm.configurations(rng, 30, 0.8)
+    poses = arm.poses(q + np.deg2rad(2.0) / 2 * rng.choice([-1.0, 1.0], q.shape))
+    data = Position(q - arm.zeros, poses[:, :3, 3] + rng.normal(0, 5e-4, (30, 3)))
+    assert not diagnose_mixups(NOMINAL, [data], HAND_BUILT).hypotheses
+
+
 def test_counts_of_servos_have_no_wrong_unit():
     data = Position(np.zeros((2, 5)), np.zeros((2, 3)))
     keys = [
