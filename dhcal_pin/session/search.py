@@ -76,7 +76,7 @@ N_BLOCKS, MIN_BLOCKS, MAX_BLOCKS = 20, 6, 200
 # Smallest logarithm of the ratio of the evidences of a change over time and over the configuration, and
 # largest correlation of both orders that are compared.
 MIN_ORDER_EVIDENCE, MAX_ORDER_CORRELATION = 4.0, 0.9
-# Largest share of outliers on the shorter side of a step: more of them are those of another event, or mistakes
+# Largest share of outliers on the shorter side of a step: more of them are due to another event, or mistakes
 # in single samples.
 MAX_OUTLIER_SHARE = 0.25
 # Logarithm of the ratio of the noises from which a search begins with a lag from some sample on.
