@@ -79,7 +79,8 @@ MIN_ORDER_EVIDENCE, MAX_ORDER_CORRELATION = 4.0, 0.9
 # Largest share of its evidence that a change over time keeps beside a function of the configuration which
 # explains it. It was 0.96 to 2.2 where the base moved, and mostly below 0.9 along smooth paths.
 MAX_REMAINING_SHARE = 0.9
-# Largest share of outliers on the shorter side of a step: more of them are mistakes in single samples.
+# Largest share of outliers on the shorter side of a step: more of them are due to another event, or mistakes
+# in single samples.
 MAX_OUTLIER_SHARE = 0.25
 # Logarithm of the ratio of the noises from which a search begins with a lag from some sample on.
 MIN_LAG_GAIN = 0.5
@@ -105,8 +106,8 @@ MIN_NOISE = 1e-3
 PASS_TOL = 0.01
 # Share of the information about a cause that the fit leaves even if it can explain all of it.
 MIN_UNEXPLAINED = 1e-8
-# Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters do, and
-# that of the residuals of the robot with fewer samples, too.
+# Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters and steps
+# of base, tool and joints do, and that of the residuals of the robot with fewer samples, too.
 MIN_ROBOT_GAIN = 0.3
 # Smallest number of rows of the robot with fewer samples for each unknown of its geometry.
 MIN_ROBOT_ROWS = 2.5
@@ -539,10 +540,8 @@ class _Search:
             if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
                 break
             before = self.x, self.changes, [*self.causes]
-            self._add(found)
-            settled = self._settle()
-            judged = self._judge(self.rows, settled, len(self.causes) - 1)
-            if judged.log_evidence >= MIN_LOG_EVIDENCE:
+            settled, evidence = self._settle_with(found)
+            if evidence >= MIN_LOG_EVIDENCE:
                 fit = settled
                 continue
             self.x, self.changes, self.causes = before
@@ -550,6 +549,24 @@ class _Search:
             if len(self.rejected) > MAX_REJECTED:
                 break
         self._confirm()
+
+    def _settle_with(self, found: Cause) -> tuple[LinearFit, float]:
+        """Fit with one more cause and those of its outliers, and return the smallest evidence of them."""
+        first, n_outliers = len(self.causes), len(self.numbers) + 1
+        while True:
+            self._add(found)
+            fit = self._settle()
+            added = [i for i in range(first, len(self.causes)) if not _is_part_of_model(self.causes[i])]
+            evidence = min(self._judge(self.rows, fit, i).log_evidence for i in added)
+            # The samples behind another event are outliers of a step, until this event is found.
+            share = max(self._outlier_share(fit, self.causes[i]) for i in added)
+            last, n_outliers = n_outliers, int(np.sum(fit.weights < OUTLIER_WEIGHT))
+            if evidence >= MIN_LOG_EVIDENCE or share <= MAX_OUTLIER_SHARE or n_outliers >= last:
+                return fit, evidence
+            best = self.best_cause(fit)
+            if len(self.causes) >= MAX_CAUSES or not best or best.log_evidence < MIN_PROPOSED_EVIDENCE:
+                return fit, evidence
+            found = best
 
     def _remove(self, i: int) -> LinearFit:
         """Remove a cause, and fit without it."""
@@ -815,6 +832,11 @@ class _Search:
             number, fit = place, solve(place)
         return number, fit
 
+    def _steps_of_all(self, number: int) -> list[Cause]:
+        """Return steps of base, tool, payload and the zeros of all joints at a sample."""
+        blocks = [b for b in self.layout.blocks if not b.is_constant and b.kind != "links"]
+        return [Cause(b, Step(number), np.zeros(len(b.sizes)), np.empty((0, 0))) for b in blocks]
+
     def _gain_of_side(self, one: LinearFit, two: LinearFit, number: int, n_unknowns: int) -> float:
         """Return by how much a second robot lowers the logarithm of the residuals on the shorter side."""
         is_after = self.numbers >= number
@@ -846,8 +868,10 @@ class _Search:
         for first in steps:
             others = [c for c in self.causes if c.shape != Step(first)]
             number, two = self._second_robot(rows, others, block, first)
-            gain = count * float(np.mean(np.log(one.noise / two.noise)))
-            is_explained = self._gain_of_side(one, two, number, len(sizes)) > MIN_ROBOT_GAIN
+            # One robot of which everything but the geometry of the arm has changed must not fit as well.
+            changed = self.solve(rows, [*self.causes, *self._steps_of_all(number)])
+            gain = count * float(np.mean(np.log(changed.noise / two.noise)))
+            is_explained = self._gain_of_side(changed, two, number, len(sizes)) > MIN_ROBOT_GAIN
             if is_explained and gain > max(needed, best[0] if best else 0.0):
                 best = gain, number, two
         if best is None:

@@ -227,6 +227,26 @@ def test_a_step_before_the_last_three_samples_is_found():
     assert [cause.shape for cause in search.causes] == [Step(57)]
 
 
+@pytest.mark.parametrize(
+    ("arm", "count", "n_after"), some_slow([("ur10", 50, 8), ("panda", 80, 12), ("xarm7", 120, 20)], {0, 1})
+)
+def test_steps_of_a_joint_and_later_of_the_tool_are_no_drift(arm, count, n_after):
+    """A third of the samples behind the first step are outliers of it, until the second one is found."""
+    simulation = Simulation(arm, count, 3)
+    zeros = DEGREE * np.eye(simulation.chain.n_joints)[2]
+    positions = simulation.measure(Position, Changes(joint=(2, DEGREE))).positions().copy()
+    poses = simulation.poses(simulation.q[-n_after:] + zeros)
+    shift = 1.2e-3 * simulation.direction()
+    positions[-n_after:] += [simulation.base.rotation @ pose.rotation @ shift for pose in poses]
+    fit = calibrate(simulation.chain, Position(simulation.q, positions), extend="none")
+    session = session_of(fit)
+    assert not session.drifts
+    found = [(event.kind, event.after.line) for event in session.events]
+    assert found == [("joint", count // 2 + 1), ("tool", count - n_after + 1)]
+    assert fit.n_outliers == 0
+    assert simulation.true_error(fit.chain) < 1.5e-4
+
+
 def test_a_session_has_a_largest_number_of_causes(monkeypatch):
     monkeypatch.setattr(search_module, "MAX_CAUSES", 1)
     search = search_of(Changes("base", 2e-4, joint=(4, 0.015 * DEGREE), at=0.3))
@@ -528,6 +548,14 @@ def test_two_robots_are_refused():
     assert "Two robots were measured" in fit.verdict.reasons[0]
     (event,) = [event for event in session_of(fit).events if event.kind == "robot"]
     assert (event.before.line, event.after.line) == (50, 51)
+
+
+@pytest.mark.parametrize("of", ["base", "tool"])
+def test_one_robot_with_several_events_is_not_two(of):
+    """No cause was kept, so that a second robot would explain base or tool and the joint at once."""
+    search = search_of(Changes(of, 2e-3, joint=(2, DEGREE)))
+    assert search.causes == []
+    assert search.other_robot() is None
 
 
 @pytest.mark.parametrize("seed", some_slow([103, 123, 131, 153], {0}))
