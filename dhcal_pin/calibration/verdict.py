@@ -67,6 +67,9 @@ MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
 # belong together. The first of image coordinates depends on the type of arm.
 MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
+# Errors of hold-out samples of this size do not belong to the fit, with the same units. A fit that knows
+# nothing leaves the size of the workspace, and the zeros of a hand-built arm a tenth of it.
+MAX_HOLDOUT_ERROR = {"m": 0.3, "rad": 1.0}
 # Longest tool [m] that is believed if measured positions are farther from each other than the tip can be.
 MAX_TOOL = 1.0
 # More parameters are suggested if they reduce the error at least to this fraction, and not if the error is
@@ -105,8 +108,8 @@ MAX_SAME_ORIENTATION = 0.1
 MAX_FRAME_ITERATIONS = 20
 # Largest number of further iterations that are tried where a fit did not converge.
 MAX_CONTINUED = 500
-# A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
-# standard errors, and by this many times what the uncertainty of its parameters explains.
+# A calibrated robot is worse if its held-out errors exceed those of the nominal one by this many standard
+# errors, and their squares by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # RMS error of the nominal robot, as a fraction of the workspace, of values that were computed, not measured.
 MAX_COMPUTED_ERROR = 2e-5
@@ -116,9 +119,6 @@ MIN_SIGMA_RATIO = 10.0
 # smaller, the first fit was far from its minimum. They were 1.00 to 1.04 in 29 simulated cases with too small
 # standard deviations, and 0.001 and 0.3 in two that did not converge.
 MIN_REFITTED_SHARE = 0.5
-# Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
-# probability and one degree of freedom. Those with more degrees of freedom are closer to 0.
-MAX_CHANCE, MIN_T = 0.025, -12.71
 # Outliers spoil a fit if the error without them is smaller by this factor.
 MAX_SPOILED_RATIO = 1.5
 # Largest share of hold-out samples that may be equal to fitted ones.
@@ -212,8 +212,13 @@ def judge(fit: Evidence) -> Verdict:
         # A cause of the errors of images explains the correction, too.
         explains_correction = any(error.has_cause for error in errors)
         is_wrong = any(finding.status == "refused" for finding in (*correction, *errors))
-        hidden = _hidden_outliers(fit)
+        hidden, outliers = _hidden_outliers(fit), _outliers(fit)
+        if holdout := [] if is_wrong else _implausible_holdout(fit):
+            # The outliers to which the fit did not adapt explain it.
+            outliers = [replace(each, status="refused") for each in outliers]
         found = [
+            *(outliers if holdout else []),
+            *holdout,
             *(_wrong_labels(fit) or _deviating_lines(fit) or _outlying_end(fit)),
             *([*errors, *correction] if explains_correction else [*correction, *errors]),
             *_session(fit),
@@ -224,11 +229,11 @@ def judge(fit: Evidence) -> Verdict:
             *([] if is_wrong else _weak_positions(fit) or _hidden_position_errors(fit)),
             *_fitted_holdout(fit),
             *_held_out_errors(fit),
-            *_unexplained_holdout(fit),
+            *([] if holdout else _unexplained_holdout(fit)),
             *_regional_errors(fit),
             *_few_measurements(fit),
             *(hidden or _few_judged(fit)),
-            *_outliers(fit),
+            *([] if holdout else outliers),
             *_outlying_cameras(fit),
         ]
         if any(finding.status == "refused" for finding in found):
@@ -775,23 +780,18 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
         return []  # The base or another part moved before these samples, which neither robot contains.
     head = fit.comparisons[0]
     group, after = next(iter(head.after.groups.items()))
-    before, change = head.before.groups[group], paired.t
+    before = head.before.groups[group]
     texts = [format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (before, after)]
     figures = f"{texts[1]} on {head.title} samples, {texts[0]} for the nominal one"
-    if change > MIN_WORSE_T and paired.ratio**2 - 1 > MIN_WORSE_RATIO * _overfitting(fit):
+    if paired.t > MIN_WORSE_T and paired.ratio**2 - 1 > MIN_WORSE_RATIO * _overfitting(fit):
         text = f"The calibrated robot is worse than the nominal one: {figures}. Keep the nominal robot."
         return [Finding("refused", text)]
     # Left-out regions have shown already that the arm is wrong if images change it, and without estimates of
     # cameras and boards the nominal arm would fit worse than before.
-    if fit.camera_stages or change < MIN_T:
-        return []
-    from scipy.special import stdtrit  # lazy import: slow
-
-    if change < stdtrit(len(paired.before) - 1, MAX_CHANCE):
+    if fit.camera_stages or paired.is_better:
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
     remedy = "measure more poses"
-    before = head.before.groups[group]
     if before.unit == "m" and before.rms < MAX_COMPUTED_ERROR * _workspace_size(fit):
         remedy = (
             "no real arm fits its nominal model so well: the measured values were probably computed with it, "
@@ -840,6 +840,26 @@ def _unexplained_holdout(fit: Evidence) -> list[Finding]:
     remedy = "Measure all regions of joint space"
     remedy += ", and allow joint errors (--extend auto)." if fit.extension is None else "."
     return [Finding("caution", f"The model does not explain the arm: {figures} {remedy}")]
+
+
+def _implausible_holdout(fit: Evidence) -> list[Finding]:
+    """Refuse a robot to which hold-out samples do not belong, unless a mistake or a change explains them."""
+    judged, change = fit.comparisons[0], fit.holdout_change
+    # A base that moved explains large errors, but not several parts that changed a little.
+    has_change = change is not None and change.changes[0].kind != "robot"
+    if judged.title != "hold-out" or fit.holdout_mistake or has_change:
+        return []
+    for group, after in judged.after.groups.items():
+        size = _workspace_size(fit) if after.unit == "m" else 1.0
+        if after.rms > MAX_HOLDOUT_ERROR.get(after.unit, np.inf) * size:
+            rms = format_quantity(after.rms, after.unit, after.rms_std, small=True)
+            text = (
+                f"The fit leaves an RMS {ERROR_GROUPS[group].label} of {rms} on hold-out samples. These or "
+                "the fitted ones are wrong: check set-up, units, and order, signs and zeros of the joints in "
+                "both."
+            )
+            return [Finding("refused", text)]
+    return []
 
 
 def _regional_errors(fit: Evidence) -> list[Finding]:

@@ -59,7 +59,7 @@ from .facts import cause_size
 from .linear_model import Layout, measures_positions, whitened_rows
 from .robot_changes import RobotChanges
 from .search import can_have_session
-from .slip import Slip, find_slip
+from .slip import RANK_TOL, Fit, Slip, find_slip
 from .timeline import order_samples
 
 # Largest share of unchanged robots that are called changed.
@@ -68,6 +68,8 @@ MAX_FALSE_ALARMS = 0.001
 N_DRAWS = 3000
 # Smallest share of the evidence with which a change is named.
 MIN_SHARE = 0.75
+# Largest number of changes that are named where the samples do not show which of them it is.
+N_NAMED = 3
 # Share of the evidence from which a change that has the same effect is named, too.
 MIN_RIVAL_SHARE = 0.02
 # Widths of the prior of a change, as displacements of the tool [m]; an instrument may stand anywhere. Width
@@ -92,6 +94,9 @@ DEFAULT_SIZE = 1e-3
 MAX_UNEXPLAINED = 1e-6
 # Change of a joint that must have this effect, in standard deviations, to count as visible [rad or m].
 LARGEST_CHANGE, MIN_EFFECT = 0.1, 5.0
+# Smallest part of the effects of two changes that must remain if they cancel each other. It is 0.001 to 0.003
+# for displacements along parallel axes, as the errors of an arm leave them, and 0.2 for other changes.
+MIN_SEPARABLE = 0.02
 MAX_ITERATIONS = 6
 # Largest number of iterations of a fit of the base alone.
 MAX_FRAME_ITERATIONS = 20
@@ -548,8 +553,10 @@ class _CheckModel:
         columns = rows[:, block.columns]
         return values, columns * sizes, rows[:, -1] + columns @ values
 
-    def _estimate_base(self, block: Block) -> tuple[Array, Array, Array]:
-        """Estimate a change of the base, from zero and from the base that fits best: it may turn far."""
+    def _estimate_part(self, block: Block) -> tuple[Array, Array, Array]:
+        """Estimate a change of one part; that of the base from the best one, too, which may turn far."""
+        if block.kind != "base":
+            return self.estimate(block)
         errors = ErrorModel(self.chain, tuple(base(self.chain)))
         placed = initialize_frames(errors, self.data, self.known, MAX_FRAME_ITERATIONS).chain
         start = np.zeros(self.layout.n_columns)
@@ -589,9 +596,28 @@ class _CheckModel:
 
     def judged(self) -> tuple[list[Hypothesis], float, float]:
         """Return all hypotheses, the most likely one first, the log ratio for any change, and its limit."""
+        values, likelihoods, weights, limit = self._evidence
+        total = float(_log_sums(weights[:, None])[0])
+        if total > limit:
+            weights = self._without_right_samples(weights)
+        shares = np.exp(weights - _log_sums(weights[:, None])[0])
+        hypotheses = [
+            self._hypothesis(block, *each, share=float(share))
+            for block, *each, share in zip(self.blocks, values, likelihoods, shares, strict=False)
+        ]
+        places = [(item.source, int(row)) for item in self.data for row in item.rows]
+        for (file, line), share in zip(places, shares[len(self.blocks) :], strict=True):
+            place = f"in line {line} of {file}" if file else f"{line}"
+            hypotheses.append(Hypothesis("sample", place, float(share), 0.0, 0.0, "m", 0.0))
+        return sorted(hypotheses, key=lambda each: -each.share), total, limit
+
+    @cached_property
+    def _evidence(self) -> tuple[list[Array], list[Array], Array, float]:
+        """Values and likelihoods of the changes, log evidence of all hypotheses, and the limit of its sum."""
+        # Those of the samples follow those of the blocks.
         blocks, count = self.blocks, self.numbers[-1] + 1
         *parts, robot = blocks
-        estimates = [self._estimate_base(b) if b.kind == "base" else self.estimate(b) for b in parts]
+        estimates = [self._estimate_part(block) for block in parts]
         estimates.append(self._estimate_robot(robot, parts, estimates))
         samples = [np.eye(len(self.numbers))[:, self.numbers == i] / self._sigma[i] for i in range(count)]
         priors = [ROBOT_PRIOR if block.kind == "robot" else 1.0 for block in blocks] + [1 / count] * count
@@ -604,19 +630,41 @@ class _CheckModel:
             likelihoods.append(self.log_likelihoods(columns, sets, self.null_likelihoods(sets)))
         nothing = _log_means(self.null_likelihoods(self.scaled_sets(self.rows[:, -1:]))[:, None])
         ratios = np.array([_log_means(each) - nothing for each in likelihoods])[:, 0]
-        total = float(_log_sums((ratios + log_priors)[:, None])[0])
-        shares = np.exp(ratios + log_priors - total)
-        places = [(item.source, int(row)) for item in self.data for row in item.rows]
-        hypotheses = [
-            self._hypothesis(block, values, each, float(share))
-            for block, (values, *_), each, share in zip(blocks, estimates, likelihoods, shares, strict=False)
-        ]
-        for (file, line), share in zip(places, shares[len(blocks) :], strict=True):
-            place = f"in line {line} of {file}" if file else f"{line}"
-            hypotheses.append(Hypothesis("sample", place, float(share), 0.0, 0.0, "m", 0.0))
         columns = [*(self.rows[:, block.columns] * block.sizes for block in blocks), *samples]
         limit = self.limit(columns, log_priors)
-        return sorted(hypotheses, key=lambda each: -each.share), total, limit
+        return [values for values, *_ in estimates], likelihoods, ratios + log_priors, limit
+
+    def _without_right_samples(self, weights: Array) -> Array:
+        """Exclude likely samples without which the others agree neither with the robot nor one change."""
+        # Measured again, such a sample is as it was, or another one is blamed.
+        out, wrong, n_blocks = weights.copy(), set(), len(self.blocks)
+        while True:
+            shares = np.exp(out - _log_sums(out[:, None])[0])
+            likely = [int(i) for i in np.argsort(-out)[:N_NAMED] if shares[i] > MIN_RIVAL_SHARE]
+            suspect = next((i for i in likely if i >= n_blocks and i not in wrong), None)
+            if suspect is None:
+                return out
+            if self._agrees_without(suspect - n_blocks):
+                wrong.add(suspect)
+            else:
+                out[suspect] = -np.inf
+
+    def _agrees_without(self, sample: int) -> bool:
+        """Return whether all samples but one agree with the calibrated robot, or with one change of it."""
+        stops = np.cumsum([len(item.rows) for item in self.data])
+        kept = np.split(np.arange(stops[-1]) != sample, stops[:-1])
+        data = [
+            item.take(np.flatnonzero(mask)) for item, mask in zip(self.data, kept, strict=True) if mask.any()
+        ]
+        rest = _CheckModel(self.chain, tuple(data), self.uncertainty, self.known, self.payloads)
+        judge = rest.with_known_noise()
+        if judge is None:
+            *_, weights, limit = rest._evidence
+            return bool(_log_sums(weights[:, None])[0] <= limit)
+        if judge.unchanged_p_value() >= MAX_FALSE_ALARMS:
+            return True
+        *parts, _ = judge.blocks
+        return stops[-1] > MIN_SAMPLES and any(judge.is_changed(block) for block in parts)
 
     @cached_property
     def _positions(self) -> tuple[Array, Array]:
@@ -649,6 +697,12 @@ class _CheckModel:
         file, line = [(item.source, int(row)) for item in self.data for row in item.rows][sample]
         return f"line {line} of {file}" if file else f"sample {line}"
 
+    def is_changed(self, block: Block) -> bool:
+        """Return whether a change of one part explains the residuals."""
+        start = np.zeros(self.layout.n_columns)
+        start[block.columns] = self._estimate_part(block)[0]
+        return self.explained([block], start).p_value >= MAX_FALSE_ALARMS
+
     def slip(self) -> Slip:
         """Find the sample from which on a base that moved explains the residuals best."""
         *parts, robot = self.blocks
@@ -656,15 +710,30 @@ class _CheckModel:
         moved = self.rows[:, base_block.columns]
         others = [self.rows[:, each.columns[each.sizes > 0]] for each in (*parts, robot)]
         pairs = [np.concatenate([moved, each], 1) for each in others]
-        whitening = self.axes.T / np.sqrt(self.variances[self.usual_noise])[:, None]
-        return find_slip(moved, self.rows[:, -1], whitening, self.numbers, [*others, *pairs, *self.origins])
+        rivals = [*others, *pairs, *self.origins]
+        return find_slip(moved, self.rows[:, -1], self._whitening, self.numbers, rivals)
+
+    def is_origin(self, chi_square: float) -> bool:
+        """Return whether a motion of the origin of one joint explains the residuals as well as chi-square."""
+        scaled = self._whitening @ self.rows[:, -1]
+        fits = [Fit.of(self._whitening @ columns, scaled) for columns in self.origins]
+        return any(
+            fit.chi_square < chi_square + MAX_EQUAL
+            and _p_value(len(scaled) - fit.rank, fit.chi_square) >= MAX_FALSE_ALARMS
+            for fit in fits
+        )
+
+    @property
+    def _whitening(self) -> Array:
+        """Matrix (n, n) that gives rows unit covariance at the usual noise."""
+        return self.axes.T / np.sqrt(self.variances[self.usual_noise])[:, None]
 
     @cached_property
     def _sigma(self) -> Array:
         """Standard deviation of the position of each sample, (N,) [m]."""
         return np.concatenate([item.sigma.mean(1) for item in self.data])
 
-    def _hypothesis(self, block: Block, values: Array, likelihoods: Array, share: float) -> Hypothesis:
+    def _hypothesis(self, block: Block, values: Array, likelihoods: Array, *, share: float) -> Hypothesis:
         """Describe a change."""
         best = int(likelihoods.max((1, 2)).argmax())
         used = np.flatnonzero(block.sizes)
@@ -698,18 +767,22 @@ class _CheckModel:
         return _p_value(len(self.rows), float(chi_square))
 
     def explained(self, blocks: Sequence[Block], start: Array) -> Explained:
-        """Fit several changes, from the values (p,) of the first one, and return what they leave."""
+        """Fit several changes, from the values (p,) of the first one, and return what they leave.
+
+        Displacements that hardly differ from none together, as along parallel axes, are left out.
+        """
         columns, sizes = (np.concatenate([getattr(b, key) for b in blocks]) for key in ("columns", "sizes"))
         values, effects, undone = self.estimate(Block("robot", "", columns, sizes), start)
-        used = sizes > 0
-        scaled_values = np.divide(values, sizes, out=np.zeros_like(values), where=used)
+        scaled_values = np.divide(values, sizes, out=np.zeros_like(values), where=sizes > 0)
+        a = self._scaled(effects, self.usual_noise)
+        stops = np.cumsum([len(block.columns) for block in blocks])[:-1]
+        inverse, rank = _separable_inverse(np.split(a, stops, axis=1))
+        scaled_values = inverse @ (a @ scaled_values)
         left = undone - effects @ scaled_values
-        a, r = self._scaled(effects[:, used], self.usual_noise), self._scaled(left[:, None], self.usual_noise)
-        inverse = np.linalg.pinv(a, rcond=1e-9)
-        covariance = np.zeros((len(values),) * 2)
-        covariance[np.ix_(used, used)] = inverse @ inverse.T * np.outer(sizes[used], sizes[used])
-        freedom, chi_square = len(left) - np.linalg.matrix_rank(a), float(np.sum(r**2))
-        p_value = _p_value(int(freedom), chi_square)
+        r = self._scaled(left[:, None], self.usual_noise)
+        values, covariance = scaled_values * sizes, inverse @ inverse.T * np.outer(sizes, sizes)
+        freedom, chi_square = len(left) - rank, float(np.sum(r**2))
+        p_value = _p_value(freedom, chi_square)
         rows, sigma = self._positions
         rms = float(np.sqrt(np.sum((left[rows] * sigma) ** 2) / (self.numbers[-1] + 1)))
         return Explained(values, covariance, rms, chi_square, p_value)
@@ -740,6 +813,20 @@ class _CheckModel:
         return REVEALED_RATIO * float(np.sqrt(max(np.linalg.eigvalsh(r @ covariance @ r.T).max(), 0.0)))
 
 
+def _separable_inverse(effects: Sequence[Array]) -> tuple[Array, int]:
+    """Return the inverse (c, n) of effects (n, ·) of changes without what they cancel, and its rank."""
+    parts = []
+    for each in effects:
+        u, s, vt = np.linalg.svd(each, full_matrices=False)
+        kept = s > RANK_TOL * s.max(initial=0.0)
+        parts.append((u[:, kept], vt[kept].T / s[kept]))
+    # Singular values of joined orthonormal bases are small in directions in which one cancels the other.
+    u, s, vt = np.linalg.svd(np.concatenate([part[0] for part in parts], 1), full_matrices=False)
+    kept = s > MIN_SEPARABLE
+    inverse = (np.asarray(block_diag(*(part[1] for part in parts))) @ vt[kept].T / s[kept]) @ u[:, kept].T
+    return inverse, int(kept.sum())
+
+
 def _p_value(freedom: int, chi_square: float) -> float:
     """Return the probability of a larger chi-square if the noise is the largest one that is possible."""
     from scipy.special import chdtrc  # lazy import: slow
@@ -765,7 +852,7 @@ def _answer(
     """Decide, and say why."""
     changes: tuple[Hypothesis, ...] = ()
     has_several = False
-    best = hypotheses[0]
+    best, robot = hypotheses[0], next(each for each in hypotheses if each.kind == "robot")
     group = [
         best,
         *(h for h in hypotheses if h.name in best.imitators),
@@ -787,17 +874,17 @@ def _answer(
     elif best.kind == "sample":
         verdict = "cannot say"
         reasons = [f"The sample {best.of} does not fit to the others; measure it again."]
-    elif share < MIN_SHARE and (slipped := _slipped(model)):
-        verdict, reasons, changes, has_several = slipped
+    elif share < MIN_SHARE and (found := _slipped(model) or _several(model, robot)):
+        verdict, reasons, changes, has_several = found
     elif share < MIN_SHARE:
         verdict = "cannot say"
-        rivals = ", ".join(f"{each.name} ({100 * each.share:.0f} %)" for each in hypotheses[:3])
+        rivals = ", ".join(f"{each.name} ({100 * each.share:.0f} %)" for each in hypotheses[:N_NAMED])
         reasons = [
             f"Something changed. These samples do not show which of these it is: {rivals}. Measure more "
             "poses, as `dhcal plan --recheck` chooses them."
         ]
     else:
-        verdict, reasons, changes, has_several = _verified(model, group)
+        verdict, reasons, changes, has_several = _verified(model, group, robot)
     if verdict == "cannot say" and (columns := model.unknown_columns):
         reasons = [*reasons, f"State the conditions of the samples: {join_names(columns)}."]
     if verdict == "cannot say" and model.has_extrapolated_payloads:
@@ -821,7 +908,7 @@ def _answer(
 Finding = tuple[str, list[str], tuple[Hypothesis, ...], bool]
 
 
-def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
+def _verified(model: _CheckModel, group: list[Hypothesis], robot: Hypothesis) -> Finding:
     """Compare what a change leaves of the residuals with the noise; look for a second change if needed."""
     best, judge = group[0], model.with_known_noise()
     unverified = "changed", [_sentence(group)], tuple(group), False
@@ -847,6 +934,8 @@ def _verified(model: _CheckModel, group: list[Hypothesis]) -> Finding:
     trials = sorted(
         (pair for pair in trials if pair[1].p_value >= MAX_FALSE_ALARMS), key=lambda pair: pair[1].chi_square
     )
+    if judge.is_origin(trials[0][1].chi_square if trials else np.inf):
+        return "changed", [_robot_sentence(judge)], (robot,), False
     rivals = [each for each, fit in trials if fit.chi_square < trials[0][1].chi_square + MAX_EQUAL]
     if len(rivals) == 1:
         changes = _both_changes(judge, block, *trials[0])
@@ -879,6 +968,14 @@ def _slipped(model: _CheckModel) -> Finding | None:
     change = Hypothesis("base", place, 1.0, *size, 0.0, (), *turn)
     reason = "Before and after, the samples fit to the calibrated arm. Fasten both, and measure again."
     return "changed", [_sentence([change]), reason], (change,), False
+
+
+def _several(model: _CheckModel, robot: Hypothesis) -> Finding | None:
+    """Return the answer if the origin of a joint explains the samples, and no single part does."""
+    judge = model.with_known_noise()
+    if judge is None or not judge.is_origin(np.inf) or any(map(judge.is_changed, judge.blocks[:-1])):
+        return None
+    return "changed", [_robot_sentence(judge)], (robot,), False
 
 
 def _is_possible(slip: Slip) -> bool:

@@ -132,3 +132,27 @@ def test_random_hold_out_samples_of_one_session_show_no_change(seed):
     (fitted,), holdout = split(data, 0.4, seed)
     fit = calibrate(sim.chain, fitted, holdout=holdout, session="off")
     assert "Something changed between" not in " ".join(fit.verdict.reasons)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(4), [0]))
+def test_a_file_half_in_other_units_is_refused_or_named(seed):
+    """The fit adapts to one half, and the errors of the other half are as large as the robot."""
+    sim = Simulation("ur10", 40, seed)
+    data = sim.measure(Position)
+    values = data.values.copy()
+    values[20:] /= 25.4
+    is_held_out = np.random.default_rng(seed).permutation(40) < 12
+    spoilt = data.replace(values=values)
+    fitted, holdout = (spoilt.take(np.flatnonzero(mask)) for mask in (~is_held_out, is_held_out))
+    verdict = calibrate(sim.chain, fitted, holdout=holdout).verdict
+    is_named = "as if in had been read as mm" in verdict.reasons[0]
+    assert is_named or (verdict.status == "refused" and "samples (" in verdict.reasons[0])
+
+
+def test_hold_out_samples_of_something_else_are_refused():
+    sim = Simulation("ur10", 60, 0)
+    fitted, holdout = halves(sim.measure(Position))
+    rng = np.random.default_rng(0)
+    fit = calibrate(sim.chain, fitted, holdout=holdout.replace(values=rng.uniform(-1, 1, (30, 3))))
+    assert fit.verdict.status == "refused"
+    assert "on hold-out samples. These or the fitted ones are wrong" in fit.verdict.reasons[0]

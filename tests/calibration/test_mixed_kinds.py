@@ -415,3 +415,26 @@ def test_few_right_positions_beside_inclinations_are_not_called_outliers(sim_6do
     assert (
         "So few samples do not show which are wrong, if any. Measure at least 12 different poses" in reasons
     )
+
+
+def is_correction_applied(arm, seed):
+    """Calibrate with few positions and many inclinations, of which four positions are held out."""
+    rng, errors = np.random.default_rng(seed), select_parameters(arm, "minimal")
+    sizes = np.array([{"m": 1e-3, "rad": 5e-3}[parameter.unit] for parameter in errors.parameters])
+    truth = errors.at(sizes * rng.standard_normal(len(sizes)))
+    few, held_out = (
+        KINDS["position"].simulate(truth, rng.uniform(-2, 2, (n, 6)), Noise(1e-4), rng) for n in (12, 4)
+    )
+    many = KINDS["inclination"].simulate(truth, rng.uniform(-2, 2, (100, 6)), Noise(5e-5, 1e-4), rng)
+    fit = calibrate(arm, [few, many], "minimal,base,tool", holdout=held_out)
+    before, after = fit.comparisons[0].before, fit.comparisons[0].after
+    assert after["position_rms_m"] < before["position_rms_m"] / 5
+    return not fit.verdict.keeps_nominal
+
+
+@pytest.mark.parametrize(
+    ("seeds", "least"), [(range(2), 2), pytest.param(range(2, 22), 18, marks=pytest.mark.slow)]
+)
+def test_four_hold_out_positions_show_that_the_robot_is_better(sim_6dof, seeds, least):
+    """The correction was kept in half of these cases only."""
+    assert sum(is_correction_applied(sim_6dof, seed) for seed in seeds) >= least

@@ -29,6 +29,22 @@ from dhcal_pin.session import Recheck, find_excess_error, recheck
 from dhcal_pin.session.check import WIDTHS, _CheckModel
 
 STILL = pin.SE3.Identity()
+# A SCARA: all axes are parallel, and the third joint is a slide.
+JOINTS = (
+    ("j1", "revolute", "0 0 0.35", "0 0 1", -2.3, 2.3),
+    ("j2", "revolute", "0.325 0 0.05", "0 0 1", -2.5, 2.5),
+    ("j3", "prismatic", "0.275 0 0", "0 0 -1", 0.0, 0.2),
+    ("j4", "revolute", "0 0 0", "0 0 1", -3.0, 3.0),
+)
+LINKS = ("base", "l1", "l2", "l3", "tcp")
+SCARA = '<robot name="scara">' + "".join(f'<link name="{name}"/>' for name in LINKS)
+for (name, what, xyz, axis, lower, upper), parent, child in zip(JOINTS, LINKS[:-1], LINKS[1:], strict=True):
+    SCARA += (
+        f'<joint name="{name}" type="{what}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}"/><axis xyz="{axis}"/>'
+        f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/></joint>'
+    )
+SCARA += "</robot>"
 LENGTH, ANGLE = 5e-4, np.deg2rad(0.05)
 CHANGES = ("nothing", "joint", "base", "tool")
 
@@ -384,6 +400,62 @@ def test_changes_of_the_arm_are_no_motion_of_the_instrument(n_seeds):
             found = recheck(fit.chain, [data], fit.uncertainty)
             assert found.verdict != "ok"
             assert "the samples fit to the calibrated arm" not in " ".join(found.reasons)
+
+
+def with_shifted_origin(sim, q, kind, joint, shift, **changes) -> Measurement:
+    """Measure an arm of which the origin of a joint moved."""
+    own, sim.model = sim.model, sim.model.copy()
+    sim.model.jointPlacements[sim.ids[joint]] *= pin.SE3(np.eye(3), np.asarray(shift))
+    data = measured(sim, q, kind, True, **changes)
+    sim.model = own
+    return data
+
+
+@pytest.mark.parametrize(
+    "base", [STILL, pin.SE3(pin.exp3(np.array([0, 0.01, 0.015])), np.array([0.01, 0, 0]))]
+)
+@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize("seeds", some_slow([range(1), range(1, 6)], {0}))
+def test_motions_along_parallel_axes_that_cancel_each_other_are_not_named(
+    kind, seeds, base, tmp_path, monkeypatch
+):
+    """The origin of a joint of a SCARA moved by 0.3 mm; "the base moved by 50 mm, the tool by 50 mm"."""
+    (tmp_path / "scara.urdf").write_text(SCARA)
+    monkeypatch.setitem(ARMS, "scara", (str(tmp_path / "scara.urdf"), "tcp"))
+    for seed, joint, axis in product(seeds, range(1, 4), range(2)):
+        sim, fit, q = calibrated("scara", seed, kind)
+        data = with_shifted_origin(sim, q, kind, joint, 3e-4 * np.eye(3)[axis], base=base)
+        found = recheck(fit.chain, [data], fit.uncertainty)
+        assert found.verdict != "ok"
+        assert all(each.unit == "rad" or abs(each.size) < 0.03 for each in found.changes), found.reasons
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([1, 8], {0}))
+@pytest.mark.parametrize(("arm", "kind"), [("ur10", Position), ("panda", Pose)])
+def test_a_moved_origin_is_not_blamed_on_a_sample(arm, kind, n_seeds):
+    """Measured again, another sample did not fit to the others."""
+    for seed, joint, axis in product(range(n_seeds), (2, 4), range(3)):
+        sim, fit, q = calibrated(arm, seed, kind)
+        data = with_shifted_origin(sim, q, kind, joint, 3e-4 * np.eye(3)[axis])
+        reasons = " ".join(recheck(fit.chain, [data], fit.uncertainty).reasons)
+        assert "measure it again" not in reasons
+        assert "sample" not in reasons.replace("These samples", "")
+
+
+@pytest.mark.parametrize("n_seeds", some_slow([2, 20], {0}))
+@pytest.mark.parametrize("angle", [0.0, 0.1])
+def test_a_wrong_sample_is_blamed_beside_a_changed_zero_too(angle, n_seeds):
+    sim, fit, q = calibrated("ur10", 7, Position)
+    zeros = np.deg2rad(angle) * np.eye(6)[2]
+    for seed in range(n_seeds):
+        wrong = int(np.random.default_rng(seed).integers(len(q)))
+        data = measured(sim, q, Position, True, zeros=zeros)
+        data.positions()[wrong] += 0.02 * sim.direction()
+        found = recheck(fit.chain, [data], fit.uncertainty)
+        assert found.reasons[0] == f"The sample {wrong + 1} does not fit to the others; measure it again."
+        # The advice: without it, the others agree with the robot or with the changed zero.
+        rest = recheck(fit.chain, [data.take(np.flatnonzero(np.arange(len(q)) != wrong))], fit.uncertainty)
+        assert (rest.verdict, rest.what) == (("changed", "joint elbow_joint") if angle else ("ok", ""))
 
 
 def test_a_motion_during_the_check_is_named_as_possible_if_the_samples_do_not_exclude_it():
