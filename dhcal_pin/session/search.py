@@ -235,9 +235,8 @@ class _Search:
     def _linearized_without(self, i: int) -> Array:
         """Return the whitened rows with the current unknowns and all changes but those of a cause."""
         # Linear models at different motions of base or tool differ where only priors determine a direction.
-        values = [-c.values if k == i else np.zeros_like(c.values) for k, c in enumerate(self.causes)]
-        changes = update(self.changes, self.causes, values, self._base(), self.layout.links)
-        return self._linearized(changes, [*self.causes[:i], *self.causes[i + 1 :]])
+        others = [*self.causes[:i], *self.causes[i + 1 :]]
+        return self._linearized(self._changes_of(others), others)
 
     def _linearized(self, changes: RobotChanges, causes: Sequence[Cause]) -> Array:
         """Return the whitened rows with the current unknowns and some changes and causes."""
@@ -626,8 +625,12 @@ class _Search:
 
     def _drop_others(self) -> None:
         """Drop the changes of causes that are not among the present ones."""
-        held = [np.zeros_like(cause.values) for cause in self.causes]
-        self.changes = update(self.changes, self.causes, held, self._base(), self.layout.links)
+        self.changes = self._changes_of(self.causes)
+
+    def _changes_of(self, causes: Sequence[Cause]) -> RobotChanges:
+        """Return the current changes of some causes without those of others."""
+        held = [np.zeros_like(cause.values) for cause in causes]
+        return update(self.changes, causes, held, self._base(), self.layout.links)
 
     def log_noise(self, fit: LinearFit) -> float:
         """Return the mean logarithm of the noise of a fit."""
