@@ -172,7 +172,8 @@ def _find_confirmed(search: _Search) -> SessionFit:
         # Joint errors can imitate a change. They are dropped if none is supported beside the change.
         if _has_changes(found):
             changed, remaining = search.models.supported(found.fit)
-            if not remaining.families and _log_noise(changed) <= _log_noise(search.extended):
+            is_kept = _keeps_all_parts(found, changed)
+            if is_kept and not remaining.families and _log_noise(changed) <= _log_noise(search.extended):
                 return found
         # Joint errors that are not in the model hide small changes, and look like changes.
         found = search.confirmed(search.find_beside(search.extended, found))
@@ -258,7 +259,8 @@ class _Search:
         session = found.session
         if session is None or not _has_changes(found) or session.has_two_robots:
             return found
-        if _confirm_changes(session, self.fit, self.models.reweighted(found.fit), self.models.extended):
+        fit = self.models.reweighted(found.fit)
+        if _keeps_all_parts(found, fit) and _confirm_changes(session, self.fit, fit, self.models.extended):
             return found
         return SessionFit(self.fit, self.holdout, without_changes(session))
 
@@ -353,6 +355,16 @@ def _is_changed_zero(session: Session, diagnosis: Diagnosis) -> bool:
     sizes = [(session.chain.joint_names.index(e.of), e.size) for e in session.events if e.kind == "joint"]
     offsets = [each.offsets for each in diagnosis.hypotheses]
     return any(abs(abs(each[j]) - size) < SAME_ZERO for each in offsets for j, size in sizes if j in each)
+
+
+def _keeps_all_parts(found: SessionFit, fit: Fit) -> bool:
+    """Return whether a fit with the changes keeps most samples of each part between two steps."""
+    # A part that it rejects shows nothing of what the steps before and after it state.
+    assert found.session is not None
+    steps = sorted({cause.shape.number for cause in _causes(found) if isinstance(cause.shape, Step)})
+    parts = np.searchsorted(steps, found.session.timeline.fitted_numbers, side="right")
+    is_kept = np.concatenate(fit.weights) > MIN_KEPT_WEIGHT
+    return all(np.mean(is_kept[parts == part]) > 0.5 for part in np.unique(parts))
 
 
 def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend) -> bool:

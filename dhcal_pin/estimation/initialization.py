@@ -105,13 +105,19 @@ def subsample(item: Measurement) -> Measurement:
     return item.take(np.flatnonzero(np.isin(labels, drawn)))
 
 
-def positions_at_end(item: Measurement) -> Array:
-    """Return the measured positions (m, 3) [m] as if the base had stood where it stands at the end."""
-    positions, conditions = item.positions(), item.conditions()
-    if conditions.base_motion is None or not len(positions):
-        return positions
-    back = se3.inverse(conditions.base_motion)
-    return (back[:, :3, :3] @ positions[..., None])[..., 0] + back[:, :3, 3]
+def measured_at_end(item: Measurement) -> tuple[Array, Array]:
+    """Return measured positions (m, 3) [m] and rotations (m, 3, 3) as with base and tool of the end."""
+    positions, rotations, conditions = item.positions(), item.rotations(), item.conditions()
+    # Positions alone do not show where the tool moved.
+    if conditions.tool_motion is not None and len(rotations):
+        back = se3.inverse(conditions.tool_motion)
+        positions = positions + (rotations @ back[:, :3, 3:])[..., 0]
+        rotations = rotations @ back[:, :3, :3]
+    if conditions.base_motion is not None and len(positions):
+        back = se3.inverse(conditions.base_motion)
+        positions = (back[:, :3, :3] @ positions[..., None])[..., 0] + back[:, :3, 3]
+        rotations = back[: len(rotations), :3, :3] @ rotations
+    return positions, rotations
 
 
 def candidate_frames(
@@ -124,7 +130,8 @@ def candidate_frames(
     if sum(len(pose) for pose in tips) < 3 or not (is_base_unknown or is_tool_unknown):
         return
     tip = np.concatenate(tips)
-    measured = np.concatenate([positions_at_end(item) for item in with_positions])
+    positions, measured_rotations = zip(*map(measured_at_end, with_positions), strict=True)
+    measured = np.concatenate(positions)
     if not is_base_unknown:
         # With a known base the target is measured directly in the tip frame.
         local = se3.inverse(chain.base @ tip)
@@ -139,9 +146,9 @@ def candidate_frames(
     for base, offset in best:
         rotation = chain.tool[:3, :3]
         rotations = [
-            np.swapaxes((base @ pose)[:, :3, :3], 1, 2) @ item.rotations()
-            for pose, item in zip(tips, with_positions, strict=True)
-            if len(item.rotations())
+            np.swapaxes((base @ pose)[:, :3, :3], 1, 2) @ each
+            for pose, each in zip(tips, measured_rotations, strict=True)
+            if len(each)
         ]
         if is_tool_unknown and rotations:
             rotation = nearest_rotation(np.concatenate(rotations).sum(0))
@@ -173,7 +180,7 @@ def agreeing_samples(
         return out
     bare = chain.with_base_and_tool(np.eye(4), np.eye(4))
     tip = np.concatenate([bare.poses(item.conditions().of_arm) for _, item in with_positions])
-    measured = np.concatenate([positions_at_end(item) for _, item in with_positions])
+    measured = np.concatenate([measured_at_end(item)[0] for _, item in with_positions])
     m, columns = len(tip), []
     right = tip[:, :3, 3]
     if is_base_unknown:

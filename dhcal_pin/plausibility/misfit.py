@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._typing import Array
-from ..estimation.initialization import positions_at_end
+from ..estimation.initialization import measured_at_end
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.conditions import concatenate_conditions
@@ -70,8 +70,8 @@ def _sums_of_errors(arm: Chain, items: Sequence[Measurement]) -> Array:
     conditions = concatenate_conditions([item.conditions() for item in items])
     assert conditions is not None
     tip = arm.poses(conditions.of_arm).reshape(v, m, 4, 4)
-    p, r = np.stack([positions_at_end(item) for item in items]), tip[..., :3, :3].reshape(v, m, 9)
-    z = np.concatenate([p, tip[..., :3, 3], r], -1)
+    p, rotations = map(np.stack, zip(*map(measured_at_end, items), strict=True))
+    z = np.concatenate([p, tip[..., :3, 3], tip[..., :3, :3].reshape(v, m, 9)], -1)
     gram = _gram(z, np.ones((v, m)))
     # Without the part that A·p explains.
     cross = gram[:, :3, 3:]
@@ -81,9 +81,9 @@ def _sums_of_errors(arm: Chain, items: Sequence[Measurement]) -> Array:
     near = np.flatnonzero(bounds <= max(MAX_MISFIT, *np.sort(bounds)[:_N_NEAREST]))
     fit = _fit_rotations(z[near], t[near])
     squares[near], spread[near] = fit.square, fit.spread
-    if len(items[0].rotations()) and items[0].conditions().base_motion is None:
-        measured = np.stack([items[i].rotations() for i in near.tolist()])
-        turns[near] = _mean_turns(np.swapaxes(tip[near, :, :3, :3], 2, 3) @ fit.rotation[:, None] @ measured)
+    if rotations.size:
+        turned = np.swapaxes(tip[near, :, :3, :3], 2, 3) @ fit.rotation[:, None]
+        turns[near] = _mean_turns(turned @ rotations[near])
     return m * np.stack([squares, spread, turns, np.ones(v)])
 
 

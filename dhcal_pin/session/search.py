@@ -43,8 +43,8 @@ from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_SCALE_CHANGE, Event, Scale, Session, describe_lag
 from .linear_model import Layout, covariance_root, inverse, solve_information, whitened_rows
-from .part_bases import place_parts, starts_of_parts
-from .robot_changes import JointPaths, Motion, RobotChanges, apply_changes, update
+from .part_frames import place_parts, starts_of_parts
+from .robot_changes import JointPaths, RobotChanges, apply_changes, update
 from .timeline import Timeline, order_samples
 
 # Largest numbers of samples that are examined, and of cells between which steps are tested; the same for the
@@ -204,16 +204,22 @@ class _Search:
             labels.append(label)
         return np.concatenate(labels)[self.order]
 
-    def move_base(self, base: Motion) -> None:
-        """Begin with a step of the base at the beginning of each part but the first."""
-        block = next(block for block in self.layout.blocks if block.kind == "base")
+    def move_frames(self, changes: RobotChanges) -> None:
+        """Begin with the steps of base and tool in given changes."""
         own = self._base()
-        twists = [se3.log6(se3.inverse(own) @ pose @ own) for pose in base.poses]
+        twists = {
+            "base": se3.log6(se3.inverse(own) @ changes.base.poses @ own),
+            "tool": se3.log6(changes.tool.poses),
+        }
         self.causes = [
             Cause(block, Step(number), after - before, np.zeros((6, 6)))
-            for number, (before, after) in zip(base.steps, pairwise(twists), strict=True)
+            for block in self.layout.blocks
+            if block.kind in twists
+            for number, (before, after) in zip(
+                getattr(changes, block.kind).steps, pairwise(twists[block.kind]), strict=True
+            )
         ]
-        self.changes = RobotChanges(base)
+        self.changes = changes
         self.first_fit = self._fit()
 
     def move_lag(self) -> None:
@@ -233,9 +239,8 @@ class _Search:
     def _linearized_without(self, i: int) -> Array:
         """Return the whitened rows with the current unknowns and all changes but those of a cause."""
         # Linear models at different motions of base or tool differ where only priors determine a direction.
-        values = [-c.values if k == i else np.zeros_like(c.values) for k, c in enumerate(self.causes)]
-        changes = update(self.changes, self.causes, values, self._base(), self.layout.links)
-        return self._linearized(changes, [*self.causes[:i], *self.causes[i + 1 :]])
+        others = [*self.causes[:i], *self.causes[i + 1 :]]
+        return self._linearized(self._changes_of(others), others)
 
     def _linearized(self, changes: RobotChanges, causes: Sequence[Cause]) -> Array:
         """Return the whitened rows with the current unknowns and some changes and causes."""
@@ -640,8 +645,12 @@ class _Search:
 
     def _drop_others(self) -> None:
         """Drop the changes of causes that are not among the present ones."""
-        held = [np.zeros_like(cause.values) for cause in self.causes]
-        self.changes = update(self.changes, self.causes, held, self._base(), self.layout.links)
+        self.changes = self._changes_of(self.causes)
+
+    def _changes_of(self, causes: Sequence[Cause]) -> RobotChanges:
+        """Return the current changes of some causes without those of others."""
+        held = [np.zeros_like(cause.values) for cause in causes]
+        return update(self.changes, causes, held, self._base(), self.layout.links)
 
     def log_noise(self, fit: LinearFit) -> float:
         """Return the mean logarithm of the noise of a fit."""
@@ -964,10 +973,10 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
     parts = starts_of_parts(problem, x, timeline) if is_ordered else ()
     for each in dict.fromkeys((timeline.file_starts, parts)):
         if placed := place_parts(problem, timeline, each):
-            moved, motion = placed
+            moved, changes = placed
             fitted = timeline.with_fitted(moved.data)
             starts.append(_Search(moved, np.zeros_like(x), fitted, is_ordered, MAX_SAMPLES, MAX_CELLS))
-            starts[-1].move_base(motion)
+            starts[-1].move_frames(changes)
     noises = [search.log_noise(search.first_fit) for search in starts]
     if starts[0].paths is not None and starts[0].has_different_rows:
         delayed = _Search(problem, np.zeros_like(x), timeline, is_ordered, MAX_SAMPLES, MAX_CELLS)

@@ -1,4 +1,4 @@
-"""Parts of a session whose measuring frames differ by large rotations, against the true arm and motions."""
+"""Parts of a session whose bases or tools differ by large rotations, against the true arm and motions."""
 
 from collections.abc import Collection, Sequence
 from itertools import pairwise
@@ -11,7 +11,10 @@ from sessions import Changes, Simulation, session_of
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
+from dhcal_pin.estimation import initialization
 from dhcal_pin.measurements import MultiTargetPosition, Pose, Position, Wires
+from dhcal_pin.robot.conditions import Conditions
+from dhcal_pin.session import search
 
 
 def files(sim: Simulation, kind: type, frames: list[pin.SE3]):
@@ -147,6 +150,94 @@ def test_equal_parts_of_a_file_have_their_own_pose_of_the_base(arm, count, kind)
         ("base", 40 * i + 1) for i in range(1, count)
     ]
     assert sim.true_error(fit.chain) < 1e-4
+
+
+def turned_frame(sim: Simulation, angle: float, distance: float) -> pin.SE3:
+    """Return a motion by an angle [deg] and a distance [m]."""
+    return pin.SE3(pin.exp3(np.deg2rad(angle) * sim.direction()), distance * sim.direction())
+
+
+def moved_poses(sim: Simulation, base: pin.SE3, base_from: int, tool: pin.SE3, tool_from: int) -> Pose:
+    """Return poses of which those from some row on have another base, and those from another one a tool."""
+    data = sim.measure(Pose)
+    poses = data.poses.copy()
+    poses[base_from:] = base.homogeneous @ poses[base_from:]
+    poses[tool_from:] = poses[tool_from:] @ tool.homogeneous
+    return Pose(data.q, poses)
+
+
+@pytest.mark.parametrize(
+    ("arm", "angle", "count", "n_files"),
+    some_slow(
+        [("panda", 93, 30, 1), ("ur10", 41, 40, 2), ("xarm7", 179, 60, 1), ("ur10", 166, 30, 2)], {0, 1}
+    ),
+)
+def test_a_tool_that_turned_far_is_found(arm, angle, count, n_files):
+    sim = Simulation(arm, count, 9)
+    turned = turned_frame(sim, angle, 0.1)
+    first = count // 2 + 2
+    data = moved_poses(sim, pin.SE3.Identity(), count, turned, first)
+    parts = np.split(np.arange(count), [first] * (n_files - 1))
+    fit = calibrate(
+        sim.chain,
+        [data.take(part).replace(source=f"{i}.csv") for i, part in enumerate(parts)],
+        extend="none",
+    )
+    (event,) = session_of(fit).events
+    # Rows count from 1.
+    assert (event.kind, event.after.file, event.after.line) == ("tool", f"{n_files - 1}.csv", first + 1)
+    assert not fit.n_outliers
+    assert len(fit.verdict.reasons) == 1, fit.verdict.reasons
+    # The tool of the result is the later one.
+    before, after = session_of(fit).changes.tool.poses
+    np.testing.assert_allclose(after, np.eye(4), atol=1e-12)
+    found = pin.SE3(before).inverse()
+    assert np.linalg.norm(pin.log3(found.rotation.T @ turned.rotation)) < 1e-3
+    assert np.linalg.norm(found.translation - turned.translation) < 3e-4
+    tool = sim.tool * turned
+    assert np.linalg.norm(fit.chain.tool[:3, 3] - tool.translation) < 3e-3
+    sim.tool = tool
+    assert sim.true_error(fit.chain) < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("arm", "base_from", "tool_from"),
+    some_slow([("ur10", 20, 42), ("panda", 40, 18), ("xarm7", 30, 30), ("panda", 20, 42)], {0, 1}),
+)
+def test_base_and_tool_that_turned_far_are_told_apart(arm, base_from, tool_from):
+    """The other one of both gets no step where it stayed."""
+    sim = Simulation(arm, 60, 3)
+    base, tool = turned_frame(sim, 70, 1.5), turned_frame(sim, 120, 0.1)
+    fit = calibrate(sim.chain, moved_poses(sim, base, base_from, tool, tool_from), extend="none")
+    events = sorted((event.kind, event.after.line) for event in session_of(fit).events)
+    assert events == [("base", base_from + 1), ("tool", tool_from + 1)]
+    assert not fit.n_outliers
+    sim.tool = sim.tool * tool
+    assert sim.true_error(fit.chain) < 2e-4
+
+
+def test_measured_poses_are_carried_to_base_and_tool_of_the_end():
+    sim = Simulation("ur10", 5, 0)
+    data = sim.measure(Pose)
+    base, tool = turned_frame(sim, 60, 1.0).homogeneous, turned_frame(sim, 90, 0.1).homogeneous
+    conditions = Conditions(
+        data.q, base_motion=np.tile(base, (5, 1, 1)), tool_motion=np.tile(tool, (5, 1, 1))
+    )
+    moved = Pose(data.q, base @ data.poses @ tool).replace(recorded=conditions)
+    positions, rotations = initialization.measured_at_end(moved)
+    np.testing.assert_allclose(positions, data.positions(), atol=1e-12)
+    np.testing.assert_allclose(rotations, data.rotations(), atol=1e-12)
+
+
+def test_a_tool_of_rejected_samples_is_not_stated(monkeypatch):
+    """A search from no first values, and a fit from a wrong start, reject one of both parts."""
+    monkeypatch.setattr(search, "place_parts", lambda *args: None)
+    monkeypatch.setattr(initialization, "measured_at_end", lambda item: (item.positions(), item.rotations()))
+    sim = Simulation("panda", 40, 0)
+    data = moved_poses(sim, pin.SE3.Identity(), 40, turned_frame(sim, 41, 0.1), 25)
+    fit = calibrate(sim.chain, data, extend="none")
+    assert fit.n_outliers == 15
+    assert not session_of(fit).events
 
 
 @pytest.mark.parametrize(("count", "kind"), for_both_kinds([(1,), (2,), (6,)], {0, 3, 4}))

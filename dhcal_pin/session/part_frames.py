@@ -1,8 +1,8 @@
-"""First values of the poses of the base in the parts of a session, which may differ by large rotations.
+"""First values of the poses of base and tool in the parts of a session, which may differ by large rotations.
 
-The search for changes is linear. It does not find a base that turned by more than about 20°, such as that
-of a tracker which was set up anew. Parts of a session are its files, or consecutive samples that fit by
-themselves only.
+The search for changes is linear. It does not find a base or a tool that turned by more than about 20°, such
+as the base of a tracker which was set up anew, or another tool. Parts of a session are its files, or
+consecutive samples that fit by themselves only.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from .._typing import Array
 from ..estimation.initialization import initialize_frames
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement
-from ..robot.chain import BASE_FRAME, Chain
-from .robot_changes import Motion
+from ..robot.chain import Chain
+from .robot_changes import Motion, RobotChanges
 from .timeline import Timeline
 
-# Smallest rotation between two parts for which the base is placed in each of them [rad].
+# Smallest rotation between two parts for which base or tool are placed in each of them [rad].
 MIN_ROTATION = np.deg2rad(10.0)
-# Smallest number of samples of a part in which the base is placed.
+# Smallest number of samples of a part in which base and tool are placed.
 MIN_SAMPLES = 6
 # Number of samples at the beginning of a part to which base and tool are fitted, of consecutive samples far
 # from this fit with which the next part begins, and of parts at most.
@@ -38,10 +38,10 @@ MAX_ITERATIONS = 20
 
 def place_parts(
     problem: Problem, timeline: Timeline, starts: tuple[int, ...]
-) -> tuple[Problem, Motion] | None:
-    """Fit base and tool to each part of a session by itself; None for one part, and if no base turned far."""
-    # The problem gets the base and the tool of the last part, and the base moves where a part begins.
-    if not _is_base_free(problem) or not starts:
+) -> tuple[Problem, RobotChanges] | None:
+    """Fit base and tool to each part of a session by itself; None for one part, and if neither turned far."""
+    # The problem gets the base and the tool of the last part. What turned far moves where a part begins.
+    if not _can_turn(problem) or not starts:
         return None
     limits = (timeline.begin, *starts, np.inf)
     parts = [_samples_between(problem.data, timeline, *pair) for pair in pairwise(limits)]
@@ -50,10 +50,17 @@ def place_parts(
     errors = problem.errors
     chains = [initialize_frames(errors, part, problem.known, MAX_ITERATIONS).chain for part in parts]
     last = chains[-1]
-    poses = np.array([chain.base @ se3.inverse(last.base) for chain in chains])
-    if max(np.linalg.norm(se3.log3(pose[:3, :3])) for pose in poses) < MIN_ROTATION:
-        return None
-    return _placed(problem, last, parts[-1]), Motion(starts, poses)
+    changes = RobotChanges(
+        _motion(starts, np.array([chain.base @ se3.inverse(last.base) for chain in chains])),
+        _motion(starts, np.array([se3.inverse(last.tool) @ chain.tool for chain in chains])),
+    )
+    return None if changes.is_empty else (_placed(problem, last, parts[-1]), changes)
+
+
+def _motion(starts: tuple[int, ...], poses: Array) -> Motion:
+    """Return the motion with the poses of each part, (S, 4, 4); none if no part turned far."""
+    has_turned = np.linalg.norm(se3.log3(poses[:, :3, :3]), axis=1).max() >= MIN_ROTATION
+    return Motion(starts, poses) if has_turned else Motion()
 
 
 def _placed(problem: Problem, chain: Chain, part: tuple[Measurement, ...]) -> Problem:
@@ -69,9 +76,10 @@ def _placed(problem: Problem, chain: Chain, part: tuple[Measurement, ...]) -> Pr
     return replace(problem, errors=replace(problem.errors, chain=placed), data=data)
 
 
-def _is_base_free(problem: Problem) -> bool:
-    """Return whether the pose of the base is unknown."""
-    return any(p.error_frame == BASE_FRAME for p in problem.errors.parameters)
+def _can_turn(problem: Problem) -> bool:
+    """Return whether rotations of base or tool are unknown."""
+    frames = problem.errors.only_frames
+    return frames is not None and any(p.unit == "rad" for p in frames.parameters)
 
 
 def _samples_between(
@@ -85,7 +93,7 @@ def _samples_between(
 
 def starts_of_parts(problem: Problem, x: Array, timeline: Timeline) -> tuple[int, ...]:
     """Return the first samples of parts but the first that fit by themselves, but not to one solution."""
-    if not _is_base_free(problem):
+    if not _can_turn(problem):
         return ()
     numbers = np.sort(timeline.fitted_numbers)
     numbers = numbers[numbers >= timeline.begin]
