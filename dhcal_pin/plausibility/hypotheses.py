@@ -660,13 +660,12 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
     """Yield exchanged and shifted joint columns."""
     n, names = chain.n_joints, chain.joint_names
     for i, j in combinations(range(n), 2):
-        if chain.is_prismatic[i] == chain.is_prismatic[j]:
-            sources = list(range(n))
-            sources[i], sources[j] = j, i
-            text = f"the columns of joints {names[i]} and {names[j]} are exchanged"
-            change = JointChange.of(n, sources=sources)
-            instead = f"the order of joints {names[i]} and {names[j]}{_IN_ROBOT}"
-            yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, change, instead)
+        sources = list(range(n))
+        sources[i], sources[j] = j, i
+        text = f"the columns of joints {names[i]} and {names[j]} are exchanged"
+        change = JointChange.of(n, sources=sources)
+        instead = f"the order of joints {names[i]} and {names[j]}{_IN_ROBOT}"
+        yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, change, instead)
     if n < 3:
         return
     for key, sources, text in (

@@ -91,6 +91,33 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
     assert not diagnose_mixups(ur10, [data]).is_suspicious
 
 
+def scara(theta, d, a):
+    """SCARA whose third joint is a slide [m, rad]."""
+    alpha, zero = np.array([0.0, np.pi, 0.0, 0.0]), np.zeros(4)
+    names, is_slide = ("j1", "j2", "j3", "j4"), np.arange(4) == 2
+    lengths = map(np.array, (d, a))
+    return Chain.from_dh(
+        DHTable("standard", names, is_slide, theta, *lengths, alpha, zero, zero - np.inf, zero + np.inf)
+    )
+
+
+@pytest.mark.parametrize("other", [0, 1, 3])
+def test_the_exchanged_column_of_a_slide_is_named_and_mended(other):
+    actual = scara(np.array([0.0, 0.01, 0.0, 0.0]), (0.401, 0, 0, 0.1), (0.3005, 0.2491, 0, 0))
+    base, tool = frames()
+    rng = np.random.default_rng(other)
+    q = rng.uniform([-2, -2, 0, -3], [2, 2, 0.2, 3], (40, 4))
+    data = Pose.simulate(actual.with_base_and_tool(base, tool), q, Noise(1e-4, 1e-4), rng)
+    order = np.arange(4)
+    order[[2, other]] = other, 2
+    nominal = scara(np.zeros(4), (0.4, 0, 0, 0.1), (0.3, 0.25, 0, 0))
+    wrong = with_joints(data, lambda q: q[:, order])
+    keys = [each.key for each in diagnose_mixups(nominal, [wrong]).hypotheses]
+    key = ":".join(["swap", *(f"j{j + 1}" for j in sorted((2, other)))])
+    assert key in keys
+    np.testing.assert_allclose(mend(nominal, wrong, key).q, data.q)
+
+
 def test_a_reversed_axis_of_the_robot_has_the_effect_of_a_wrong_sign(ur10):
     """The remedies give a robot for the joint values, or one for those with the change."""
     data = measured(Position)
