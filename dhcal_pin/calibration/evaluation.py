@@ -37,9 +37,9 @@ from ..robot.chain import Chain
 MIN_SAMPLES = 10
 # The error of a wrong measurement before a calibration is at least this fraction of that after it.
 MIN_RATIO_BEFORE = 0.5
-# Probability that chance makes a robot appear better that is not, and the quantile of Student's t with this
-# probability and one degree of freedom. Those with more degrees of freedom are closer to 0.
-MAX_CHANCE, MIN_T = 0.025, -12.71
+# Probability that chance makes a robot appear better that is not, of the squared errors and of their fourth
+# roots. The quantiles of Student's t with one degree of freedom are -63.7 and -15.9; others are closer to 0.
+MAX_CHANCES, MIN_T = (0.005, 0.02), -63.7
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
@@ -297,29 +297,34 @@ class PairedErrors:
 
     @property
     def t(self) -> float:
-        """Student's t of the paired change of the fourth root of the squared error; NaN if unknown.
-
-        It is negative if the error fell. Squared errors of few samples are far from normal, and one large
-        one hides the change of all others. The fourth root of a chi-square with one to three degrees of
-        freedom is nearly normal: D. M. Hawkins and R. A. J. Wixley, A Note on the Transformation of
-        Chi-Squared Variables to Normality, The American Statistician 40, 1986.
-        """
-        change = self.after**0.25 - self.before**0.25
-        if len(change) < 2:
-            return np.nan
-        error = np.std(change, ddof=1) / np.sqrt(len(change))
-        return float(np.mean(change) / error) if error > 0 else 0.0
+        """Student's t of the paired change of the squared error: negative if it fell; NaN if unknown."""
+        return _student_t(self.after - self.before)
 
     @property
     def is_better(self) -> bool:
-        """Whether the RMS error fell, and errors of robots that are equally wrong rarely change so much."""
+        """Whether the RMS error fell, and errors of robots that are equally wrong rarely change so much.
+
+        One large squared error of few samples hides the change of all others, as they are far from normal.
+        The fourth root of a chi-square with one to three degrees of freedom is nearly normal: D. M. Hawkins
+        and R. A. J. Wixley, A Note on the Transformation of Chi-Squared Variables to Normality, The American
+        Statistician 40, 1986. Both are tested.
+        """
         if self.ratio >= 1 or len(self.before) < 2:
             return False
-        if self.t < MIN_T:
+        t = self.t, _student_t(self.after**0.25 - self.before**0.25)
+        if min(t) < MIN_T:
             return True
         from scipy.special import stdtrit  # lazy import: slow
 
-        return bool(self.t < stdtrit(len(self.before) - 1, MAX_CHANCE))
+        return bool(np.any(t < stdtrit(len(self.before) - 1, MAX_CHANCES)))
+
+
+def _student_t(change: Array) -> float:
+    """Return Student's t of the mean of changes; NaN for fewer than two."""
+    if len(change) < 2:
+        return np.nan
+    error = np.std(change, ddof=1) / np.sqrt(len(change))
+    return float(np.mean(change) / error) if error > 0 else 0.0
 
 
 @frozen

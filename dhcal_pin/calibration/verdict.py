@@ -108,8 +108,8 @@ MAX_SAME_ORIENTATION = 0.1
 MAX_FRAME_ITERATIONS = 20
 # Largest number of further iterations that are tried where a fit did not converge.
 MAX_CONTINUED = 500
-# A calibrated robot is worse if its held-out errors exceed those of the nominal one by this many standard
-# errors, and their squares by this many times what the uncertainty of its parameters explains.
+# A calibrated robot is worse if its squared held-out errors exceed those of the nominal one by this many
+# standard errors, and by this many times what the uncertainty of its parameters explains.
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # RMS error of the nominal robot, as a fraction of the workspace, of values that were computed, not measured.
 MAX_COMPUTED_ERROR = 2e-5

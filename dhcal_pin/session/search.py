@@ -877,11 +877,11 @@ class _Search:
         for first in steps:
             others = [c for c in self.causes if c.shape != Step(first)]
             number, two = self._second_robot(rows, others, block, first)
-            # One robot of which everything but the geometry of the arm has changed must not fit as well.
-            changed = self.solve(rows, [*self.causes, *self._steps_of_all(number)])
-            gain = count * float(np.mean(np.log(changed.noise / two.noise)))
-            is_explained = self._gain_of_side(changed, two, number, len(sizes)) > MIN_ROBOT_GAIN
-            if is_explained and gain > max(needed, best[0] if best else 0.0):
+            # One robot must not fit as well, nor one of which everything but the geometry of the arm changed.
+            rivals = one, self.solve(rows, [*self.causes, *self._steps_of_all(number)])
+            gain = count * min(float(np.mean(np.log(each.noise / two.noise))) for each in rivals)
+            of_side = min(self._gain_of_side(each, two, number, len(sizes)) for each in rivals)
+            if of_side > MIN_ROBOT_GAIN and gain > max(needed, best[0] if best else 0.0):
                 best = gain, number, two
         if best is None:
             return None

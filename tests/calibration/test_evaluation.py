@@ -6,7 +6,7 @@ from scipy.stats import binom
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import Accuracy
-from dhcal_pin.calibration.evaluation import MAX_CHANCE, PairedErrors
+from dhcal_pin.calibration.evaluation import MAX_CHANCES, PairedErrors
 
 
 def test_standard_error_of_rms_matches_scatter_over_repeats():
@@ -66,7 +66,7 @@ def paired_errors(rng, n, shape, ratio=1.0):
 def test_robots_that_are_equally_wrong_rarely_appear_better(n, shape):
     rng, n_trials = np.random.default_rng(n), 2000
     count = sum(paired_errors(rng, n, shape).is_better for _ in range(n_trials))
-    assert count <= binom.isf(1e-4, n_trials, MAX_CHANCE)
+    assert count <= binom.isf(1e-4, n_trials, sum(MAX_CHANCES))
 
 
 @pytest.mark.parametrize(
