@@ -94,11 +94,9 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
 def scara(theta, d, a):
     """SCARA whose third joint is a slide [m, rad]."""
     alpha, zero = np.array([0.0, np.pi, 0.0, 0.0]), np.zeros(4)
-    names, is_slide = ("j1", "j2", "j3", "j4"), np.arange(4) == 2
-    lengths = map(np.array, (d, a))
-    return Chain.from_dh(
-        DHTable("standard", names, is_slide, theta, *lengths, alpha, zero, zero - np.inf, zero + np.inf)
-    )
+    names, is_slide, limits = ("j1", "j2", "j3", "j4"), np.arange(4) == 2, np.full(4, np.inf)
+    rows = theta, np.array(d), np.array(a), alpha, zero
+    return Chain.from_dh(DHTable("standard", names, is_slide, *rows, -limits, limits))
 
 
 @pytest.mark.parametrize("other", [0, 1, 3])
