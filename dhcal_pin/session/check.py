@@ -600,7 +600,8 @@ class _CheckModel:
         total = float(_log_sums(weights[:, None])[0])
         if total > limit:
             weights = self._without_right_samples(weights)
-        shares = np.exp(weights - _log_sums(weights[:, None])[0])
+        # What excluded samples explained is no evidence for others.
+        shares = np.exp(weights - total)
         hypotheses = [
             self._hypothesis(block, *each, share=float(share))
             for block, *each, share in zip(self.blocks, values, likelihoods, shares, strict=False)
