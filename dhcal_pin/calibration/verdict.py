@@ -67,8 +67,8 @@ MAX_USUAL_DISPLACEMENT, MAX_DISPLACEMENT = 12.0, 16.0
 # belong together. The first of image coordinates depends on the type of arm.
 MAX_USUAL_ERROR = {"m": 0.02, "rad": 0.1}
 MAX_ERROR = {"m": 0.05, "rad": 0.3, "px": 50.0}
-# Errors of hold-out samples of this size do not belong to the fit, with the same units. A fit that knows
-# nothing leaves the size of the workspace, and the zeros of a hand-built arm a tenth of it.
+# Errors of hold-out samples of this size do not belong to the fit, with the same units. Wrong units
+# or rows leave errors as large as the workspace, and wrong zeros of a hand-built arm a tenth of it.
 MAX_HOLDOUT_ERROR = {"m": 0.3, "rad": 1.0}
 # Longest tool [m] that is believed if measured positions are farther from each other than the tip can be.
 MAX_TOOL = 1.0

@@ -386,7 +386,7 @@ class _Search:
                 yield from self._scores(fit, blocks, shapes, products)
 
     def _follows_configuration(self, i: int) -> bool:
-        """Return whether a function of the configuration explains as much as a cause and what it explains."""
+        """Return whether a function of the configuration explains the samples as well in place of a cause."""
         # Errors of the arm that the model does not contain depend on the configuration. Along a smooth path
         # they change slowly over time, too.
         without = copy.copy(self)
