@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from itertools import combinations, permutations, product
+from itertools import combinations, pairwise, permutations, product
 from typing import Literal, Protocol
 
 import numpy as np
@@ -44,9 +44,9 @@ from .displacement import workspace_radius
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
 # Beginnings of the keys of hypotheses about the joint columns.
-JOINT_CHANGES = ("sign", "zero", "ratio", "swap", "columns", "joint", "joints")
+JOINT_CHANGES = ("sign", "zero", "ratio", "coupling", "swap", "columns", "joint", "joints")
 # Kinds of changes that the controller may keep: the robot is then for joint values with the change.
-LASTING_CHANGES = ("sign", "zero", "ratio", "swap", "columns")
+LASTING_CHANGES = ("sign", "zero", "ratio", "coupling", "swap", "columns")
 # Sign between the keys of two mistakes.
 _AND = "+"
 # Name of all joints in a key.
@@ -77,12 +77,10 @@ class Change(Protocol):
 
 @frozen
 class JointChange:
-    """Other joint columns: q_j becomes sign_j · factor_j · q_source_j + offset_j."""
+    """Other joint values: q becomes M·q + o."""
 
-    sources: tuple[int, ...]  # Column that holds joint j, for each of the n joints
-    signs: tuple[int, ...]  # 1 or -1 for each joint
-    offsets: tuple[float, ...]  # Summand for each joint [rad or m]
-    factors: tuple[float, ...]  # Factor of the unit for each joint
+    matrix: tuple[tuple[float, ...], ...]  # M, shape (n, n)
+    offsets: tuple[float, ...]  # o, shape (n,) [rad or m]
 
     @classmethod
     def of(
@@ -90,35 +88,34 @@ class JointChange:
         n: int,
         *,
         sources: Sequence[int] | None = None,
-        signs: Sequence[int] | None = None,
-        offsets: Sequence[float] | None = None,
         factors: Sequence[float] | None = None,
+        offsets: Sequence[float] | None = None,
+        coupling: tuple[int, int, float] | None = None,
     ) -> JointChange:
-        """Make a change of n joints in which everything that is not given stays as it is."""
-        return cls(
-            tuple(sources if sources is not None else range(n)),
-            tuple(signs if signs is not None else [1] * n),
-            tuple(offsets if offsets is not None else [0.0] * n),
-            tuple(factors if factors is not None else [1.0] * n),
-        )
+        """Make a change of n joints in which everything that is not given stays as it is.
+
+        `sources` (n,) are the columns that hold the joints. `coupling` is a joint, another one, and the
+        multiple of the other one's values that is added.
+        """
+        matrix = np.eye(n)[list(sources if sources is not None else range(n))]
+        matrix *= np.reshape(factors if factors is not None else np.ones(n), (n, 1))
+        if coupling:
+            joint, other, multiple = coupling
+            matrix[joint, other] = multiple
+        return cls(tuple(map(tuple, matrix.tolist())), tuple(offsets if offsets is not None else [0.0] * n))
 
     @cached_property
     def joints(self) -> frozenset[int]:
-        """Numbers of the joints that change; changes of different joints commute."""
-        values = zip(self.sources, self.signs, self.offsets, self.factors, strict=True)
-        return frozenset(j for j, value in enumerate(values) if value != (j, 1, 0.0, 1.0))
-
-    @cached_property
-    def _columns(self) -> tuple[Array, Array, Array]:
-        """Numbers of the columns, their factors with signs, and their summands."""
-        return np.array(self.sources), np.array(self.signs) * self.factors, np.array(self.offsets)
+        """Numbers of the joints that change or are used; changes of different joints commute."""
+        is_changed = np.array(self.matrix) != np.eye(len(self.offsets))
+        used = is_changed.any(0) | is_changed.any(1) | (np.array(self.offsets) != 0)
+        return frozenset(np.flatnonzero(used).tolist())
 
     def apply(self, item: Measurement) -> Measurement | None:
         """Return the measurements at the changed joint positions."""
         if not item.configurations_per_row:
             return None
-        sources, factors, offsets = self._columns
-        return item.resample(item.configurations()[:, sources] * factors + offsets)
+        return item.resample(item.configurations() @ np.transpose(self.matrix) + self.offsets)
 
 
 @frozen
@@ -459,13 +456,13 @@ def _log_contact_jacobian(chain: Chain, item: Measurement, change: JointChange) 
     """Return the logarithm of the change of the joint values that hold the tool at touched points."""
     # Joint values are what a contact measures: a small factor makes their noise small, too. The combinations
     # of them that move the tool count, but for those that determine the points.
-    factors = np.array(change.factors)
-    if (factors == 1).all():
+    matrix = np.array(change.matrix)
+    if np.allclose(matrix @ matrix.T, np.eye(len(matrix))):
         return 0.0
-    jacobian = tool_pose_and_jacobian(chain, item.configurations() * factors)[1][:, :3]
+    jacobian = tool_pose_and_jacobian(chain, item.configurations() @ matrix.T)[1][:, :3]
     before, after = (
         np.linalg.slogdet(each @ np.swapaxes(each, 1, 2) + _MIN_MOTION**2 * np.eye(3))[1]
-        for each in (jacobian, jacobian * factors)
+        for each in (jacobian, jacobian @ matrix)
     )
     share = 1 - len(item.instrument_parameters) / (item.residual_dim * len(item.rows))
     return 0.5 * max(0.0, share) * float(np.sum(after - before))
@@ -642,18 +639,27 @@ def inner_revolute_joints(chain: Chain) -> list[int]:
 
 
 def _joint_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
-    """Yield wrong signs and zeros."""
+    """Yield wrong signs, zeros and couplings."""
     n = chain.n_joints
     for j, name in enumerate(chain.joint_names):
         signs = [-1 if i == j else 1 for i in range(n)]
         text = f"the sign of joint {name} is wrong"
-        change = JointChange.of(n, signs=signs)
+        change = JointChange.of(n, factors=signs)
         yield Hypothesis(f"sign:{name}", text, change, f"the axis of joint {name}{_IN_ROBOT}")
-    change = JointChange.of(n, signs=[-1] * n)
+    change = JointChange.of(n, factors=[-1] * n)
     text = "the signs of all joints are wrong"
     yield Hypothesis(f"sign:{ALL}", text, change, f"the axes of all joints{_IN_ROBOT}")
     for j, wrong in product(inner_revolute_joints(chain), (90, -90, 180)):
         yield zero_hypothesis(chain, j, wrong)
+    revolute = revolute_joints(chain)
+    for (other, j), (sign, done) in product(pairwise(revolute), ((1, "subtracted from"), (-1, "added to"))):
+        name, text = chain.joint_names[j], "-+"[sign > 0] + chain.joint_names[other]
+        yield Hypothesis(
+            f"coupling:{name}:{text}",
+            f"the values of joint {text[1:]} are {done} those of joint {name}, as with coupled joints",
+            JointChange.of(n, coupling=(j, other, sign)),
+            f"the coupling of joint {name} in the controller",
+        )
 
 
 def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:

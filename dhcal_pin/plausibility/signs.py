@@ -227,7 +227,7 @@ def _fit_signs(chain: Chain, samples: Sequence[Measurement]) -> dict[tuple[int, 
     """Compute the evidence of each hypothesis."""
     fits = {}
     for turned in _hypotheses(chain):
-        change = JointChange.of(chain.n_joints, signs=_signs(chain, turned).astype(int).tolist())
+        change = JointChange.of(chain.n_joints, factors=_signs(chain, turned).tolist())
         changed = Hypothesis("", "", change).apply(samples)
         assert changed is not None
         fits[turned] = fit_evidence(chain, changed, HAND_BUILT)

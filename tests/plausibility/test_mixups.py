@@ -56,6 +56,10 @@ def flipped(j):
     return lambda q: q * np.where(np.arange(6) == j, -1, 1)
 
 
+def coupled(i, j, multiple):
+    return lambda q: q + multiple * q[:, [i]] * (np.arange(6) == j)
+
+
 NAMES = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
@@ -72,6 +76,8 @@ MIXUPS = [
     (np.rad2deg, "joints:deg-not-rad"),
     (np.deg2rad, "joints:rad-not-deg"),
     (lambda q: np.where(np.arange(6) == 3, np.rad2deg(q), q), "joint:wrist_1_joint:deg-not-rad"),
+    (coupled(1, 2, 1), "coupling:elbow_joint:-shoulder_lift_joint"),
+    (coupled(4, 5, -1), "coupling:wrist_3_joint:+wrist_2_joint"),
 ]  # fmt: skip
 
 
