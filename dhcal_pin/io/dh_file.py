@@ -44,6 +44,8 @@ _JOINT_TYPES = ("revolute", "prismatic", "continuous")
 _CSV_HEADER = "joint,type,theta[deg],d[mm],a[mm],alpha[deg]"
 # Largest entry of a table [m or rad]; a larger one has the wrong unit.
 _MAX_ENTRY = 1e4
+# Largest angle of a link [rad]; degrees that were read as radians are larger.
+_MAX_ANGLE = 4 * math.pi
 # Largest number of joints.
 _MAX_JOINTS = 250
 
@@ -223,6 +225,8 @@ def _build_table(
         where = f"{source}: joint {name!r}"
         for key in (*_UNITS, *_LIMITS):
             value = columns[key][row]
+            if _UNITS.get(key) is ANGLES and abs(value) > _MAX_ANGLE:
+                raise FileFormatError(f"{where}: {key} is {value:g} rad, more than two turns; check its unit")
             if math.isfinite(value) and abs(value) > _MAX_ENTRY:
                 raise FileFormatError(
                     f"{where}: {key} is {value:g} m or rad, beyond ±{_MAX_ENTRY:g}; check its unit"

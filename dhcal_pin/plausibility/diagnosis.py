@@ -94,9 +94,12 @@ class Diagnosis:
         """What to do about it; only with a hypothesis.
 
         A mistake in the robot file has the same effect as one in all measurements. If only some of them have
-        it, the others fit the robot file.
+        it, the others fit the robot file. A hypothesis about the robot file alone has no key.
         """
         where = f"@{self.source}" if self.source else ""
+        first = self.hypotheses[0]
+        if not first.key:
+            return f"Correct {first.instead}."
         if self.lines:
             if not self.source:
                 return "Correct these lines."
@@ -107,7 +110,7 @@ class Diagnosis:
         instead = ", or ".join(dict.fromkeys(each.instead for each in self.hypotheses if each.instead))
         if where or not instead:
             return f"Correct the measurements, or {add}"
-        if self.hypotheses[0].is_instead:
+        if first.is_instead:
             return f"Correct {instead}. If they are right, correct the measurements, or {add}"
         values = "joint values" if all(each.concerns_joints for each in self.hypotheses) else "measurements"
         aim = "To keep the robot's lengths"

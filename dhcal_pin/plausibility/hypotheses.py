@@ -390,7 +390,7 @@ def _with_poses(item: PoseMeasurement, poses: Array) -> PoseMeasurement:
 class Hypothesis:
     """Assumption about what was mixed up."""
 
-    key: str  #: Short name, by which users select the change.
+    key: str  #: Short name, by which users select the change; empty if only the robot file may be wrong.
     description: str  #: What was mixed up, as a clause.
     change: Change  #: Change that undoes it.
     #: What may be wrong instead of the measurements, with the same effect; empty if nothing may.

@@ -18,6 +18,8 @@ zeros that are wrong by tens of degrees a robot fits the measurements after a wr
 measured angle that explains far more than the other hypotheses refutes them, but only a decisive one is
 reported.
 
+If none is, mistakes in the DH table of the robot are tried (`dh_tables`).
+
 If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
 closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
 the nominal robot much nearer: with errors of decimetres, a robot can fit exactly what a wrong hypothesis
@@ -93,6 +95,10 @@ def _diagnose(
     diagnosis, trial = _find_single(chain, items, sets, report, lengths)
     if trial is None:
         return diagnosis
+    from .dh_tables import find_wrong_table  # lazy import: few measurements are suspicious
+
+    if table := find_wrong_table(chain, trial.samples, sets, trial.before):
+        return table
     # The mistake may be in one of several measurements.
     if len(items) > 1 and not trial.single.hypotheses:
         separate = [(item, _find_one_or_two(chain, item, sets, report)) for item in items]

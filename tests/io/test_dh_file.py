@@ -143,6 +143,7 @@ def change(old: str, new: str) -> tuple[str, str]:
             ["251 joints, more than 250"],
         ),
         (change("a = 325.0", "a = 3.25e9"), ["'shoulder'", "a is 3.25e+06 m", "unit"]),
+        (change('angle = "deg"', 'angle = "rad"'), ["'lift'", "theta is 30 rad, more than two turns"]),
         (change("upper = 0.0", "upper = nan"), ["'lift'", "upper = nan", "finite"]),
         (change("upper = 0.0", "upper = -300.0"), ["'lift'", "lower is above upper", "swap"]),
         (change('"prismatic"', '"linear"'), ["'lift'", "'linear'", '"revolute", "prismatic"']),

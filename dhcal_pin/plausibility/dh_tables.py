@@ -1,0 +1,87 @@
+"""Mistakes in a DH table: the other convention, exchanged columns, angles in degrees that are radians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .._typing import Array
+from ..measurements.base import Measurement
+from ..robot.chain import Chain
+from ..robot.dh import Convention, DHTable
+from ..units import ANGLES
+from .diagnosis import MIN_LOG_RATIO, Diagnosis
+from .evidence import Evidence, fit_evidence
+from .hypotheses import Hypothesis, JointChange
+
+# Convention of a table by the default parameter set of its chain.
+_CONVENTIONS: dict[str, Convention] = {"dh": "standard", "modified-dh": "modified"}
+# Origins differ from those of a table by less than this [m or 1].
+_TOLERANCE = 1e-9
+
+
+def find_wrong_table(
+    chain: Chain, samples: Sequence[Measurement], sets: str, before: Evidence
+) -> Diagnosis | None:
+    """Look for a mistake in the DH table of a robot that explains samples; None without one."""
+    table = _read_table(chain)
+    if table is None:
+        return None
+    other = "modified" if table.convention == "standard" else "standard"
+    found = []
+    for text, instead, change in _MISTAKES:
+        mended = replace(Chain.from_dh(change(table)), parameters=chain.parameters)
+        after = fit_evidence(mended, samples, sets)
+        hypothesis = Hypothesis("", text.format(other), JointChange.of(chain.n_joints), instead.format(other))
+        found.append(Diagnosis(before, (hypothesis,), after, gain=after.log - before.log))
+    best = max(found, key=lambda each: each.log)
+    return best if best.is_certain and best.gain >= MIN_LOG_RATIO else None
+
+
+def _with_other_convention(table: DHTable) -> DHTable:
+    """Return the rows of a table in the other convention."""
+    return replace(table, convention="modified" if table.convention == "standard" else "standard")
+
+
+# What is wrong in the file, what to correct, and the table without the mistake.
+_MISTAKES: tuple[tuple[str, str, Callable[[DHTable], DHTable]], ...] = (
+    (
+        "the DH table is in the {0} convention, but was read in the other one",
+        'convention in the robot file to "{0}"',
+        _with_other_convention,
+    ),
+    (
+        "a and d of the DH table are exchanged",
+        "a and d in the robot file",
+        lambda table: replace(table, a=table.d, d=table.a),
+    ),
+    (
+        "the angles of the DH table are radians that were read as degrees",
+        "the angles in the robot file",
+        lambda table: replace(table, theta=ANGLES["deg"] * table.theta, alpha=ANGLES["deg"] * table.alpha),
+    ),
+)
+
+
+def _read_table(chain: Chain) -> DHTable | None:
+    """Return the table of a chain that was made from one; None for other chains."""
+    convention = _CONVENTIONS.get(chain.parameters)
+    if convention is None or len(chain.moving_joints) != chain.n_joints:
+        return None
+    is_standard = convention == "standard"
+    origins = chain.link_transforms[1:] if is_standard else chain.link_transforms[:-1]
+    rotations, positions = origins[:, :3, :3], origins[:, :3, 3]
+    if is_standard:
+        theta = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
+        alpha = np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2])
+        d, a = positions[:, 2], positions[:, 0] * np.cos(theta) + positions[:, 1] * np.sin(theta)
+    else:
+        theta = np.arctan2(-rotations[:, 0, 1], rotations[:, 0, 0])
+        alpha = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
+        d, a = positions[:, 2] * np.cos(alpha) - positions[:, 1] * np.sin(alpha), positions[:, 0]
+    rows: tuple[Array, ...] = (theta, d, a, alpha, np.zeros(chain.n_joints))
+    table = DHTable(convention, chain.joint_names, chain.prismatic, *rows, chain.lower, chain.upper)
+    read = table.origins()[1:] if is_standard else table.origins()[:-1]
+    return table if np.allclose(read, origins, 0, _TOLERANCE) else None
