@@ -224,6 +224,9 @@ def recheck(
         )
     if noise is not None:
         data = [_with_noise(item, noise) for item in data]
+    elif (least := _calibration_noise(uncertainty, data)) is not None:
+        # The errors that the model of the arm lacks are in these measurements, too.
+        data = [_with_least_noise(item, least) if item.has_stated_sigma else item for item in data]
     model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
     return _answer(model, *model.judged(), size)
 

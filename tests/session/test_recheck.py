@@ -343,6 +343,27 @@ def test_a_noise_that_is_larger_than_stated_is_not_ok():
     assert any("Either the noise is larger" in result.reasons[0] for result in found)
 
 
+@pytest.mark.parametrize("n_seeds", some_slow([2, 12], {0}))
+@pytest.mark.parametrize("kind", [Position, Pose])
+@pytest.mark.parametrize("factor", [2, 3])
+def test_noise_that_the_calibration_showed_is_no_change_whatever_is_stated(factor, kind, n_seeds):
+    """Stated standard deviations are too small, at the calibration and at the check."""
+
+    def state(data):
+        names = ("sigma", "rotation_sigma") if kind is Pose else ("sigma",)
+        return data.replace(**{name: getattr(data, name) / factor for name in names})
+
+    for arm, seed in product(("ur10", "panda"), range(n_seeds)):
+        sim = Simulation(arm, 60, seed)
+        data = state(measured(sim, sim.q, kind, True))
+        fit = calibrate(sim.chain, data, extend="none", session="off")
+        q = sim.rng.uniform(-1.5, 1.5, (10, sim.chain.n_joints))
+        for what in ("nothing", "base"):
+            keywords, name = changed(sim, what)
+            check = state(measured(sim, q, kind, True, **keywords))
+            assert is_right(recheck(fit.chain, [check], fit.uncertainty), name)
+
+
 @pytest.mark.parametrize("n_seeds", some_slow([3, 30], {0}))
 @pytest.mark.parametrize(
     ("factor", "verdicts"), [(1, {"ok"}), (2, {"ok", "cannot say"}), (5, {"cannot say"})]
