@@ -425,7 +425,7 @@ class Evidence(FittedModel):
         sources = {item.source for item in self.holdout}
         source = found.source or (sources.pop() if len(sources) == 1 else "")
         # The fitted samples show that the robot file is right.
-        hypotheses = tuple(replace(each, instead="", is_instead=False) for each in found.hypotheses)
+        hypotheses = tuple(replace(each, instead="") for each in found.hypotheses if each.key)
         found = replace(found, source=source, hypotheses=hypotheses)
         return _with_servos(self, found) if hypotheses else None
 

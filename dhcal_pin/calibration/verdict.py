@@ -39,6 +39,7 @@ from ..plausibility.diagnosis import Diagnosis, is_suspicious
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
+from ..plausibility.robot_files import LARGEST_ARM, sum_of_links
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
 from . import cameras
@@ -198,7 +199,7 @@ def judge(fit: Evidence) -> Verdict:
     findings = _unmoved_joints(fit) or _unrelated_images(fit) or _few_images(fit)
     if not any(finding.status == "refused" for finding in findings):
         findings += [
-            *_mixups(fit.diagnosis),
+            *(_mixups(fit.diagnosis) or _impossible_size(fit)),
             *_wrong_joint_values(fit),
             *_board_size(fit),
             *_signs(fit),
@@ -448,6 +449,17 @@ def _sufficient_iterations(fit: Evidence) -> int | None:
         if minimize(fit.problem, fit.method, fit.solution.x, limit, **options).converged:
             return limit
     return None
+
+
+def _impossible_size(fit: Evidence) -> list[Finding]:
+    """Refuse a robot that is larger than any arm, whether measurements agree with it or not."""
+    if (size := sum_of_links(fit.errors.chain)) <= LARGEST_ARM:
+        return []
+    text = (
+        f"The links of the robot are {size:.0f} m long together. Correct the unit of the lengths in the "
+        "robot file, and that of the measurements if it is the same."
+    )
+    return [Finding("refused", text)]
 
 
 def _wrong_joint_values(fit: Evidence) -> list[Finding]:

@@ -77,8 +77,6 @@ class Diagnosis:
         text = f"In {' of '.join(where)}, {first}" if where else f"{first[0].upper()}{first[1:]}"
         if others:
             text += f" (or {' or '.join(others)})"
-        if self.hypotheses[0].is_instead:
-            return f"{text}."
         for before, after, unit in (
             (self.before.length_scale, self.after.length_scale, "m"),
             (self.before.angle_scale, self.after.angle_scale, "rad"),
@@ -110,8 +108,6 @@ class Diagnosis:
         instead = ", or ".join(dict.fromkeys(each.instead for each in self.hypotheses if each.instead))
         if where or not instead:
             return f"Correct the measurements, or {add}"
-        if first.is_instead:
-            return f"Correct {instead}. If they are right, correct the measurements, or {add}"
         values = "joint values" if all(each.concerns_joints for each in self.hypotheses) else "measurements"
         aim = "To keep the robot's lengths"
         if any(each.changes_joints for each in self.hypotheses):

@@ -13,7 +13,6 @@ import difflib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from itertools import combinations, pairwise, permutations, product
 from typing import Literal, Protocol
@@ -39,7 +38,6 @@ from ..robot.inverse_kinematics import MAX_POSE_DIFFERENCE, reach_poses, tool_po
 from ..robot.joint_path import joint_path
 from ..session.facts import MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
-from .displacement import workspace_radius
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
 QUATERNION_ORDERS: tuple[QuaternionNotation, ...] = ("xyzw", "wxyz")
@@ -53,8 +51,6 @@ _AND = "+"
 ALL = "all"
 # Place of what may be wrong in place of the measurements.
 _IN_ROBOT = " in the robot file"
-# RMS distances of the flange from its mean position beyond which the unit of a robot is wrong [m].
-_SMALLEST_ARM, _LARGEST_ARM = 0.01, 50.0
 # Number of coordinates of the instrument and of the target.
 N_PLACES = 6
 # Motion of the tool per unit of a joint that counts as none [m].
@@ -395,7 +391,6 @@ class Hypothesis:
     change: Change  #: Change that undoes it.
     #: What may be wrong instead of the measurements, with the same effect; empty if nothing may.
     instead: str = ""
-    is_instead: bool = False  #: Whether the robot by itself shows that this is wrong.
 
     @property
     def offsets(self) -> dict[int, float]:
@@ -497,7 +492,6 @@ def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
         BothChanges(first, second),
         # If only one of them may be elsewhere, the measurements have to be corrected all the same.
         f"{first.instead} and {second.instead}" if first.instead and second.instead else "",
-        first.is_instead and second.is_instead,
     )
 
 
@@ -699,26 +693,18 @@ def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypo
             key, label = (f"joint:{name}", f"joint {name}") if is_single else ("joints", f"all {kind} joints")
             for true, read, value in ((large, small, 1 / factor), (small, large, factor)):
                 factors = [value if i in group else 1.0 for i in range(n)]
-                text = f"the values of {label} are {_misread(true, read, value)}"
+                text = f"the values of {label} are {describe_misread(true, read, value)}"
                 yield Hypothesis(f"{key}:{true}-not-{read}", text, JointChange.of(n, factors=factors))
-    # The tool may be a first estimate, from measurements with a wrong unit.
-    radius = workspace_radius(replace(chain, tool=np.eye(4)))
     for true, read in (*permutations(("m", "mm", "in"), 2), *permutations(("mm", "cm"), 2)):
         factor = LENGTHS[read] / LENGTHS[true]
-        is_robot = radius < _SMALLEST_ARM if factor < 1 else radius > _LARGEST_ARM
-        text = (
-            f"the lengths of the robot are {_misread(read, true, 1 / factor)}"
-            if is_robot
-            else f"measured lengths are {_misread(true, read, factor)}"
-        )
-        key, instead = f"lengths:{true}-not-{read}", f"the lengths{_IN_ROBOT}"
-        yield Hypothesis(key, text, LengthChange(factor), instead, is_robot)
+        text = f"measured lengths are {describe_misread(true, read, factor)}"
+        yield Hypothesis(f"lengths:{true}-not-{read}", text, LengthChange(factor), f"the lengths{_IN_ROBOT}")
     numbers = "rotation vectors" if _notations(data) & _COMPUTED else "Euler angles"
-    text = f"measured {numbers} are {_misread('rad', 'deg', ANGLES['deg'])}"
+    text = f"measured {numbers} are {describe_misread('rad', 'deg', ANGLES['deg'])}"
     yield Hypothesis("rotations:rad-not-deg", text, RotationUnit())
 
 
-def _misread(true: str, read: str, factor: float) -> str:
+def describe_misread(true: str, read: str, factor: float) -> str:
     """Describe values that a factor corrects; their unit in the file may be another one than `read`."""
     return f"{_times(factor)}, as if {true} had been read as {read}"
 
@@ -735,7 +721,7 @@ def _axis_unit_hypotheses(data: Sequence[Measurement]) -> Iterator[Hypothesis]:
         factor = LENGTHS[true] / LENGTHS[read]
         expected = max(np.delete(spreads, i)) * np.sqrt(factor)
         if (spreads[i] < expected) if factor < 1 else (spreads[i] > expected):
-            text = f"measured {axis} is {_misread(true, read, 1 / factor)}"
+            text = f"measured {axis} is {describe_misread(true, read, 1 / factor)}"
             yield Hypothesis(f"{axis}:{true}-not-{read}", text, AxisScale(i, factor))
 
 

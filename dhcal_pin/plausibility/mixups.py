@@ -18,7 +18,8 @@ zeros that are wrong by tens of degrees a robot fits the measurements after a wr
 measured angle that explains far more than the other hypotheses refutes them, but only a decisive one is
 reported.
 
-If none is, mistakes in the DH table of the robot are tried (`dh_tables`).
+If none is, mistakes in the DH table of the robot are tried. The unit of a robot of impossible size is tried
+first (`robot_files`).
 
 If none is, all pairs of hypotheses are compared by the misfit of the nominal robot, and the evidence of the
 closest ones is computed. Single hypotheses that need large errors of the robot remain only if no pair brings
@@ -51,6 +52,7 @@ from ..robot.chain import Chain
 from .diagnosis import NO_EVIDENCE, Diagnosis, is_suspicious, leaves_residuals
 from .drawn_samples import comparable_items, draw_samples, fit_samples
 from .evidence import MANUFACTURED
+from .robot_files import find_wrong_lengths, find_wrong_table
 
 if TYPE_CHECKING:
     from .trials import Trial
@@ -95,10 +97,6 @@ def _diagnose(
     diagnosis, trial = _find_single(chain, items, sets, report, lengths)
     if trial is None:
         return diagnosis
-    from .dh_tables import find_wrong_table  # lazy import: few measurements are suspicious
-
-    if table := find_wrong_table(chain, trial.samples, sets, trial.before):
-        return table
     # The mistake may be in one of several measurements.
     if len(items) > 1 and not trial.single.hypotheses:
         separate = [(item, _find_one_or_two(chain, item, sets, report)) for item in items]
@@ -159,6 +157,9 @@ def _find_single(
     """Look for one mistake in all of the measurements; return what was tried if it is not certain."""
     samples, neighbourhood = draw_samples(data)
     before = fit_samples(chain, samples, sets)
+    # A long tool can take the place of links without lengths.
+    if lengths_of_robot := find_wrong_lengths(chain, samples, sets, before):
+        return lengths_of_robot, None
     is_fitting = not is_suspicious(before)
     if is_fitting and (before.chain is None or any(len(item.positions()) for item in samples)):
         return Diagnosis(before), None
@@ -168,7 +169,10 @@ def _find_single(
         samples = [*samples, *lengths]
         before = fit_samples(chain, samples, sets) if lengths else before
         return try_ratios(chain, samples, sets, before, progress), None
-    return try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
+    found, trial = try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
+    if trial and (table := find_wrong_table(chain, samples, sets, before)):
+        return table, None
+    return found, trial
 
 
 def _find_alone(chain: Chain, item: Measurement, sets: str, progress: Progress) -> Diagnosis:

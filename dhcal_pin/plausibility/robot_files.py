@@ -1,9 +1,10 @@
-"""Mistakes in a DH table: the other convention, exchanged columns, angles in degrees that are radians."""
+"""Mistakes in the file of a robot: the unit of lengths; convention, columns and angles of a DH table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 
@@ -11,15 +12,43 @@ from .._typing import Array
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.dh import Convention, DHTable
-from ..units import ANGLES
+from ..units import ANGLES, LENGTHS
 from .diagnosis import MIN_LOG_RATIO, Diagnosis
 from .evidence import Evidence, fit_evidence
-from .hypotheses import Hypothesis, JointChange
+from .hypotheses import Hypothesis, JointChange, describe_misread
 
+# Sums of the lengths of all links beyond which the unit of a robot is wrong [m].
+SMALLEST_ARM, LARGEST_ARM = 0.01, 50.0
 # Convention of a table by the default parameter set of its chain.
 _CONVENTIONS: dict[str, Convention] = {"dh": "standard", "modified-dh": "modified"}
 # Origins differ from those of a table by less than this [m or 1].
 _TOLERANCE = 1e-9
+
+# What is wrong in the file, what to correct, and the robot without the mistake.
+_Mistake = tuple[str, str, Chain]
+
+
+def sum_of_links(chain: Chain) -> float:
+    """Return the sum of the lengths of all links between joints [m]."""
+    return float(np.linalg.norm(chain.origins[1:-1, :3, 3], axis=1).sum())
+
+
+def find_wrong_lengths(
+    chain: Chain, samples: Sequence[Measurement], sets: str, before: Evidence
+) -> Diagnosis | None:
+    """Look for another unit of length of a robot of impossible size; None without one."""
+    size = sum_of_links(chain)
+    if SMALLEST_ARM <= size <= LARGEST_ARM:
+        return None
+    mistakes = []
+    for true, read in permutations(("m", "cm", "mm"), 2):
+        factor = LENGTHS[read] / LENGTHS[true]
+        if SMALLEST_ARM <= factor * size <= LARGEST_ARM:
+            origins = chain.origins.copy()
+            origins[:, :3, 3] *= factor
+            text = f"the lengths of the robot are {describe_misread(true, read, factor)}"
+            mistakes.append((text, "the lengths in the robot file", replace(chain, origins=origins)))
+    return _best(mistakes, samples, sets, before)
 
 
 def find_wrong_table(
@@ -30,14 +59,25 @@ def find_wrong_table(
     if table is None:
         return None
     other = "modified" if table.convention == "standard" else "standard"
-    found = []
-    for text, instead, change in _MISTAKES:
-        mended = replace(Chain.from_dh(change(table)), parameters=chain.parameters)
+    mistakes = [
+        (text.format(other), instead.format(other), Chain.from_dh(change(table)))
+        for text, instead, change in _MISTAKES
+    ]
+    return _best(mistakes, samples, sets, before)
+
+
+def _best(
+    mistakes: Iterable[_Mistake], samples: Sequence[Measurement], sets: str, before: Evidence
+) -> Diagnosis | None:
+    """Return the mistake that explains samples best; None if none does."""
+    best = None
+    for text, instead, mended in mistakes:
         after = fit_evidence(mended, samples, sets)
-        hypothesis = Hypothesis("", text.format(other), JointChange.of(chain.n_joints), instead.format(other))
-        found.append(Diagnosis(before, (hypothesis,), after, gain=after.log - before.log))
-    best = max(found, key=lambda each: each.log)
-    return best if best.is_certain and best.gain >= MIN_LOG_RATIO else None
+        hypothesis = Hypothesis("", text, JointChange.of(mended.n_joints), instead)
+        found = Diagnosis(before, (hypothesis,), after, gain=after.log - before.log)
+        if found.is_certain and found.gain >= MIN_LOG_RATIO and (best is None or found.gain > best.gain):
+            best = found
+    return best
 
 
 def _with_other_convention(table: DHTable) -> DHTable:
@@ -45,7 +85,7 @@ def _with_other_convention(table: DHTable) -> DHTable:
     return replace(table, convention="modified" if table.convention == "standard" else "standard")
 
 
-# What is wrong in the file, what to correct, and the table without the mistake.
+# What is wrong in the table, what to correct, and the table without the mistake.
 _MISTAKES: tuple[tuple[str, str, Callable[[DHTable], DHTable]], ...] = (
     (
         "the DH table is in the {0} convention, but was read in the other one",

@@ -1,4 +1,4 @@
-"""Mistakes in a DH table: its convention, exchanged columns, the unit of its angles."""
+"""Mistakes in the file of a robot: its unit of length, or the convention, columns and angles of a table."""
 
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.plausibility import diagnose_mixups
 from dhcal_pin.robot import Chain, DHTable
+from dhcal_pin.units import LENGTHS
 
 QUARTER = np.pi / 2
 
@@ -85,3 +86,27 @@ def test_the_calibration_is_refused_with_the_mistake_and_ok_without():
     assert verdict.status == "refused"
     assert "The DH table is in the standard convention, but was read in the other one" in verdict.reasons[0]
     assert calibrate(right, data).verdict.status == "ok"
+
+
+@pytest.mark.parametrize(("true", "read", "size"), [("m", "mm", "small"), ("mm", "m", "large")])
+@pytest.mark.parametrize("name", ["kuka", "scara"])
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_a_robot_of_impossible_size_has_a_wrong_unit(kind, name, true, read, size):
+    right = Chain.from_dh(TABLES[name])
+    data = measured(right, kind, 0)
+    factor = LENGTHS[true] / LENGTHS[read]
+    wrong = Chain.from_dh(replace(TABLES[name], a=factor * TABLES[name].a, d=factor * TABLES[name].d))
+    found = diagnose_mixups(wrong, [data])
+    words = f"The lengths of the robot are 1000 times too {size}, as if {true} had been read as {read}"
+    assert found.sentence.startswith(words)
+    assert found.remedy == "Correct the lengths in the robot file."
+
+
+def test_a_robot_and_measurements_of_kilometres_are_refused():
+    """Metres in the file were millimetres, and so were the measurements: they agree with each other."""
+    right = TABLES["kuka"]
+    data = measured(Chain.from_dh(right), Position, 0)
+    wrong = Chain.from_dh(replace(right, a=1e3 * right.a, d=1e3 * right.d))
+    found = calibrate(wrong, data.replace(values=1e3 * data.values), "minimal,base,tool").verdict
+    assert found.status == "refused"
+    assert found.reasons[0].startswith("The links of the robot are 1511 m long together")
