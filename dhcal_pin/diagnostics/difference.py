@@ -308,7 +308,7 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
     )
     if not roots:
         return difference
-    return _tested(difference, pair, varied((a, b), q_all), lever, n_components)
+    return _tested(difference, pair, varied((a, b), q_all, np.random.default_rng(0)), lever, n_components)
 
 
 def _common_region(first: Calibrated, second: Calibrated) -> Array | None:
