@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
+from ..exceptions import InvalidArgumentError
 from ..messages import message_line, similar_words
 
 if TYPE_CHECKING:
@@ -307,6 +308,13 @@ def execution_options(jobs_help: str, jobs: int | None) -> Options:
     """Declare --jobs and --scheduler, which exclude each other."""
     table = {"--jobs N": {"type": POSITIVE_INTEGER, "default": jobs, "help": jobs_help}}
     return {"--jobs|--scheduler": Exclusive({**table, "--scheduler": SCHEDULER})}
+
+
+def forbid_options(args: argparse.Namespace, names: str, reason: str) -> None:
+    """Raise an error if one of some options, named as attributes, is given."""
+    for name in names.split():
+        if getattr(args, name):
+            raise InvalidArgumentError(f"--{name.replace('_', '-')}: {reason}")
 
 
 def read_one_robot(path: str, args: argparse.Namespace, sidecar: str | None = None) -> Chain:

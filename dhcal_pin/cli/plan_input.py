@@ -31,7 +31,7 @@ from ..robot.collision import Obstacle, obstacles_from_urdf
 from ..robot.sampling import WorkspaceConstraints
 from ..robot.urdf import read_urdf
 from ..units import ANGLES, LENGTHS, PIXELS, parse_noise
-from .options import read_data, read_mounted_rig, split_commas
+from .options import forbid_options, read_data, read_mounted_rig, split_commas
 from .outputs import existing_sidecars
 from .plan_options import (
     DEFAULT_IMAGE_SIGMA,
@@ -98,9 +98,7 @@ def read_input(args: Namespace, chain: Chain, kind: str) -> tuple[dict[str, Any]
 def planned_count(args: Namespace) -> tuple[int, int]:
     """Return the number of different poses to plan, and how many of them are repeated."""
     if args.recheck:
-        for option in ("rig", "data", "parameters", "priors", "criterion"):
-            if getattr(args, option):
-                raise InvalidArgumentError(f"--{option}: not allowed with --recheck")
+        forbid_options(args, "rig data parameters priors criterion", "not allowed with --recheck")
     elif args.count is None:
         raise InvalidArgumentError("the number of poses is missing; expected -n, such as -n 40")
     count = args.count or N_RECHECKED

@@ -95,27 +95,19 @@ def _sight_of_pixel_corners(camera: Camera) -> Array:
 def _ideal_image(sight: Array, sheets: Sequence[tuple[_Print, Array]], n: int) -> Array:
     """Return mean grey values (height, width) of prints, each with the pose of the camera in its board."""
     # Pixels at edges are the mean of n·n points.
-    shape = sight.shape[1] - 1, sight.shape[2] - 1
-    flat = sight.reshape(2, -1)
-    image, nearest = np.full(shape, BACKGROUND), np.full(shape, np.inf)
-    has_edges = np.zeros(shape, bool)
-    for sheet, inverse in sheets:
-        depth, points = _hits(flat, inverse)
-        cells = np.where(np.isfinite(depth), sheet.cells(*points), 0).reshape(sight.shape[1:])
-        first = cells[:-1, :-1]
-        has_edges |= (cells[1:, :-1] != first) | (cells[:-1, 1:] != first) | (cells[1:, 1:] != first)
-        grey = sheet.grey.ravel()[first]
-        depth = depth.reshape(sight.shape[1:])[:-1, :-1]
-        is_seen = np.isfinite(grey) & (depth < nearest)
-        image[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
-    rows, columns = np.nonzero(has_edges)
+    grey, found = _grey_values(sight.reshape(2, -1), sheets)
+    image = grey.reshape(sight.shape[1:])[:-1, :-1].copy()
+    cells = np.array(found).reshape(-1, *sight.shape[1:])
+    first = cells[:, :-1, :-1]
+    changes = (cells[:, 1:, :-1] != first) | (cells[:, :-1, 1:] != first) | (cells[:, 1:, 1:] != first)
+    rows, columns = np.nonzero(changes.any(0))
     quads = np.array([sight[:, rows + i, columns + j] for i in (0, 1) for j in (0, 1)])
     offsets = (np.arange(n) + 0.5) / n
     total = np.zeros(len(rows))
     for b in offsets:
         for a in offsets:
             weights = ((1 - b) * (1 - a), (1 - b) * a, b * (1 - a), b * a)
-            total += _grey_values(np.einsum("q,qip->ip", weights, quads), sheets)
+            total += _grey_values(np.einsum("q,qip->ip", weights, quads), sheets)[0]
     image[rows, columns] = total / n**2
     return image
 
@@ -129,12 +121,15 @@ def _hits(sight: Array, inverse: Array) -> tuple[Array, Array]:
     return depth, points
 
 
-def _grey_values(sight: Array, sheets: Sequence[tuple[_Print, Array]]) -> Array:
-    """Return the grey values (m,) along lines of sight (2, m); the nearest board hides the others."""
+def _grey_values(sight: Array, sheets: Sequence[tuple[_Print, Array]]) -> tuple[Array, list[Array]]:
+    """Return the grey values (m,) along lines of sight (2, m), and the cells (m,) of each print on them."""
+    # The nearest board hides the others.
     out, nearest = np.full(sight.shape[1], BACKGROUND), np.full(sight.shape[1], np.inf)
+    cells = []
     for sheet, inverse in sheets:
         depth, points = _hits(sight, inverse)
-        grey = sheet.grey.ravel()[sheet.cells(*points)]
+        cells.append(np.where(np.isfinite(depth), sheet.cells(*points), 0))
+        grey = sheet.grey.ravel()[cells[-1]]
         is_seen = np.isfinite(grey) & (depth < nearest)
         out[is_seen], nearest[is_seen] = grey[is_seen], depth[is_seen]
-    return out
+    return out, cells

@@ -32,16 +32,14 @@ def at_reference(chains: Sequence[Chain], q: Array) -> Conditions:
     return Conditions(q, temperature=np.full(len(q), _first(chains, THERMAL).reference_temperature))
 
 
-def varied(chains: Sequence[Chain], q: Array) -> Conditions:
+def varied(chains: Sequence[Chain], q: Array, rng: np.random.Generator) -> Conditions:
     """Draw conditions (m,) that show all errors of the robots."""
-    reference, rng = _first(chains, THERMAL).reference_temperature, np.random.default_rng(0)
-    names = [
-        family.condition
-        for family in FAMILIES.values()
-        if family.condition and any(family in chain.error_families for chain in chains)
-    ]
+    reference = _first(chains, THERMAL).reference_temperature
+    needed = {family.condition for chain in chains for family in chain.error_families}
     drawn = {
-        name: draw(rng, q.shape, reference) for name in names if (draw := CONDITIONS[name].draw) is not None
+        name: condition.draw(rng, q.shape, reference)
+        for name, condition in CONDITIONS.items()
+        if name in needed and condition.draw
     }
     return replace(at_reference(chains, q), **drawn)
 

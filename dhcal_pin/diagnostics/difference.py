@@ -209,11 +209,13 @@ class Difference:
                 "No calibration states its uncertainty, so that nothing says how large a difference may be.",
                 *self.remarks,
             ]
-        texts = [f"{_described(self.of_parameters)}; equal robots have {_limit(self.of_parameters)}."]
+        texts = [
+            f"{_described(self.of_parameters)}; equal robots have less than {self.of_parameters.limit:.2f}."
+        ]
         if self.overall.freedom > self.of_parameters.freedom:
             texts.append(
                 f"With the residuals of both: {_described(self.overall)}; one robot that the model describes "
-                f"has {_limit(self.overall)}."
+                f"has less than {self.overall.limit:.2f}."
             )
         if self.lacking:
             names = ", ".join(f"{name} ({FAMILIES[name].description})" for name in self.lacking)
@@ -250,11 +252,6 @@ CHI_SQUARE_KEYS = tuple(ChiSquare(0.0, 1.0).to_dict())
 def _described(found: ChiSquare) -> str:
     """Describe a chi-square."""
     return f"Reduced chi-square {found.reduced:.2f} with {found.freedom:.0f} degrees of freedom"
-
-
-def _limit(found: ChiSquare) -> str:
-    """Describe the limit of a chi-square."""
-    return f"less than {found.limit:.2f}"
 
 
 def compare(first: Calibrated, second: Calibrated) -> Difference:
@@ -308,7 +305,7 @@ def compare(first: Calibrated, second: Calibrated) -> Difference:
     )
     if not roots:
         return difference
-    return _tested(difference, pair, varied((a, b), q_all), lever, n_components)
+    return _tested(difference, pair, varied((a, b), q_all, np.random.default_rng(0)), lever, n_components)
 
 
 def _common_region(first: Calibrated, second: Calibrated) -> Array | None:
@@ -431,7 +428,7 @@ def _tested(difference: Difference, pair, at: Conditions, lever: float, n: int) 
         return difference
     candidates = []
     for each in parameters(a, at):
-        effects = _scaled(each.effects, lever)
+        effects = each.effects * np.repeat([1.0, lever], 3)
         own = _without_frames(a, at, lever, n, effects[..., None])[:, 0]
         is_own = np.linalg.norm(own) > MIN_OWN_EFFECT * np.linalg.norm(effects)
         if is_own and np.sum((own - u @ (u.T @ own)) ** 2) < MAX_OUTSIDE * np.sum(own**2):
@@ -439,11 +436,6 @@ def _tested(difference: Difference, pair, at: Conditions, lever: float, n: int) 
     joints, zeros = find_part_differences(candidates, lambda zeros: whiten @ remaining(zeros), a.n_joints)
     unexplained = _unexplained(first, remaining(zeros), u, len(at.q))
     return replace(difference, joints=joints, unexplained=unexplained)
-
-
-def _scaled(twists: Array, lever: float) -> Array:
-    """Return twists (m, 6) with angles times a length."""
-    return twists * np.repeat([1.0, lever], 3)
 
 
 def _unexplained(whole: Array, remaining: Array, u: Array, count: int) -> float:

@@ -33,7 +33,7 @@ from ..io.servo_file import ServoFile
 from ..io.tables import Column, DataTable, TextLayout, read_table
 from ..measurements.mounting import MountedRig
 from ..robot.chain import Chain
-from ..robot.coverage import BIN_WIDTH_RAD, joint_coverage
+from ..robot.coverage import BIN_WIDTH_RAD, coverage_of
 from ..units import ANGLES, LENGTHS
 from .input_checks import find_input_warnings, find_payload_warnings, first_equal_rows
 
@@ -284,25 +284,14 @@ def _summarize_column(
     lower, upper = (
         float(limit * divisor) if np.isfinite(limit) else None for limit in (chain.lower[j], chain.upper[j])
     )
-    return replace(
-        summary, lower=lower, upper=upper, coverage=_coverage_of_limits(chain, j, values / divisor)
-    )
+    coverage = None if chain.is_prismatic[j] else coverage_of(chain, j, values / divisor).share
+    return replace(summary, lower=lower, upper=upper, coverage=coverage)
 
 
 def _coverage_of_range(values: Array) -> float:
     """Return the share of visited bins between the smallest and the largest of angles (m,) [rad]."""
     bins = np.unique(np.rint(values / BIN_WIDTH_RAD))
     return len(bins) / (bins[-1] - bins[0] + 1)
-
-
-def _coverage_of_limits(chain: Chain, joint: int, values: Array) -> float | None:
-    """Return the share of visited bins within the limits of a joint; None if it is prismatic."""
-    if chain.is_prismatic[joint]:
-        return None
-    q = np.zeros((len(values), chain.n_joints))
-    q[:, joint] = values
-    by_name = {one.joint: one for one in joint_coverage(chain, q)}
-    return by_name[chain.joint_names[joint]].share
 
 
 def _count_configurations(file: MeasurementFile) -> int | None:

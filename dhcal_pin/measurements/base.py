@@ -153,11 +153,11 @@ class Measurement(ABC):
             if "required_columns" not in cls.__dict__:
                 cls.required_columns = (frozenset(c.name for c in cls.COLUMNS if not c.is_implied),)
 
-    def _initialize(self, **values: Any) -> None:
-        """Set attributes of an immutable object; for constructors only."""
-        self.__dict__.update(
-            {"has_joint_values": True, "has_counts": False, "rig": None, "recorded": None} | values
-        )
+    def _initialize(self, q: Array, **values: Any) -> None:
+        """Set attributes of an immutable object, some by default; for constructors only."""
+        defaults = {"rows": np.arange(1, len(q) + 1), "source": "", "instrument_parameters": ()}
+        defaults |= {"has_joint_values": True, "has_counts": False, "rig": None, "recorded": None}
+        self.__dict__.update(defaults | {"q": q} | values)
 
     def __repr__(self) -> str:
         """Return the kind, the number of samples and the standard deviations."""
@@ -167,6 +167,18 @@ class Measurement(ABC):
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
         return []
+
+    def _sigma_text(self, *sigmas: tuple[Array, float, str]) -> str:
+        """Return a text with standard deviations for `repr`."""
+        if not self.has_stated_sigma:
+            return "sigma not stated"
+        texts = []
+        for values, factor, unit in sigmas:
+            extremes = (values.min(), values.max()) if values.size else ()
+            # One number if both are written alike.
+            numbers = dict.fromkeys(f"{factor * value:.3g}" for value in extremes)
+            texts += [f"{' to '.join(numbers)} {unit}"] if numbers else []
+        return " ".join(["sigma", ", ".join(texts)]) if texts else "sigma stated"
 
     @cached_property
     def configuration_groups(self) -> Array:
@@ -612,14 +624,3 @@ def point_parameters(prefix: str, point: Array) -> tuple[InstrumentParameter, ..
         InstrumentParameter(f"{prefix}.{axis}", "m", float(value), POINT_PRIOR)
         for axis, value in zip("xyz", point, strict=True)
     )
-
-
-def format_sigma(*sigmas: tuple[Array, float, str]) -> str:
-    """Return a text with standard deviations for `repr`."""
-    texts = []
-    for values, factor, unit in sigmas:
-        extremes = (values.min(), values.max()) if values.size else ()
-        # One number if both are written alike.
-        numbers = dict.fromkeys(f"{factor * value:.3g}" for value in extremes)
-        texts += [f"{' to '.join(numbers)} {unit}"] if numbers else []
-    return " ".join(["sigma", ", ".join(texts)]) if texts else "sigma stated"

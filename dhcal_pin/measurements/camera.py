@@ -41,7 +41,7 @@ from ..formatting import format_count
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
 from . import images
-from .base import Measurement, Noise, format_sigma, label_stops
+from .base import Measurement, Noise, label_stops
 from .columns import Column
 from .groups import ErrorGroup, Group
 from .images.camera_parameters import (
@@ -202,8 +202,6 @@ class CameraCorners(Measurement):
         values = validated_array(pixels, (m, 2), "CameraCorners: pixels", "pair of image coordinates")
         self._initialize(
             q=q,
-            rows=np.arange(1, m + 1),
-            source="",
             rig=rig,
             values=values,
             sigma=validated_sigma(PIXEL_SIGMA if sigma is None else sigma, (m, 2), "CameraCorners: sigma"),
@@ -343,10 +341,7 @@ class CameraCorners(Measurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        return [
-            format_count(self.n_images, "image"),
-            format_sigma((self.sigma, 1.0, "px")) if self.has_stated_sigma else "sigma not stated",
-        ]
+        return [format_count(self.n_images, "image"), self._sigma_text((self.sigma, 1.0, "px"))]
 
     @property
     def label_names(self) -> tuple[str, ...]:

@@ -61,7 +61,7 @@ class PointContact(NamedPointMeasurement):
         names, label = encode_labels(points, len(q), "PointContact: points")
         parameters = tuple(u for name in names for u in point_parameters(f"point_{name}", _ORIGIN))
         super().__init__(q, np.zeros((len(q), 3)), sigma, parameters)
-        self._initialize(label=label, names=names)
+        self.__dict__.update(label=label, names=names)
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the tool points relative to the touched points, and their derivatives."""
@@ -148,7 +148,7 @@ class PointDistance(PointMeasurement):
         unknown = np.full(3, np.nan)
         parameters = tuple(u for name in names for u in point_parameters(f"point_{name}", unknown))
         super().__init__(np.zeros((m, n_joints)), distances, sigma, parameters)
-        self._initialize(label=label.reshape(-1, 2), names=names)
+        self.__dict__.update(label=label.reshape(-1, 2), names=names)
 
     @classmethod
     def from_columns(
@@ -235,7 +235,7 @@ class PlaneContact(PointMeasurement):
             for parameter, unit in (("tilt_1", "rad"), ("tilt_2", "rad"), ("height", "m"))
         )
         super().__init__(q, np.zeros((len(q), 1)), sigma, parameters)
-        self._initialize(name=name, origin=np.zeros(3), axes=np.eye(3))
+        self.__dict__.update(name=name, origin=np.zeros(3), axes=np.eye(3))
 
     def text_values(self) -> dict[str, Sequence[str]]:
         """Return the name of the plane for each sample."""
@@ -309,7 +309,7 @@ class SphereContact(PointMeasurement):
             radius = np.full(len(q), radius)
         values = validated_array(radius, (len(q),), "SphereContact: radius", "number")[:, None]
         super().__init__(q, values, sigma, point_parameters(f"sphere_{name}", _ORIGIN))
-        self._initialize(name=name)
+        self.__dict__.update(name=name)
 
     def text_values(self) -> dict[str, Sequence[str]]:
         """Return the name of the sphere for each sample."""

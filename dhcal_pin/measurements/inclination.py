@@ -40,7 +40,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError, SampleError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
-from .base import ANGLE_SIGMA, InstrumentParameter, Measurement, Noise, format_sigma
+from .base import ANGLE_SIGMA, InstrumentParameter, Measurement, Noise
 from .columns import Column, angle_columns, common_text, stack_columns, stack_sigmas, text_column
 from .groups import Group
 from .validation import validated_array, validated_joint_positions, validated_sigma
@@ -123,8 +123,6 @@ class Inclination(Measurement):
                 )
         self._initialize(
             q=q,
-            rows=np.arange(1, len(q) + 1),
-            source="",
             angles=angles,
             sigma=validated_sigma(ANGLE_SIGMA if sigma is None else sigma, (len(q), 2), "Inclination: sigma"),
             has_stated_sigma=sigma is not None,
@@ -188,9 +186,7 @@ class Inclination(Measurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        if not self.has_stated_sigma:
-            return ["sigma not stated"]
-        return [format_sigma((self.sigma, 180 / np.pi, "deg"))]
+        return [self._sigma_text((self.sigma, 180 / np.pi, "deg"))]
 
     @property
     def residual_dim(self) -> int:

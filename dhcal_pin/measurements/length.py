@@ -99,7 +99,7 @@ class Wires(PointMeasurement):
             )
         offsets = np.broadcast_to(offsets, w).copy()
         super().__init__(q, lengths, sigma, _wire_parameters(anchors, offsets, np.zeros((w, 3))))
-        self._initialize(anchors=anchors, offsets=offsets)
+        self.__dict__.update(anchors=anchors, offsets=offsets)
 
     @classmethod
     def present_columns(cls, values: Mapping[str, Any]) -> tuple[Column, ...]:
@@ -219,7 +219,7 @@ class Distance(PointMeasurement):
         q_to = validated_array(q_to, q.shape, "Distance: q_to", "row of joint positions")
         values = validated_array(distances, (len(q),), "Distance: distances", "number")[:, None]
         super().__init__(q, values, sigma)
-        self._initialize(q_to=q_to)
+        self.__dict__.update(q_to=q_to)
 
     def configurations(self) -> Array:
         """Return the joint positions (2m, n): first configurations, then second ones."""

@@ -25,7 +25,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
-from .base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, Noise, format_sigma
+from .base import ANGLE_SIGMA, LENGTH_SIGMA, Measurement, Noise
 from .columns import angle_columns, displacement_range, length_columns, stack_columns, stack_sigmas
 from .groups import ORIENTATION, POSITION
 from .validation import validated_array, validated_joint_positions, validated_poses, validated_sigma
@@ -72,8 +72,6 @@ class PoseMeasurement(Measurement):
             )
         self._initialize(
             q=q,
-            rows=np.arange(1, m + 1),
-            source="",
             poses=validated_poses(poses, m, kind),
             sigma=validated_sigma(sigma if is_stated else LENGTH_SIGMA, (m, 3), f"{kind}: sigma"),
             rotation_sigma=validated_sigma(
@@ -82,7 +80,6 @@ class PoseMeasurement(Measurement):
             notations=np.full(m, "", object),
             angles=np.full((m, 3), np.nan),
             has_stated_sigma=is_stated,
-            instrument_parameters=(),
         )
 
     def with_euler_angles(self, notation: str, angles: Array) -> Self:
@@ -100,9 +97,7 @@ class PoseMeasurement(Measurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        if not self.has_stated_sigma:
-            return ["sigma not stated"]
-        return [format_sigma((self.sigma, 1e3, "mm"), (self.rotation_sigma, 180 / np.pi, "deg"))]
+        return [self._sigma_text((self.sigma, 1e3, "mm"), (self.rotation_sigma, 180 / np.pi, "deg"))]
 
     @classmethod
     def _arguments(cls, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -280,7 +275,7 @@ class RelativePose(PoseMeasurement):
         q = validated_joint_positions(q, "RelativePose")
         q_to = validated_array(q_to, q.shape, "RelativePose: q_to", "row of joint positions")
         super().__init__(q, poses, sigma, rotation_sigma)
-        self._initialize(q_to=q_to)
+        self.__dict__.update(q_to=q_to)
 
     def configurations(self) -> Array:
         """Return the joint positions (2m, n): configurations a, then configurations b."""

@@ -26,7 +26,7 @@ from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..robot.chain import Chain
 from ..robot.conditions import Conditions
-from .base import LENGTH_SIGMA, OFFSET_PRIOR, InstrumentParameter, Measurement, Noise, format_sigma
+from .base import LENGTH_SIGMA, OFFSET_PRIOR, InstrumentParameter, Measurement, Noise
 from .columns import Column, length_columns, text_column
 from .groups import LENGTHS, POSITION, Group
 from .validation import encode_labels, validated_array, validated_joint_positions, validated_sigma
@@ -56,8 +56,6 @@ class PointMeasurement(Measurement):
         where = f"{type(self).__name__}: sigma"
         self._initialize(
             q=q,
-            rows=np.arange(1, len(q) + 1),
-            source="",
             values=values,
             sigma=validated_sigma(LENGTH_SIGMA if sigma is None else sigma, (len(q), values.shape[1]), where),
             has_stated_sigma=sigma is not None,
@@ -91,7 +89,7 @@ class PointMeasurement(Measurement):
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""
-        return [format_sigma((self.sigma, 1e3, "mm")) if self.has_stated_sigma else "sigma not stated"]
+        return [self._sigma_text((self.sigma, 1e3, "mm"))]
 
     @property
     def residual_dim(self) -> int:
@@ -254,7 +252,7 @@ class PositionComponents(PointMeasurement):
             values = np.asarray(values)[:, None]
         shape, where = (len(q), len(axes)), "PositionComponents: values"
         super().__init__(q, validated_array(values, shape, where), sigma)
-        self._initialize(axes=tuple(axes))
+        self.__dict__.update(axes=tuple(axes))
 
     @classmethod
     def _arguments(cls, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -325,7 +323,7 @@ class MultiTargetPosition(NamedPointMeasurement):
             for axis in _AXES
         )
         super().__init__(q, values, sigma, parameters)
-        self._initialize(label=label, names=names)
+        self.__dict__.update(label=label, names=names)
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy in which each further target starts at its mean position in the chain's tool frame.

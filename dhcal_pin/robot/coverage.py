@@ -114,17 +114,17 @@ def joint_coverage(chain: Chain, q: Array) -> tuple[JointCoverage, ...]:
         rounded = np.rint(q / _SAME_CONFIGURATION)
     _, first = np.unique(rounded, axis=0, return_index=True)
     different = q[np.sort(first)]
-    out = []
-    for i in np.flatnonzero(~chain.is_prismatic):
-        out.append(
-            JointCoverage(
-                joint=chain.joint_names[i],
-                values=different[:, i],
-                counts=np.bincount(bin_indices(different[:, i]), minlength=N_BINS),
-                is_in_range=_bins_in_range(float(chain.lower[i]), float(chain.upper[i])),
-            )
-        )
-    return tuple(out)
+    return tuple(coverage_of(chain, i, different[:, i]) for i in np.flatnonzero(~chain.is_prismatic).tolist())
+
+
+def coverage_of(chain: Chain, i: int, values: Array) -> JointCoverage:
+    """Compute which parts of a turn the values (m,) [rad] of a revolute joint visited."""
+    return JointCoverage(
+        joint=chain.joint_names[i],
+        values=values,
+        counts=np.bincount(bin_indices(values), minlength=N_BINS),
+        is_in_range=_bins_in_range(float(chain.lower[i]), float(chain.upper[i])),
+    )
 
 
 def _bins_in_range(lower: float, upper: float) -> Array:

@@ -173,12 +173,9 @@ class ConfigurationSampler:
             return False
         if self.workspace.instrument_position is None:
             return True
-        base_from_measuring = se3.inverse(self.chain.base)
         point = self.chain.poses(q[None])[0, :3, 3]
-        eye, point = (
-            base_from_measuring[:3, :3] @ position + base_from_measuring[:3, 3]
-            for position in (self.workspace.instrument_position, point)
-        )
+        ends = np.array([self.workspace.instrument_position, point])
+        eye, point = se3.transform_points(se3.inverse(self.chain.base), ends)
         return self.collision.has_line_of_sight(q, eye, point)
 
 

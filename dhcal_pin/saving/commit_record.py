@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from .._frozen import frozen
@@ -81,7 +82,7 @@ def remove_stale(folder: str) -> None:
     with os.scandir(folder) as entries:
         stale = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
     for path in stale:
-        _remove(path)
+        Path(path).unlink(missing_ok=True)
 
 
 def complete(folder: str) -> None:
@@ -92,7 +93,7 @@ def complete(folder: str) -> None:
     primary = record.folders[0]
     committed = CommitRecord.read(primary)
     if committed is None or committed.token != record.token:
-        _remove(os.path.join(folder, RECORD_NAME))
+        Path(folder, RECORD_NAME).unlink(missing_ok=True)
         return
     parts = {other: CommitRecord.read(other) for other in committed.folders}
     own = {other: part for other, part in parts.items() if part is not None and part.token == record.token}
@@ -100,7 +101,7 @@ def complete(folder: str) -> None:
         _apply(other, part)
     # All records stay until all folders are complete, so that the commit is found in each of them.
     for other in reversed(own):
-        _remove(os.path.join(other, RECORD_NAME))
+        Path(other, RECORD_NAME).unlink(missing_ok=True)
 
 
 def _apply(folder: str, record: CommitRecord) -> None:
@@ -110,13 +111,8 @@ def _apply(folder: str, record: CommitRecord) -> None:
         with suppress(FileNotFoundError):
             os.replace(os.path.join(folder, temporary), os.path.join(folder, name))
     for name in record.removals:
-        _remove(os.path.join(folder, name))
+        Path(folder, name).unlink(missing_ok=True)
     flush_folder(folder)
-
-
-def _remove(path: str) -> None:
-    with suppress(FileNotFoundError):
-        os.unlink(path)
 
 
 def flush_folder(folder: str) -> None:

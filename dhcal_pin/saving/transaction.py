@@ -8,6 +8,7 @@ import shutil
 import stat
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from .._frozen import frozen
 from .._typing import PathLike
@@ -94,8 +95,7 @@ def _save(
         finally:
             for change in changes:
                 for path in (change.temporary, change.backup):
-                    with suppress(FileNotFoundError):
-                        os.unlink(path)
+                    Path(path).unlink(missing_ok=True)
 
 
 def _prepare(change: _Change, needs_backup: bool) -> None:
@@ -179,16 +179,14 @@ def _write_record(
             os.fsync(file.fileno())
         os.replace(temporary, os.path.join(folder, RECORD_NAME))
     finally:
-        with suppress(FileNotFoundError):
-            os.unlink(temporary)
+        Path(temporary).unlink(missing_ok=True)
     flush_folder(folder)
 
 
 def _roll_back(changes: Sequence[_Change], folders: Sequence[str]) -> None:
     """Restore all old files. The records go first: nobody must complete the commit any more."""
     for folder in folders:
-        with suppress(FileNotFoundError):
-            os.unlink(os.path.join(folder, RECORD_NAME))
+        Path(folder, RECORD_NAME).unlink(missing_ok=True)
     for change in changes:
         if os.path.exists(change.backup):
             # Does nothing if the target is still the same file.

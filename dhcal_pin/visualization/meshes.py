@@ -18,7 +18,6 @@ import base64
 import itertools
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import field
 from functools import lru_cache, partial
 from operator import itemgetter
 from typing import Any
@@ -74,7 +73,7 @@ def visuals_of(
     names = {mesh.get("filename", "") for mesh in ElementTree.fromstring(text).iter("mesh")}
     files = [file for name in sorted(names) for file in mesh_files(name, folders)]
     stamps = tuple((file, os.path.getmtime(file), os.path.getsize(file)) for file in files)
-    model, objects, missing = _read_objects(_Source(text, stamps, tuple(folders)))
+    model, objects, missing = _read_objects(text, tuple(folders), stamps)
     if not objects and not missing:
         shapes = _skeleton(bodies, set(range(len(bodies))))
         return Visuals(shapes, [], "Drawn as a skeleton: the URDF has no visual geometry.")
@@ -110,15 +109,6 @@ def rows(pose: Array) -> list[float]:
 
 
 # --- the URDF's visual geometry --------------------------------------------------------------------
-@frozen
-class _Source:
-    """A URDF and its meshes, identified by the time stamps of their files."""
-
-    text: str
-    stamps: tuple[tuple[str, float, int], ...]  # Path, time of the last change, size
-    folders: tuple[str, ...] = field(compare=False)
-
-
 @frozen(eq=False)
 class _Object:
     """Visual object of a link."""
@@ -131,10 +121,13 @@ class _Object:
 
 # A job draws its robot several times, such as in the report and in the scene.
 @lru_cache(maxsize=4)
-def _read_objects(source: _Source) -> tuple[pin.Model, list[_Object], dict[str, list[str]]]:
+def _read_objects(
+    text: str, folders: tuple[str, ...], _stamps: tuple[tuple[str, float, int], ...]
+) -> tuple[pin.Model, list[_Object], dict[str, list[str]]]:
     """Return the model, its visual objects, and by link the file names of meshes that cannot be used."""
-    model = _build_model(source.text)
-    objects, missing = _load_visuals(model, source.text, source.folders)
+    # A file with another stamp, which is its path, the time of its last change and its size, is read again.
+    model = _build_model(text)
+    objects, missing = _load_visuals(model, text, folders)
     return (
         model,
         [

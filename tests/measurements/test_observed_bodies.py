@@ -29,12 +29,12 @@ class LinkPoint(PointMeasurement):
     def __init__(self, q, positions, body, pose, sigma=None):
         q = validated_joint_positions(q, "LinkPoint")
         super().__init__(q, validated_array(positions, (len(q), 3), "LinkPoint: positions"), sigma)
-        self._initialize(body=body, local=pose[:3, :3] @ POINT + pose[:3, 3])
+        self.__dict__.update(body=body, local=pose[:3, :3] @ POINT + pose[:3, 3])
 
     def replace(self, **values):
         """Return a copy that observes the same point."""
         copy = super().replace(**values)
-        copy._initialize(body=self.body, local=self.local, rig=self.rig)
+        copy.__dict__.update(body=self.body, local=self.local, rig=self.rig)
         return copy
 
     @property

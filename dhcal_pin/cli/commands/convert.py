@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ... import io
 from ...exceptions import InvalidArgumentError
 from .. import screens
-from ..options import COLUMNS, JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
+from ..options import COLUMNS, JSON, ROBOT, URDF_OPTIONS, Options, forbid_options, read_one_robot
 
 EXAMPLE = "dhcal convert arm.dh.toml arm.urdf"
 
@@ -62,14 +62,9 @@ def run(args: Namespace) -> int:
 
 def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
     """Return the text of a robot in another format, and notes on it."""
-    for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
-        if value:
-            raise InvalidArgumentError(
-                f"{option}: {args.input} is no recording; expected .bag, .mcap or a folder"
-            )
-    for option, value in (("--robot", args.robot), ("--columns", args.columns)):
-        if value:
-            raise InvalidArgumentError(f"{option}: only for a recording; omit it, or add --poses")
+    reason = f"{args.input} is no recording; expected .bag, .mcap or a folder"
+    forbid_options(args, "pose_topic joint_topic", reason)
+    forbid_options(args, "robot columns", "only for a recording; omit it, or add --poses")
     if args.template_tip and not args.template:
         raise InvalidArgumentError("--template-tip: needs --template, the file that it is in")
     return io.convert_robot(
@@ -82,9 +77,7 @@ def _convert_tables(args: Namespace) -> tuple[str, Sequence[str]]:
     from ...io.measurement_files.recorded_tables import convert_tables  # lazy import: loads Pinocchio
 
     _require_measurement_file(args)
-    for option, value in (("--pose-topic", args.pose_topic), ("--joint-topic", args.joint_topic)):
-        if value:
-            raise InvalidArgumentError(f"{option}: the tables of --poses have no topics; omit it")
+    forbid_options(args, "pose_topic joint_topic", "the tables of --poses have no topics; omit it")
     if not args.robot:
         raise InvalidArgumentError("--poses: needs --robot, whose joints the columns of IN name")
     return convert_tables(args.input, args.poses, read_one_robot(args.robot, args), args.columns)
@@ -103,6 +96,4 @@ def _require_measurement_file(args: Namespace) -> None:
     """Require the output and the options of a recording."""
     if not args.output.lower().endswith(".csv"):
         raise InvalidArgumentError(f"{args.output}: a recording becomes a measurement file; expected .csv")
-    for option, value in (("--convention", args.convention), ("--template", args.template)):
-        if value:
-            raise InvalidArgumentError(f"{option}: a recording has none; omit it")
+    forbid_options(args, "convention template", "a recording has none; omit it")

@@ -5,9 +5,8 @@ from __future__ import annotations
 from argparse import Namespace
 
 from ... import planning, report
-from ...exceptions import InvalidArgumentError
 from .. import screens
-from ..options import read_one_robot
+from ..options import forbid_options, read_one_robot
 from ..plan_options import ARGUMENTS as ARGUMENTS
 
 EXAMPLE = "dhcal plan ur10.urdf -n 40 --tip tool0 --sigma 0.1mm,0.01deg -o poses.csv"
@@ -19,9 +18,7 @@ def run(args: Namespace) -> int:
         from ..iso_plan import run_iso_plan  # lazy import: slow to load
 
         return run_iso_plan(args)
-    for option in ("cube", "cycles"):
-        if getattr(args, option):
-            raise InvalidArgumentError(f"--{option}: needs --iso9283")
+    forbid_options(args, "cube cycles", "needs --iso9283")
     from ..arm_types import with_arm_type  # lazy import, as the following: they load Pinocchio
     from ..output_table import file_contents
     from ..outputs import checked_files, require_workbook, write_outputs

@@ -12,7 +12,7 @@ from ...exceptions import InvalidArgumentError, UnknownNameError
 from .. import options, screens
 
 if TYPE_CHECKING:
-    from ..._typing import Array, PathLike
+    from ..._typing import PathLike
     from ...measurements import Measurement, Noise
 
 EXAMPLE = "dhcal simulate arm.dh.toml --truth actual.dh.toml -n 50 --sigma 0.1mm,0.01deg -o data.csv"
@@ -59,6 +59,7 @@ def run(args: Namespace) -> int:
     """Simulate measurements and write them."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
+    from ...diagnostics.common_conditions import varied
     from ...measurements import KINDS, Noise
     from ...units import parse_noise
     from ..output_table import Output
@@ -86,7 +87,8 @@ def run(args: Namespace) -> int:
         truth = _with_random_errors(nominal, *parse_noise(args.errors, "--errors"), args.seed)
     rng = np.random.default_rng(args.seed)
     q = rng.uniform(*robot.joint_range(nominal), (args.samples, nominal.n_joints))
-    data = KINDS[args.kind].simulate(truth, _conditions(truth, q, args.seed), noise, rng)
+    conditions = varied([truth], q, np.random.default_rng([args.seed, 2]))
+    data = KINDS[args.kind].simulate(truth, conditions, noise, rng)
     errors = f" with random errors {args.errors}" if args.errors else ""
     comment = (
         f"simulated {args.kind} of {args.truth or args.robot}{errors}, noise {args.noise}, seed {args.seed}"
@@ -101,20 +103,6 @@ def run(args: Namespace) -> int:
     write_with_json(contents, args.json, files, inputs, tip=nominal.tip, **facts)
     screens.show(screens.simulation_screen(screens.robot_line(args.robot, nominal), contents), args.verbosity)
     return 0
-
-
-def _conditions(truth: robot.Chain, q: Array, seed: int) -> robot.Conditions:
-    """Return joint positions with random values of the conditions that the robot depends on."""
-    import numpy as np  # lazy import: slow to load
-
-    rng = np.random.default_rng([seed, 2])
-    needed = {family.condition for family in truth.error_families}
-    drawn = {
-        name: condition.draw(rng, q.shape, truth.reference_temperature)
-        for name, condition in robot.CONDITIONS.items()
-        if name in needed and condition.draw
-    }
-    return robot.Conditions(q, **drawn)
 
 
 def _require_noise_of(kind: type[Measurement], noise: Noise, text: str) -> None:
