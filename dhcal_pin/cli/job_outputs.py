@@ -112,22 +112,31 @@ def _camera_frames(
     return camera_frames(fit.rig, replace(written, base=base, tool=tool), camera_frame)
 
 
-def servo_files(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
-    """Make LeRobot's calibration or parameters for `ros2_control`, and the URDF for their joint values."""
+def lerobot_files(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make LeRobot's calibration with corrected homing offsets, and the URDF for its degrees."""
     servos: ServoFile = options["servo_file"]
-    is_lerobot = robot_ending(output) == ".json"
-    content = servos.lerobot_content() if is_lerobot else servos.ros2_control_content()
-    return {output: content, **urdf_with_sidecar(fit, f"{robot_stem(output)}.urdf", options)}
+    return {output: servos.lerobot_content(), **_urdf_beside(fit, output, options)}
+
+
+def ros2_control_files(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make parameters of the joints for drivers of `ros2_control`, and the URDF for their joint values."""
+    servos: ServoFile = options["servo_file"]
+    return {output: servos.ros2_control_content(), **_urdf_beside(fit, output, options)}
+
+
+def _urdf_beside(fit: Result, output: str, options: Mapping[str, Any]) -> dict[PathLike, str | bytes]:
+    """Make the URDF and its sidecar beside another output."""
+    return urdf_with_sidecar(fit, f"{robot_stem(output)}.urdf", options)
 
 
 # Formats of the calibrated robot by the ending of --output.
 ROBOT_FORMATS = {
     ".urdf": RobotOutput("corrected URDF (.urdf)", urdf_with_sidecar),
     ".xml": RobotOutput("corrected MJCF, if ROBOT is an MJCF (.xml)", urdf_with_sidecar, _require_mjcf),
-    ".json": RobotOutput("LeRobot's calibration with its URDF (.json, needs --servos)", servo_files),
+    ".json": RobotOutput("LeRobot's calibration with its URDF (.json, needs --servos)", lerobot_files),
     ".ros2_control.yaml": RobotOutput(
         "joint parameters of ros2_control drivers with their URDF (.ros2_control.yaml, needs --servos)",
-        servo_files,
+        ros2_control_files,
     ),
 }
 # Endings of the files of a robot, and what they are called in the JSON document.
