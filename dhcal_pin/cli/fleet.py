@@ -154,9 +154,9 @@ def _real_path(folder: str, path: str) -> str:
 
 def _output_paths(job: Job) -> list[str]:
     """List the files that a job writes."""
-    companions = companion_paths(job.output, has_servos=True) if job.servos else [sidecar_path(job.output)]
-    paths = (*companions, *job.output_paths)
-    return [path for path in paths if path]
+    has_more = job.servos or job.curves
+    companions = companion_paths(job) if has_more else [sidecar_path(job.output)]
+    return [path for path in (*companions, *job.output_paths) if path]
 
 
 def file_paths(entries: Sequence[FleetJob], path: PathLike) -> list[str]:

@@ -168,7 +168,8 @@ class Job:
     )
     curves: str | None = job_option(
         "write joint corrections for controllers that accept a table: joint, value and the angle "
-        "to add to it before it is commanded, in steps of 1 degree (.csv)",
+        "to add to it before it is commanded, in steps of 1 degree (.csv); beside it, the robot to use with "
+        "it (.with_table.urdf)",
         "CURVES.csv",
         output=Output("a table of corrections", (".csv",)),
     )

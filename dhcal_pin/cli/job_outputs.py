@@ -5,6 +5,7 @@ Functions import what they need when they are called, because help pages load no
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ..io.camera_files import CameraFrame
     from ..io.servo_file import ServoFile
     from ..robot.chain import Chain
+    from .job import Job
 
 
 # Ending of the corrected servo file.
@@ -168,10 +170,18 @@ def robot_stem(output: str) -> str:
     return output[: -len(robot_ending(output))]
 
 
-def companion_paths(output: str, has_servos: bool) -> list[str]:
-    """List the files that are written beside --output; those of a camera are not among them."""
-    endings = [".urdf", ".calibration.toml", SERVO_ENDING] if has_servos else [".calibration.toml"]
-    return [path for ending in endings if (path := robot_stem(output) + ending) != output]
+def companion_paths(job: Job) -> list[str]:
+    """List the files that are written beside the named ones; those of a camera are not among them."""
+    endings = [".urdf", ".calibration.toml", SERVO_ENDING] if job.servos else [".calibration.toml"]
+    paths = [robot_stem(job.output) + ending for ending in endings]
+    paths += [robot_of_table(job)] if job.curves else []
+    return [path for path in paths if path != job.output]
+
+
+def robot_of_table(job: Job) -> str:
+    """Return the path of the robot to which the table of --curves belongs."""
+    ending = ".xml" if robot_ending(job.output) == ".xml" else ".urdf"
+    return f"{os.path.splitext(job.curves or '')[0]}.with_table{ending}"
 
 
 def name_robot_files(paths: Iterable[str], output: str) -> dict[str, str]:

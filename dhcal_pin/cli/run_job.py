@@ -69,6 +69,7 @@ from .job_outputs import (
     name_robot_files,
     require_servos,
     robot_ending,
+    robot_of_table,
     robot_stem,
 )
 from .options import read_data, split_commas
@@ -237,7 +238,7 @@ def checked_inputs(job: Job) -> list[str]:
     require_workbook(job.sheet, measured)
     require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    companions = companion_paths(job.output, servos is not None)
+    companions = companion_paths(job)
     require_writable_outputs([*job.output_paths, *companions], protected)
     _require_own_sidecar([path for path in (job.output, *companions) if path])
     require_endings(job.outputs)
@@ -462,8 +463,10 @@ def _add_warnings(job: Job, fit: Result, data: JobData, sets: str, on_images: Se
     turned = [fit.signs.note] if fit.signs and fit.signs.turned else []
     assumed = [ASSUMED_ORDER] if has_assumed_directions(tuple(data.fitted.values()), fit.data) else []
     data.warnings.setdefault(job.robot, []).extend([*turned, *assumed, *on_images, *find_lattices(fit)])
-    if job.curves and not joint_corrections(fit.chain) and _is_kept(job, fit):
-        data.warnings.setdefault(job.robot, []).append(NO_CORRECTIONS)
+    if job.curves and _is_kept(job, fit):
+        text = f"use the table of --curves with {robot_of_table(job)}: {job.output} is best without it"
+        text = text if joint_corrections(fit.chain) else NO_CORRECTIONS
+        data.warnings.setdefault(job.robot, []).append(text)
     return hint
 
 
@@ -507,6 +510,9 @@ def _write_job(
     files = name_robot_files(map(str, contents), job.output)
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
+    if job.curves and is_kept:
+        files["curves_robot"] = robot_of_table(job)
+        contents[files["curves_robot"]] = io.complete_geometry(written.chain, files["curves_robot"])
     files = {name: shown.get(path, path) for name, path in files.items()}
     contents |= file_contents(outputs, _content_makers(job, fit, written, source))
     outliers = dict(zip(data.fitted, (rows.tolist() for rows in fit.outliers), strict=True))

@@ -22,6 +22,7 @@ from .rig_file import read_rig as read_rig
 from .rig_file import rig_text as rig_text
 from .rig_file import with_estimates_of as with_estimates_of
 from .robot import FORMATS as FORMATS
+from .robot import complete_geometry as complete_geometry
 from .robot import convert_robot as convert_robot
 from .robot import read_robot as read_robot
 from .robot import robot_name as robot_name

@@ -312,6 +312,12 @@ def _random_positions(n_joints: int) -> Array:
     return np.random.default_rng(0).uniform(-np.pi, np.pi, (N_READ_BACK_SAMPLES, n_joints))
 
 
+def complete_geometry(chain: Chain, path: PathLike) -> bytes:
+    """Return the robot file with the joint origins of the complete model, to use with joint corrections."""
+    geometry = replace(chain, transmission=None, urdf_origins=None)
+    return with_written_origins(chain.urdf, joint_origins(geometry)[0], path)[0]
+
+
 def with_written_origins(urdf: Urdf, origins: Mapping[str, Array], path: PathLike) -> tuple[bytes, Urdf]:
     """Return the bytes of a robot file with new joint origins, and the robot that is read from them."""
     if not is_mjcf_path(path):

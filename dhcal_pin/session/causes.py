@@ -126,8 +126,6 @@ class Cause:
     values: Array
     covariance: Array  # Their covariance, (F·c, F·c)
     log_evidence: float = 0.0  # Logarithm of the ratio of the evidence with and without it
-    # RMS of its effect on the residuals of the samples that it concerns, in standard deviations.
-    effect: float = 0.0
 
     @property
     def sizes(self) -> Array:

@@ -732,7 +732,7 @@ class _Search:
         is_supported = is_supported and self._outlier_share(full, cause) <= MAX_OUTLIER_SHARE
         is_supported = is_supported and not self._is_negligible_lag(cause)
         evidence = self._log_evidence(cause, i, full, without) if is_supported else -np.inf
-        return replace(cause, log_evidence=evidence, effect=effect)
+        return replace(cause, log_evidence=evidence)
 
     def _is_negligible_lag(self, cause: Cause) -> bool:
         """Return whether a cause is a lag that is too short to be one."""

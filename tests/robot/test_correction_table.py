@@ -117,7 +117,8 @@ def test_calibrate_writes_the_table(capsys, tmp_path, monkeypatch, arm):
     )
     status, err = run(*command, "--parameters", "minimal,base,tool,harmonics")
     assert status == 0, err
-    assert "wrote curves: curves.csv" in err
+    text = "use the table of --curves with curves.with_table.urdf: out.urdf is best without it"
+    assert text in " ".join(err.split())
     table = read("curves.csv")
     assert list(table[0]) == ["joint", "value[deg]", "correction[deg]"]
     assert len(table) == 5 * 721 + 361
@@ -129,6 +130,19 @@ def test_calibrate_writes_the_table(capsys, tmp_path, monkeypatch, arm):
         q[i] = np.deg2rad(value + correction)
         actual = found.actual_positions(Conditions(q.T))[0][i]
         np.testing.assert_allclose(np.rad2deg(actual), value, rtol=0, atol=1e-11)
+    # The robot beside the table, with corrected joint values, is the complete one; that of --output is not.
+    pairs = [(float(row["value[deg]"]), float(row["correction[deg]"])) for row in table]
+    q = rng.uniform(-2, 2, (50, 6))
+    commanded = np.empty_like(q)
+    for i, name in enumerate(arm.joint_names):
+        own = np.deg2rad([pair for row, pair in zip(table, pairs, strict=True) if row["joint"] == name])
+        commanded[:, i] = q[:, i] + np.interp(q[:, i], *own.T)
+    Path("out.calibration.toml").rename("sidecar.toml")
+    places = [read_robot(path, "tool0").poses(q)[:, :3, 3] for path in ("curves.with_table.urdf", "out.urdf")]
+    actual = found.with_base_and_tool(np.eye(4), np.eye(4)).poses(commanded)[:, :3, 3]
+    largest = [np.linalg.norm(each - actual, axis=1).max() for each in places]
+    assert largest[0] < 1e-6
+    assert largest[1] > 1e-4
     status, err = run(*command)
     assert status == 0, err
     assert Path("curves.csv").read_text() == "joint,value[deg],correction[deg]\n"
