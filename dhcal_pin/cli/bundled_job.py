@@ -63,7 +63,7 @@ def run_any_job(
             copy = Path(copies, name)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(read_bytes(path))
-        outputs = [*job.output_paths, *companion_paths(job)]
+        outputs = [*job.output_paths, *companion_paths(job.output, job.curves, job.servos is not None)]
         shown = {os.path.abspath(path): path for path in outputs}
         moved = with_output_paths(_renamed(job, names), os.path.abspath)
         moved = replace(moved, package_dir=tuple(map(os.path.abspath, job.package_dir)))

@@ -155,7 +155,9 @@ def _real_path(folder: str, path: str) -> str:
 def _output_paths(job: Job) -> list[str]:
     """List the files that a job writes."""
     has_more = job.servos or job.curves
-    companions = companion_paths(job) if has_more else [sidecar_path(job.output)]
+    companions = (
+        companion_paths(job.output, job.curves, bool(job.servos)) if has_more else [sidecar_path(job.output)]
+    )
     return [path for path in (*companions, *job.output_paths) if path]
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ..io.camera_files import CameraFrame
     from ..io.servo_file import ServoFile
     from ..robot.chain import Chain
-    from .job import Job
 
 
 # Ending of the corrected servo file.
@@ -170,18 +169,18 @@ def robot_stem(output: str) -> str:
     return output[: -len(robot_ending(output))]
 
 
-def companion_paths(job: Job) -> list[str]:
+def companion_paths(output: str, curves: str | None, has_servos: bool) -> list[str]:
     """List the files that are written beside the named ones; those of a camera are not among them."""
-    endings = [".urdf", ".calibration.toml", SERVO_ENDING] if job.servos else [".calibration.toml"]
-    paths = [robot_stem(job.output) + ending for ending in endings]
-    paths += [robot_of_table(job)] if job.curves else []
-    return [path for path in paths if path != job.output]
+    endings = [".urdf", ".calibration.toml", SERVO_ENDING] if has_servos else [".calibration.toml"]
+    paths = [robot_stem(output) + ending for ending in endings]
+    paths += [robot_of_table(curves, output)] if curves else []
+    return [path for path in paths if path != output]
 
 
-def robot_of_table(job: Job) -> str:
+def robot_of_table(curves: str, output: str) -> str:
     """Return the path of the robot to which the table of --curves belongs."""
-    ending = ".xml" if robot_ending(job.output) == ".xml" else ".urdf"
-    return f"{os.path.splitext(job.curves or '')[0]}.with_table{ending}"
+    ending = ".xml" if robot_ending(output) == ".xml" else ".urdf"
+    return f"{os.path.splitext(curves)[0]}.with_table{ending}"
 
 
 def name_robot_files(paths: Iterable[str], output: str) -> dict[str, str]:

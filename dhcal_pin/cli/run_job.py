@@ -238,7 +238,7 @@ def checked_inputs(job: Job) -> list[str]:
     require_workbook(job.sheet, measured)
     require_writable_outputs([file.path for file in job.outputs], inputs)
     protected = [*measured, *settings] if job.in_place else inputs
-    companions = companion_paths(job)
+    companions = companion_paths(job.output, job.curves, servos is not None)
     require_writable_outputs([*job.output_paths, *companions], protected)
     _require_own_sidecar([path for path in (job.output, *companions) if path])
     require_endings(job.outputs)
@@ -464,7 +464,7 @@ def _add_warnings(job: Job, fit: Result, data: JobData, sets: str, on_images: Se
     assumed = [ASSUMED_ORDER] if has_assumed_directions(tuple(data.fitted.values()), fit.data) else []
     data.warnings.setdefault(job.robot, []).extend([*turned, *assumed, *on_images, *find_lattices(fit)])
     if job.curves and _is_kept(job, fit):
-        text = f"use the table of --curves with {robot_of_table(job)}: {job.output} is best without it"
+        text = f"use the table of --curves with {robot_of_table(job.curves, job.output)}: {job.output} is best without it"
         text = text if joint_corrections(fit.chain) else NO_CORRECTIONS
         data.warnings.setdefault(job.robot, []).append(text)
     return hint
@@ -511,7 +511,7 @@ def _write_job(
     outputs = [file for file in job.outputs if is_kept or file.output.is_written_if_refused]
     files |= paths_by_name(outputs)
     if job.curves and is_kept:
-        files["curves_robot"] = robot_of_table(job)
+        files["curves_robot"] = robot_of_table(job.curves, job.output)
         contents[files["curves_robot"]] = io.complete_geometry(written.chain, files["curves_robot"])
     files = {name: shown.get(path, path) for name, path in files.items()}
     contents |= file_contents(outputs, _content_makers(job, fit, written, source))
