@@ -711,9 +711,11 @@ def _plausible_cause(fit: Evidence) -> str:
     if fit.diagnosis.is_explained:
         if missing := _missing_frames(fit):
             verb = "are" if len(missing) > 1 else "is"
+            # The default of a DH table lacks both.
+            sets = ",".join([fit.chain.parameters, *missing]) if fit.has_default_sets else FULL_SET
             return (
                 f"The measurements fit this robot if its {' and '.join(missing)} {verb} estimated: "
-                "--parameters minimal,base,tool."
+                f"--parameters {sets}."
             )
         if _lacks_parameters(fit):
             return "More parameters of the robot fit the measurements: --parameters minimal,base,tool."

@@ -464,7 +464,8 @@ def _add_warnings(job: Job, fit: Result, data: JobData, sets: str, on_images: Se
     assumed = [ASSUMED_ORDER] if has_assumed_directions(tuple(data.fitted.values()), fit.data) else []
     data.warnings.setdefault(job.robot, []).extend([*turned, *assumed, *on_images, *find_lattices(fit)])
     if job.curves and _is_kept(job, fit):
-        text = f"use the table of --curves with {robot_of_table(job.curves, job.output)}: {job.output} is best without it"
+        robot = robot_of_table(job.curves, job.output)
+        text = f"use the table of --curves with {robot}: {job.output} is best without it"
         text = text if joint_corrections(fit.chain) else NO_CORRECTIONS
         data.warnings.setdefault(job.robot, []).append(text)
     return hint

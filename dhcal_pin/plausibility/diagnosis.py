@@ -81,7 +81,8 @@ class Diagnosis:
             (self.before.length_scale, self.after.length_scale, "m"),
             (self.before.angle_scale, self.after.angle_scale, "rad"),
         ):
-            if before > _MIN_NAMED_RATIO * after:
+            # With errors of any size a robot may have fitted these measurements before.
+            if leaves_residuals(self.before) and before > _MIN_NAMED_RATIO * after:
                 sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
                 rest = " Something else is wrong, too." * leaves_residuals(self.after)
                 return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}.{rest}"

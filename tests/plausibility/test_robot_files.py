@@ -110,3 +110,17 @@ def test_a_robot_and_measurements_of_kilometres_are_refused():
     found = calibrate(wrong, data.replace(values=1e3 * data.values), "minimal,base,tool").verdict
     assert found.status == "refused"
     assert found.reasons[0].startswith("The links of the robot are 1511 m long together")
+
+
+@pytest.mark.parametrize("name", ["kuka", "panda", "scara"])
+def test_a_dh_table_with_an_unknown_base_is_calibrated_with_the_named_sets(name):
+    right = Chain.from_dh(TABLES[name])
+    data = measured(right, Pose, 2)
+    (sets,) = {
+        word
+        for text in calibrate(right, data).verdict.reasons
+        for word in text.split()
+        if "base" in word and "," in word
+    }
+    assert calibrate(right, data, sets.strip(".")).verdict.status == "ok"
+    assert sets == f"{right.parameters},base,tool."
