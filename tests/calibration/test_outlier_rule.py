@@ -219,7 +219,8 @@ def test_a_kept_robot_has_no_part_of_the_correction():
     fit = calibrate(simulation.chain, fitted, holdout=held_out, extend="none")
     assert fit.verdict.keeps_nominal
     # The chain of the fit has the correction: only the accepted result says that it has none.
-    assert fit.shrinkage_factor and np.any(fit.chain.poses(fitted.q) != simulation.chain.poses(fitted.q))
+    assert fit.shrinkage_factor
+    assert np.any(fit.chain.poses(fitted.q) != simulation.chain.poses(fitted.q))
     (reason,) = (text for text in fit.verdict.reasons if "nominal robot" in text)
     assert reason.endswith("Keep the nominal robot, and measure more poses.")
     assert "correction" not in " ".join(fit.verdict.reasons)
