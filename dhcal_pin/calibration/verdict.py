@@ -794,8 +794,8 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
     remedy = ", and measure more poses"
     if before.unit == "m" and before.rms < MAX_COMPUTED_ERROR * _workspace_size(fit):
         remedy = (
-            ": no real arm fits its nominal model so well, and the measured values were probably computed with "
-            "it, such as by the controller. Measure with an independent instrument"
+            ": no real arm fits its nominal model so well, and the measured values were probably computed "
+            "with it, such as by the controller. Measure with an independent instrument"
         )
     return [Finding("caution", f"{text}. Keep the nominal robot{remedy}.", True)]
 

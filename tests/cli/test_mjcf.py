@@ -69,6 +69,12 @@ def test_a_calibrated_urdf_goes_into_the_mjcf(run, assert_refused, mjcf_folder):
     stdout_of(run("calibrate", "ur5e.urdf", "ur5e.csv", "-o", "urdf.urdf", *TIP))
     _, _, err = run("convert", "urdf.urdf", "out.xml", "--template", "ur5e.xml", *TIP)
     assert "note: urdf.calibration.toml is not copied" in err
+    # The MJCF has the joints of the URDF: it can be read with its sidecar. The nominal robot has others.
+    to_template = ("convert", "urdf.urdf", "urdf.xml", "--template", "ur5e.xml", *TIP)
+    assert "note: urdf.calibration.toml lies beside it and is read with it" in run(*to_template)[2]
+    assert np.array_equal(read_robot("urdf.xml").base, read_robot("urdf.urdf").base)
+    words = ["mjcf.urdf: mjcf.calibration.toml lies beside it, belongs to another robot file"]
+    assert_refused(words, "convert", "ur5e.xml", "mjcf.urdf")
     q = np.random.default_rng(0).uniform(-3, 3, (20, 6))
     chain = read_robot("urdf.urdf", "attachment_site")
     poses = [
