@@ -47,6 +47,7 @@ from .sidecar import (
     sidecar_text,
     with_sidecar,
 )
+from .tables import WORKBOOK_ENDINGS
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -171,6 +172,10 @@ def _read_urdf(path: PathLike) -> Urdf:
     """Read a URDF or an MJCF; a file with an unknown ending is read as a URDF."""
     robot_format = find_format(path)
     if robot_format is None:
+        if os.fspath(path).lower().endswith(WORKBOOK_ENDINGS):
+            raise FileFormatError(
+                f"{os.fspath(path)}: a workbook holds no robot; save a DH table as .dh.csv or .dh.toml"
+            )
         return read_urdf(path)
     if robot_format.correct is not None:
         raise FileFormatError(
@@ -264,9 +269,8 @@ def convert_robot(
             )
         if template is not None:
             return _with_template(source, target, tip, template, template_tip)
-        read = read_urdf if source_format is None else source_format.read_urdf
-        if read is not None:
-            return _copy(source, target, read(source))
+        if source_format is None or source_format.read_urdf is not None:
+            return _copy(source, target, _read_urdf(source))
     elif template is not None:
         raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
     chain, table = _read(source, tip, None)
