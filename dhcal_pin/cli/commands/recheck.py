@@ -100,7 +100,9 @@ def run(args: Namespace) -> int:
     texts = texts_by_file(mistakes)
     if texts and any(change.kind == "robot" for change in result.changes):
         # Wrong units and the like change all parts of the robot at once.
-        result = replace(result, verdict="cannot say", reasons=(_MISTAKE.format(texts[0].rstrip(".")),), changes=())
+        result = replace(
+            result, verdict="cannot say", reasons=(_MISTAKE.format(texts[0].rstrip(".")),), changes=()
+        )
     warnings = _with_fitted_rows(mistakes, files, io.read_fitted(sidecar))
     if servos is not None:
         are_fitted = any(warnings[file.source] != mistakes.get(file.source, []) for file in files)
