@@ -72,7 +72,7 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
         (
             {"max_iterations": 2.5},
             InvalidArgumentError,
-            "max_iterations is 2.5; expected at least 1, a whole",
+            "max_iterations is 2.5; expected at least 1, a",
         ),
         ({"method": "newton"}, UnknownNameError, "unknown method 'newton'; choose from lm, gn"),
         (
