@@ -260,10 +260,10 @@ def plot_checks(
 
 
 def sample_color(role: str, has_holdout: bool) -> str:
-    """Return the name in `COLORS` of the dots of "fitted", "hold-out" or "outlier" samples."""
+    """Return the name in `COLORS` of the dots of "fitted", "hold-out", "outlier" or other samples."""
     if role == "fitted":
         return "sample" if has_holdout else "after"
-    return {"hold-out": "holdout", "outlier": "outlier"}[role]
+    return {"hold-out": "holdout", "outlier": "outlier"}.get(role, "after")
 
 
 def medians_by_part(x: Array, values: Array) -> tuple[Array, Array]:
