@@ -89,12 +89,13 @@ def join_names(names: Sequence[str]) -> str:
 
 
 def list_first(items: Sequence[object], most: int = MAX_LISTED, noun: str = "") -> str:
-    """Join the first items of a list with commas, and count the others.
+    """Join the first items of a list with commas, and count the others by a noun whose plural ends in s.
 
-    >>> list_first([2, 5, 7], 2), list_first(["a", "b"]), list_first("abc", 1, "letters")
-    ('2, 5 and 1 more', 'a, b', 'a and 2 more letters')
+    >>> list_first([2, 5, 7], 2), list_first(["a", "b"]), list_first("abc", 2, "letter")
+    ('2, 5 and 1 more', 'a, b', 'a, b and 1 more letter')
     """
-    more = f" and {len(items) - most} more {noun}".rstrip() if len(items) > most else ""
+    n_more = len(items) - most
+    more = f" and {format_count(n_more, f'more {noun}') if noun else f'{n_more} more'}" if n_more > 0 else ""
     return ", ".join(map(str, items[:most])) + more
 
 

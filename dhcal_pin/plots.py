@@ -47,6 +47,7 @@ COLORS = {
     "before": "#0072b2",
     "after": "#b85c00",
     "sample": "#8496a5",
+    "holdout": "#007a5e",
     "outlier": "#b0106a",
     "measured": "#d4452f",
     "unknown": "#e3e8ec",
@@ -259,10 +260,10 @@ def plot_checks(
 
 
 def sample_color(role: str, has_holdout: bool) -> str:
-    """Return the name in `COLORS` of the dots of "fitted", "hold-out" or "outlier" samples."""
-    if role == "outlier":
-        return "outlier"
-    return "sample" if role == "fitted" and has_holdout else "after"
+    """Return the name in `COLORS` of the dots of "fitted", "hold-out", "outlier" or other samples."""
+    if role == "fitted":
+        return "sample" if has_holdout else "after"
+    return {"hold-out": "holdout", "outlier": "outlier"}.get(role, "after")
 
 
 def medians_by_part(x: Array, values: Array) -> tuple[Array, Array]:

@@ -249,6 +249,25 @@ def test_prefix_is_the_name_of_the_file(name, prefix):
     assert f" {prefix}_forward_kinematics(" in model_code(nominal_arm("ur10"), Path("folder") / name)
 
 
+def test_wrong_shapes_are_named(tmp_path):
+    model = python_model(nominal_arm("ur10"), tmp_path)
+    for function in (model.forward_kinematics, model.pose_and_jacobian, model.gravity_torques):
+        for wrong in (np.zeros(7), np.zeros((6, 2)), 0.5):
+            with pytest.raises(ValueError, match=r"joint positions of shape \(.*\); expected \(\.\.\., 6\)"):
+                function(wrong)
+    for target, start in ((np.eye(4), np.zeros((2, 6))), (np.eye(3), np.zeros(6)), (np.eye(4), np.zeros(5))):
+        with pytest.raises(ValueError, match=r"expected \(4, 4\) and \(6,\)"):
+            model.inverse_kinematics(target, start)
+
+
+@pytest.mark.parametrize(("name", "is_noted"), [("3arm.py", True), ("class.py", True), ("arm3.py", False)])
+def test_a_name_that_python_does_not_import_is_noted(name, is_noted, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_bytes(nominal_arm("ur10").urdf.data)
+    assert main.main(["export", "arm.urdf", "--tip", "tool0", "-o", name]) == 0
+    assert ("Python imports no module of this name" in capsys.readouterr().err) == is_noted
+
+
 def test_unknown_ending_is_refused():
     with pytest.raises(InvalidArgumentError, match=r"model\.cpp: unknown ending; choose from \.h, \.py"):
         model_code(nominal_arm("ur10"), "model.cpp")

@@ -139,8 +139,9 @@ def cross_validate(fit: FittedModel, folds: Sequence[Fold] | None = None) -> Cro
 
     Args:
         fit: FittedModel of a calibration.
-        folds: Folds of `fit.data` from `k_fold`, `leave_one_group_out` or `blocked_folds`; the last one
-            with the contacts of the measurements if not given.
+        folds: Folds of `fit.data` from `k_fold`, `leave_one_group_out` or `blocked_folds`. By default those
+            of `blocked_folds`, which leave out regions of joint space; samples that touch the same thing
+            are held out together.
 
     Returns:
         Errors of the held-out samples without outliers, and how many there are.

@@ -245,6 +245,8 @@ class Evidence(FittedModel):
     @property
     def shrinkage_notes(self) -> list[str]:
         """One sentence if the correction was not applied in full, else empty."""
+        if self.is_kept_nominal:
+            return ["Not significantly better than the nominal robot: no correction applied."]
         if self.shrinkage_factor == 1:
             return []
         applied = f"only {100 * self.shrinkage_factor:.0f} % of the" if self.shrinkage_factor else "no"

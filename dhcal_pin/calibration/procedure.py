@@ -26,6 +26,7 @@ import fnmatch
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from numbers import Integral
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -569,8 +570,10 @@ def _check_options(options: _Options, data: Sequence[Measurement]) -> None:
     if options.session not in get_args(SessionOption):
         choices = ", ".join(get_args(SessionOption))
         raise UnknownNameError(f"unknown session option {options.session!r}; choose from {choices}")
-    if options.max_iterations < 1:
-        raise InvalidArgumentError(f"max_iterations is {options.max_iterations}; expected at least 1")
+    if not isinstance(options.max_iterations, Integral) or options.max_iterations < 1:
+        raise InvalidArgumentError(
+            f"max_iterations is {options.max_iterations}; expected at least 1, a whole number"
+        )
     if loss not in ("auto", "linear") and method != "lm":
         raise InvalidArgumentError(
             f"loss {loss!r} requires method 'lm'; method {method!r} weights all samples equally"

@@ -78,7 +78,7 @@ class Result(Evidence, ResultPlots):
             shrinkage_factor=0.0,
             bare=None,
             is_kept_nominal=True,
-            decision=self.verdict,
+            decision=replace(self.verdict, reasons=(*self.verdict.reasons, "No correction is applied.")),
         )
 
     @property

@@ -98,9 +98,12 @@ def position_notes(std: float | None) -> list[str]:
 
 
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:
-    """Sort the corrections x of the robot by their effect on the measured values."""
-    order = np.argsort(-np.abs(x) * system.column_norms, kind="stable")
-    return [estimates[i] for i in order if estimates[i].category == "robot" and estimates[i].change]
+    """Sort the corrections x of the robot by their effect on the measured values.
+
+    Those that are zero within two standard deviations are left out.
+    """
+    ordered = [estimates[i] for i in np.argsort(-np.abs(x) * system.column_norms, kind="stable")]
+    return [e for e in ordered if e.category == "robot" and e.change and not abs(e.change) <= 2 * e.std]
 
 
 def statistic(errors: ErrorStatistics, name: str = "rms") -> Quantity:

@@ -805,13 +805,13 @@ def _held_out_errors(fit: Evidence) -> list[Finding]:
     if fit.camera_stages or paired.is_better:
         return []
     text = f"The calibrated robot is not significantly better than the nominal one ({figures})"
-    remedy = "measure more poses"
+    remedy = ", and measure more poses"
     if before.unit == "m" and before.rms < MAX_COMPUTED_ERROR * _workspace_size(fit):
         remedy = (
-            "no real arm fits its nominal model so well: the measured values were probably computed with it, "
-            "such as by the controller. Measure with an independent instrument"
+            ": no real arm fits its nominal model so well, and the measured values were probably computed "
+            "with it, such as by the controller. Measure with an independent instrument"
         )
-    return [Finding("caution", f"{text}. No correction is applied; {remedy}.", True)]
+    return [Finding("caution", f"{text}. Keep the nominal robot{remedy}.", True)]
 
 
 def _fitted_holdout(fit: Evidence) -> list[Finding]:

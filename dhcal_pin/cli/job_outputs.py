@@ -204,4 +204,7 @@ def robot_ending(path: str) -> str:
     for ending in ROBOT_FORMATS:
         if path.lower().endswith(ending):
             return ending
-    raise InvalidArgumentError(f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}")
+    text = f"{path}: unknown file extension; expected {' or '.join(ROBOT_FORMATS)}"
+    if path.lower().endswith((".dh.csv", ".dh.toml")):
+        text += f"; for a DH table write cal.urdf, then `dhcal convert cal.urdf {path}`"
+    raise InvalidArgumentError(text)

@@ -115,7 +115,8 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser = _MainParser(
         prog="dhcal",
         description="Robot kinematic calibration: estimate the errors of a robot and correct its URDF.",
-        epilog="ROBOT is a URDF or a DH file. `dhcal COMMAND --help` shows the options and an example.",
+        epilog="ROBOT is a URDF, an MJCF, a DH table, a kinematics file of Universal Robots,\n"
+        "or example:NAME. `dhcal COMMAND --help` shows the options and an example.",
         formatter_class=HelpFormatter,
     )
     parser.add_argument("--version", action=_VersionAction, nargs=0, help="show the version and exit")

@@ -177,7 +177,8 @@ def add_options(parser: argparse._ActionsContainer, table: Options) -> None:
 ROBOT: dict[str, Any] = {
     "metavar": "ROBOT",
     "type": robot_path,
-    "help": "robot: {robot_formats}, or example:NAME; flange.urdf, which ships, is a flange at any pose",
+    "help": "robot: {robot_formats}, or example:NAME; flange.urdf (built in) for images with stated poses of "
+    "the flange",
 }
 DATA: dict[str, Any] = {
     "metavar": "DATA",

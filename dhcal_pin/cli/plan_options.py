@@ -60,7 +60,7 @@ ARGUMENTS: options.Options = {
     # The goal, and the calibration for which the poses are planned.
     "--recheck": "plan a check of a calibrated robot for `dhcal recheck`: poses that reveal a change of the "
     "zero of a joint, of the base or of the tool",
-    "--repeat": "measure up to three of the poses at the begin, in the middle and at the end, so that a "
+    "--repeat": "measure up to three of the poses at the beginning, in the middle and at the end, so that a "
     "change during the measurement can be found; they count among the N poses",
     "--criterion C": "optimality criterion (default: D): {criteria}",
     "--task FILE": "configurations where the accuracy matters: joint values, or tool positions "

@@ -51,13 +51,13 @@ class Extrapolation:
             return [f"All {self.n_samples} samples are within the measured region of the calibration."]
         share = 100 * self.n_outside / self.n_samples
         out = [
-            f"{self.n_outside} of {self.n_samples} samples ({share:.0f} %) are outside the measured region "
-            "of the calibration."
+            f"{self.n_outside} of {self.n_samples} samples ({share:.0f} %) {_verb(self.n_outside)} outside "
+            "the measured region of the calibration."
         ]
         if self.n_beyond_reach:
             out.append(
-                f"{self.n_beyond_reach} of them are farther away than the regions that were left out to "
-                "judge the calibration: no accuracy was stated there."
+                f"{self.n_beyond_reach} of them {_verb(self.n_beyond_reach)} farther away than the regions "
+                "that were left out to judge the calibration: no accuracy was stated there."
             )
         for group in [name for name in self.inside.groups if name in self.outside.groups]:
             inside, outside = self.inside.groups[group], self.outside.groups[group]
@@ -76,7 +76,7 @@ class Extrapolation:
                 "No joint is beyond its measured range, but the combinations of joint values are new or rare."
             )
             return [*out, text]
-        return [*out, f"Beyond the measured range: {list_first(exceeding, _MAX_JOINTS, 'joints')}."]
+        return [*out, f"Beyond the measured range: {list_first(exceeding, _MAX_JOINTS, 'joint')}."]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for the JSON document."""
@@ -88,6 +88,10 @@ class Extrapolation:
             "inside": self.inside.to_dict(),
             "outside": self.outside.to_dict(),
         }
+
+
+def _verb(count: int) -> str:
+    return "is" if count == 1 else "are"
 
 
 def find_extrapolation(

@@ -132,9 +132,10 @@ def _read_dh_csv(path: PathLike) -> DHTable:
             "first, then measurements"
         )
     notes = _notes(table)
-    convention = notes.get("convention")
+    written = notes.get("convention")
+    convention = str(written).lower()
     if convention not in CONVENTIONS:
-        problem = "no convention" if convention is None else f"unknown convention {convention!r}"
+        problem = "no convention" if written is None else f"unknown convention {written!r}"
         raise FileFormatError(
             f"{table.source}: {problem}; write a line '# convention: standard' or '# convention: modified'"
         )
@@ -157,6 +158,7 @@ def _read_dh_csv(path: PathLike) -> DHTable:
                 f"{table.cell_location(row, 'type')}: joint {columns['name'][row]!r}: unknown type "
                 f"{joint_type!r}; choose from {', '.join(_JOINT_TYPES)}"
             )
+    table.require_units(_UNITS)
     n_joints = len(table.cells)
     for key, units in _UNITS.items():
         column = table.columns.get(key)

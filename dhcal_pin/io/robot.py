@@ -40,12 +40,14 @@ from .sidecar import (
     NO_FINDINGS,
     Findings,
     Fitted,
+    belongs_to,
     existing_sidecar,
     read_tip,
     sidecar_path,
     sidecar_text,
     with_sidecar,
 )
+from .tables import WORKBOOK_ENDINGS
 from .template import with_kinematics
 
 # Smaller entries of an addition to a joint origin are rounding errors [m or rad].
@@ -70,7 +72,7 @@ def robot_name(path: PathLike) -> str:
 
 def _urdf_of_table(robot: RobotSource, path: PathLike) -> ConvertedRobot:
     """Convert a DH table to its exact URDF."""
-    return ConvertedRobot(robot.chain.urdf.data.decode(), _notes_beside(path))
+    return ConvertedRobot(robot.chain.urdf.data.decode(), _notes_beside(path, robot.chain.urdf))
 
 
 def _mjcf_needs_template(robot: RobotSource, path: PathLike) -> ConvertedRobot:
@@ -80,7 +82,7 @@ def _mjcf_needs_template(robot: RobotSource, path: PathLike) -> ConvertedRobot:
 
 def _copy(source: PathLike, target: PathLike, urdf: Urdf) -> ConvertedRobot:
     """Copy a URDF or an MJCF, or translate an MJCF to a URDF; no single deepest tip is needed."""
-    notes = [*_notes_beside(target), *_notes_on_sidecar(source)]
+    notes = [*_notes_beside(target, urdf), *_notes_on_sidecar(source)]
     if not is_mjcf_path(target):
         if isinstance(urdf, Mjcf):
             notes.append(
@@ -92,9 +94,14 @@ def _copy(source: PathLike, target: PathLike, urdf: Urdf) -> ConvertedRobot:
     return ConvertedRobot(urdf.file.decode(), notes)
 
 
-def _notes_beside(path: PathLike) -> list[str]:
-    """Note a sidecar beside a URDF that is to be written."""
+def _notes_beside(path: PathLike, urdf: Urdf) -> list[str]:
+    """Note a sidecar beside a robot that is to be written; require that it was written with this robot."""
     sidecar = existing_sidecar(path)
+    if sidecar and not belongs_to(sidecar, urdf):
+        raise InvalidArgumentError(
+            f"{os.fspath(path)}: {sidecar} lies beside it, belongs to another robot file and would be "
+            "read with it; choose another name"
+        )
     return [f"{sidecar} lies beside it and is read with it"] if sidecar else []
 
 
@@ -165,6 +172,10 @@ def _read_urdf(path: PathLike) -> Urdf:
     """Read a URDF or an MJCF; a file with an unknown ending is read as a URDF."""
     robot_format = find_format(path)
     if robot_format is None:
+        if os.fspath(path).lower().endswith(WORKBOOK_ENDINGS):
+            raise FileFormatError(
+                f"{os.fspath(path)}: a workbook holds no robot; save a DH table as .dh.csv or .dh.toml"
+            )
         return read_urdf(path)
     if robot_format.correct is not None:
         raise FileFormatError(
@@ -258,9 +269,8 @@ def convert_robot(
             )
         if template is not None:
             return _with_template(source, target, tip, template, template_tip)
-        read = read_urdf if source_format is None else source_format.read_urdf
-        if read is not None:
-            return _copy(source, target, read(source))
+        if source_format is None or source_format.read_urdf is not None:
+            return _copy(source, target, _read_urdf(source))
     elif template is not None:
         raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
     chain, table = _read(source, tip, None)
@@ -279,7 +289,7 @@ def _with_template(
             f"{os.fspath(target)}: {os.fspath(template)} has another format; expected a URDF for a .urdf "
             "and an MJCF for an .xml"
         )
-    notes = _notes_beside(target)
+    notes: list[str] = []
     source_format = find_format(source)
     if source_format is not None and source_format.correct is not None:
         robot, applied = source_format.correct(source, Chain.from_urdf(nominal, template_tip or tip))
@@ -304,6 +314,7 @@ def _with_template(
             "off; choose a --template-tip behind a fixed joint, or a site"
         )
     require_agreement(parsed, nominal_chain, target)
+    notes += _notes_beside(target, urdf)
     return ConvertedRobot(data.decode(), [*notes, *_notes_on_sidecar(source)])
 
 

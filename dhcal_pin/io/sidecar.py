@@ -295,6 +295,13 @@ def robots_of_sidecar(sidecar: PathLike) -> list[str]:
     ]
 
 
+def belongs_to(sidecar: PathLike, urdf: Urdf) -> bool:
+    """Return whether a sidecar was written with a URDF; one without a manifest belongs to any."""
+    read = TomlTable.read(sidecar, MAX_SIDECAR_BYTES).some_values(_FRAME_KEYS)
+    manifest, tip = read["manifest"], read["tip"]
+    return manifest is None or (tip in urdf.links and _is_of(manifest, urdf, tip))
+
+
 # --- reading ---------------------------------------------------------------------------------------
 
 
@@ -384,13 +391,19 @@ def read_tool(path: PathLike) -> Array:
 
 def _check_manifest(manifest: Mapping[str, str], path: str, urdf: Urdf, tip: str) -> None:
     """Require that the sidecar was written with a URDF of the same joints from the root to the tip."""
-    actual = hashlib.sha256(urdf.data).hexdigest()
-    if manifest["urdf_sha256"] != actual and manifest["joints_sha256"] != _joints_digest(urdf, tip):
+    if not _is_of(manifest, urdf, tip):
+        actual = hashlib.sha256(urdf.data).hexdigest()
         raise FileFormatError(
             f"{path}: does not belong to {urdf.source}: it was written with another content of that "
             "file; calibrate again, restore the other file, or, if you edited the robot yourself, write "
             f'urdf_sha256 = "{actual}" in [manifest]'
         )
+
+
+def _is_of(manifest: Mapping[str, str], urdf: Urdf, tip: str) -> bool:
+    """Return whether a manifest states the bytes of a URDF or its joints from the root to the tip."""
+    is_same = manifest["urdf_sha256"] == hashlib.sha256(urdf.data).hexdigest()
+    return is_same or manifest["joints_sha256"] == _joints_digest(urdf, tip)
 
 
 def _manifest_content(urdf: Urdf, tip: str, fitted: Fitted) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from .._typing import Array
 from ..exceptions import InvalidArgumentError
 from ..subsampling import evenly_spaced_indices
+from .validation import validated_array
 
 # Anchors of the paper's device closer to one line than this are collinear, relative to its largest dimension.
 MIN_RELATIVE_DIMENSION = 1e-9
@@ -50,9 +51,14 @@ def trilaterate_three_wires(lengths: ArrayLike, a: float, b: float, c: float, si
     """Compute positions (m, 3) [m] from the lengths L1, L2, L3 of the paper's device in closed form (41).
 
     The anchors are those of `device_anchors`. Their plane is a mirror; `side` is the sign of x. Collinear
-    anchors (a = c or b = 0) and lengths that do not meet raise `InvalidArgumentError`.
+    anchors (a = c or b = 0) and lengths that are negative or do not meet raise `InvalidArgumentError`.
     """
-    l1, l2, l3 = np.asarray(lengths, float).T
+    rows = validated_array(lengths, (None, 3), "three wires: lengths")
+    if (negative := np.flatnonzero((rows < 0).any(1))).size:
+        raise InvalidArgumentError(
+            f"three wires: a length of sample {negative[0] + 1} is negative; expected lengths in m"
+        )
+    l1, l2, l3 = rows.T
     scale = max(abs(a), abs(b), abs(c))
     if min(abs(a - c), abs(b)) <= MIN_RELATIVE_DIMENSION * scale:
         raise InvalidArgumentError(

@@ -133,9 +133,13 @@ def error_factors(table: DHTable, q: Array) -> Array:
         Δθ_1 … Δθ_n, Δd_1 … Δd_n, Δa_1 … Δa_n, Δα_1 … Δα_n.
 
     Raises:
-        InvalidArgumentError: The table has modified DH parameters, for which the paper gives no factors, or
-            q is no array of numbers.
+        InvalidArgumentError: The table is no DH table or has modified DH parameters, for which the paper
+            gives no factors, or q is no array of numbers.
     """
+    if not isinstance(table, DHTable):
+        raise InvalidArgumentError(
+            f"table has type {type(table).__name__}; expected a DH table, such as read_dh(path)"
+        )
     if table.convention != "standard":
         raise InvalidArgumentError(
             "the paper's error factors need standard DH parameters; convert the table first"

@@ -55,7 +55,7 @@ def with_repeats(
     space: WorkspaceConstraints,
     margin: Noise,
 ) -> Plan:
-    """Return a plan with its most informative poses at the begin, in the middle and at the end."""
+    """Return a plan with its most informative poses at the beginning, in the middle and at the end."""
     rows, none = plan.information.rows(plan.q), np.zeros(0, int)
     candidates = CandidateSet(rows, scale_joint_units(chain, plan.q), 0.0)
     chosen = select_greedily(

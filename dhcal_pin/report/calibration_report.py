@@ -65,7 +65,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
             "assess the robot."
         )
     values = [("before", "before, RMS", head.before), ("after", "after, RMS", head.after)]
-    if best.before.groups[head.group].rms:
+    if best.before.groups[head.group].rms and not verdict.is_refused:
         change = "smaller" if head.percent_reduction >= 0 else "larger"
         values.append(("", change, f"{abs(head.percent_reduction):.0f} %"))
     regions = summary.generalization_lines(context.fit.generalization, context.comparisons)

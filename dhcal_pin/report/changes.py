@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import plots, se3
 from ..diagnostics.difference import STATISTICS, Difference
-from ..formatting import Quantity, Table
+from ..formatting import Quantity, Table, format_count
 from ..io.check_history import Check
 from ..plots import SQUARE_PANEL, WIDE_PANEL
 from ..visualization import scene
@@ -84,7 +84,7 @@ def history_page(robot: str, checks: Sequence[Check]) -> str:
         Document(
             title=f"Checks of {robot}",
             heading=f"{last.verdict}: {last.what}" if last.what else last.verdict,
-            eyebrow=f"Last of {len(checks)} checks of {robot}, {last.time}",
+            eyebrow=f"{format_count(len(checks), 'check')} of {robot}, the last one {last.time}",
             sections=[
                 Section("history", "Checks over time", figures=partial(_history_figures, checks)),
                 Section("checks", "Checks", tables=[_history_table(checks)]),

@@ -108,7 +108,7 @@ class Chain:
         payload: Point mass at the tip that loads compliant joints.
         reference_temperature: Temperature at which the links have their lengths [°C].
         first_link: Name of the link where the chain begins; empty for the root of the URDF.
-        n_reversed: Number of joints at the begin of the chain that are passed from child to parent.
+        n_reversed: Number of joints at the beginning of the chain that are passed from child to parent.
         urdf_origins: Origins, shaped like `origins`, that describe the robot best without its transmission
             errors, and that its URDF has; None if they are `origins`.
     """

@@ -3,7 +3,7 @@
 A cause is a block of columns of the linear model, such as the six of the base, times functions f of time:
 
 - a step: f is -1 before it and 0 after it;
-- a drift: f rises from -1 at the begin to 0 at the end, linearly or as 1 - exp(-t/τ);
+- a drift: f rises from -1 at the beginning to 0 at the end, linearly or as 1 - exp(-t/τ);
 - a free drift: the first functions of the Karhunen-Loève expansion of a random walk that ends at 0,
   f = √2·sin(ω·(1 - s))/ω with ω = (i - ½)·π, for i = 1, 2, ... and the time s from 0 to 1;
 - a constant: f = 1, for a lag of the joint values and a scale of the instrument; and for a payload that was

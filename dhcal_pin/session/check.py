@@ -871,7 +871,7 @@ def _answer(
     if n_samples < MIN_SAMPLES:
         verdict, reasons = (
             "cannot say",
-            [f"{n_samples} samples are too few; expected at least {MIN_SAMPLES}."],
+            [f"Too few samples: {n_samples}; expected at least {MIN_SAMPLES}."],
         )
     elif total <= limit:
         verdict, reasons = _unchanged(model, hypotheses, size)
@@ -1094,4 +1094,4 @@ def _sentence(group: list[Hypothesis]) -> str:
     if best.kind == "base":
         like = f" {best.of}" if best.of else ", as after a new set-up of the instrument"
     rivals = " or ".join(each.name for each in others)
-    return f"{what} by {size}{like}." + (f" The same effect has a change of {rivals}." if rivals else "")
+    return f"{what} by {size}{like}." + (f" A change of {rivals} has the same effect." if rivals else "")

@@ -93,7 +93,7 @@ class Timeline:
 
     @property
     def directions(self) -> tuple[Array, ...]:
-        """Direction of the last motion of each joint (m, n) of each measurement; 0 at the begin of a file."""
+        """Direction of the last motion of each joint (m, n) of each measurement; 0 where a file begins."""
         order = np.argsort(np.concatenate(self.numbers))[self.begin :]
         q = np.concatenate([item.q for item in self.data])
         directions = np.zeros_like(q)

@@ -216,10 +216,16 @@ def test_a_kept_robot_has_no_part_of_the_correction():
     simulation = Simulation("ur10", 9, 2)
     data = simulation.measure(Position)
     held_out, fitted = data.take(np.s_[-2:]), data.take(np.s_[:-2])
-    verdict = calibrate(simulation.chain, fitted, holdout=held_out, extend="none").verdict
-    assert verdict.keeps_nominal
-    (reason,) = (text for text in verdict.reasons if "correction" in text)
-    assert reason.endswith("No correction is applied; measure more poses.")
+    fit = calibrate(simulation.chain, fitted, holdout=held_out, extend="none")
+    assert fit.verdict.keeps_nominal
+    # The chain of the fit has the correction: only the accepted result says that it has none.
+    assert fit.shrinkage_factor
+    assert np.any(fit.chain.poses(fitted.q) != simulation.chain.poses(fitted.q))
+    (reason,) = (text for text in fit.verdict.reasons if "nominal robot" in text)
+    assert reason.endswith("Keep the nominal robot, and measure more poses.")
+    assert "correction" not in " ".join(fit.verdict.reasons)
+    assert fit.accepted.verdict.reasons == (*fit.verdict.reasons, "No correction is applied.")
+    assert "Not significantly better" in fit.accepted.shrinkage_notes[0]
 
 
 @pytest.mark.parametrize(("noise", "is_computed"), [(2e-6, True), (5e-5, False)])
@@ -230,7 +236,7 @@ def test_positions_that_the_controller_computed_are_named(noise, is_computed):
     points = arm.poses(q)[:, :3, 3] + noise * rng.standard_normal((60, 3))
     verdict = calibrate(arm, Position(q, points), extend="none").verdict
     assert verdict.keeps_nominal
-    (reason,) = (text for text in verdict.reasons if "No correction is applied" in text)
+    (reason,) = (text for text in verdict.reasons if "Keep the nominal robot" in text)
     assert ("probably computed with it" in reason) == is_computed
     assert ("measure more poses" in reason) == (not is_computed)
 

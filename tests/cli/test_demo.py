@@ -9,6 +9,7 @@ from command_line import KEYS, assert_same_poses, json_of, parse_json, tool_posi
 from robots import URDF
 
 from dhcal_pin.cli import screens
+from dhcal_pin.io import read_robot
 from dhcal_pin.paper import simulations
 
 
@@ -34,6 +35,11 @@ def test_files_and_figures_of_the_demo(run, robot_folder, monkeypatch):
     rows = np.loadtxt(URDF / "experiment_table5.csv", delimiter=",", comments=("#", "j"))[:6]
     off = np.linalg.norm(tool_positions(rows[:, :3]) - rows[:, 3:6], axis=1) / 1e3
     assert document["before"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    # The written robot has the fitted correction, whatever the verdict advises.
+    written = read_robot("shown/experiment_calibrated.urdf").poses(np.deg2rad(rows[:, :3]))[:, :3, 3]
+    left = np.linalg.norm(written - rows[:, 3:6] / 1e3, axis=1)
+    assert document["after"]["position_rms_m"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-6)
+    assert "correction is applied" not in Path("shown/report.html").read_text()
     summary = Path("shown/summary.md").read_text()
     assert "Row 7 of Table 5 is excluded" in summary
     assert f"{1e3 * document['after']['position_rms_m']:.3f}" in summary

@@ -64,6 +64,10 @@ DATA = {
     "near miss": (edited_csv("joint_2[", "joint2["), ["data.csv:1:", "'joint2'", "did you mean 'joint_2'?"]),
     "foreign joint": (edited_csv("joint_2[", "wrist_yaw["), ["data.csv:1:", "'wrist_yaw'", "joint_2"]),
     "no unit": (edited_csv("x[mm]", "x"), ["data.csv:1:", "'x' has no unit", "x[mm]"]),
+    "no units": (
+        edited_csv("x[mm],y[mm],z[mm]", "x,y,z[mm]"),
+        ["data.csv:1:", "'x' has no unit", "x[mm]", "without a unit, too: 'y'"],
+    ),
     "empty unit": (edited_csv("x[mm]", "x[]"), ["data.csv:1:", "'x' has no unit", "x[mm]"]),
     "unknown unit": (edited_csv("x[mm]", "x[inch]"), ["data.csv:1:", "'x' has unit 'inch'", "x[mm]"]),
     "other unit": (edited_csv("x[mm]", "x[deg]"), ["data.csv:1:", "'x' has unit 'deg'", "x[mm]"]),

@@ -57,6 +57,15 @@ def test_what_an_mjcf_cannot_hold_is_refused_before_the_calibration(
     assert_refused(words, "calibrate", "ur5e.xml", "ur5e.csv", "-o", "out.xml", *TIP, *options)
 
 
+def test_other_formats_of_a_robot_name_the_way(run, assert_refused, robot_folder):
+    way = "write cal.urdf, then `dhcal convert cal.urdf out.dh.csv`"
+    assert_refused([way], "calibrate", "arm.dh.toml", "data.csv", "-o", "out.dh.csv")
+    stdout_of(run("convert", "arm.urdf", "out.dh.csv"))
+    Path("arm.dh.xlsx").write_bytes(b"PK\x03\x04\xff")
+    for command in (("inspect", "--robot", "arm.dh.xlsx"), ("convert", "arm.dh.xlsx", "other.urdf")):
+        assert_refused(["arm.dh.xlsx: a workbook holds no robot; save a DH table as .dh.csv"], *command)
+
+
 def test_a_urdf_is_not_written_as_an_mjcf(assert_refused, robot_folder):
     words = ["out.xml: ", " is no MJCF; write a .urdf, and convert it with --template"]
     assert_refused(words, "calibrate", "arm.urdf", "data.csv", "-o", "out.xml")
@@ -69,6 +78,12 @@ def test_a_calibrated_urdf_goes_into_the_mjcf(run, assert_refused, mjcf_folder):
     stdout_of(run("calibrate", "ur5e.urdf", "ur5e.csv", "-o", "urdf.urdf", *TIP))
     _, _, err = run("convert", "urdf.urdf", "out.xml", "--template", "ur5e.xml", *TIP)
     assert "note: urdf.calibration.toml is not copied" in err
+    # The MJCF has the joints of the URDF: it can be read with its sidecar. The nominal robot has others.
+    to_template = ("convert", "urdf.urdf", "urdf.xml", "--template", "ur5e.xml", *TIP)
+    assert "note: urdf.calibration.toml lies beside it and is read with it" in run(*to_template)[2]
+    assert np.array_equal(read_robot("urdf.xml").base, read_robot("urdf.urdf").base)
+    words = ["mjcf.urdf: mjcf.calibration.toml lies beside it, belongs to another robot file"]
+    assert_refused(words, "convert", "ur5e.xml", "mjcf.urdf")
     q = np.random.default_rng(0).uniform(-3, 3, (20, 6))
     chain = read_robot("urdf.urdf", "attachment_site")
     poses = [

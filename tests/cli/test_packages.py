@@ -8,6 +8,8 @@ import pytest
 from command_line import stderr_of, stdout_of
 from robots import UR10
 
+from dhcal_pin.io import read_robot
+
 # Two links, the second with a mesh of a package that is not beside the URDF.
 ARM = """<robot name="arm"><link name="base"/>
 <link name="link"><VISUAL><geometry><mesh filename="package://my_arm/meshes/box.stl"/></geometry></VISUAL></link>
@@ -60,6 +62,11 @@ def test_convert_copies_a_robot_by_name(run, tmp_path, monkeypatch):
     for target in ("two.urdf", "two.dh.toml", "two.origins.csv", "two.yaml"):
         command = ("convert", "ur10.urdf", target, *(() if target == "two.urdf" else ("--tip", "tool0")))
         assert "note: ur10.calibration.toml is not copied" in run(*command)[2]
+    # A sidecar without a manifest can be read with any robot.
+    Path("two.calibration.toml").write_text("[base]\nxyz_m = [1.0, 0.0, 0.0]\n")
+    note = "note: two.calibration.toml lies beside it and is read with it"
+    assert note in run("convert", "ur10.urdf", "two.urdf")[2]
+    assert read_robot("two.urdf").base[0, 3] == 1.0
     status, _, err = run("convert", "ur10.urdf", "three.urdf", "--convention", "modified")
     assert (status, "no DH convention" in err, Path("three.urdf").exists()) == (2, True, False)
 

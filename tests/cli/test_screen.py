@@ -115,8 +115,11 @@ def test_views(run, robot_folder):
 def test_corrections_are_ordered_by_their_size(run, robot_folder):
     err = run(*CALIBRATE)[2].splitlines()
     start = next(i for i, line in enumerate(err) if line.startswith("largest corrections"))
-    rows = [line.split() for line in err[start + 1 : start + 6]]
+    rows = [line.split() for line in err[start + 1 : err.index("", start)]]
+    assert rows
     assert all(len(row) == 5 for row in rows)
+    # Corrections that are zero within their uncertainty are none; both figures are rounded.
+    assert all(abs(float(row[1])) >= 1.9 * float(row[3]) for row in rows)
     # Lengths have priors of 5 mm or less and angles of 1 degree or less; the largest come first.
     relative = [abs(float(row[1])) / (5 if row[2] == "mm" else 17.5) for row in rows]
     assert relative[0] == max(relative)

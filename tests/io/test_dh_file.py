@@ -176,11 +176,12 @@ def test_invalid_toml_files_raise_an_error_that_names_the_problem(tmp_path, edit
         (change("# convention: standard", "# an arm"), None, ["no convention", "# convention: standard"]),
         (change(": standard", ": Craig"), None, ["unknown convention 'Craig'", "# convention: standard"]),
         (change("d[mm]", "d"), 2, ["'d' has no unit", "d[mm]"]),
+        (change("theta[deg], d[mm]", "theta, d"), 2, ["'theta' has no unit", "without a unit, too: 'd'"]),
         (change("d[mm]", "d[deg]"), 2, ["'d' has unit 'deg'", "d[mm]"]),
         (change("d[mm]", "offset[mm]"), 2, ["unknown column 'offset'", "theta"]),
         (change("606.8", "nan"), 3, ["'d'", "'nan' is not a finite number"]),
         (change("606.8", ""), 3, ["'d'", "is empty"]),
-        (change("606.8", "606,8"), 3, ["9 values for 8 columns"]),
+        (change("606.8", "606,8"), 3, ["9 values for 8 columns", "decimal commas need semicolons"]),
         (change("606.8", "6e7"), None, ["'shoulder'", "d is 60000 m", "unit"]),
         (change("lift", "shoulder"), None, ["occurs twice"]),
         (change("lift", ""), None, ["joint name ''"]),
@@ -201,6 +202,12 @@ def test_invalid_csv_files_raise_an_error_that_names_the_problem(tmp_path, edit,
     assert str(caught.value).startswith(f"{path}:{line}: " if line else f"{path}: ")
     for word in words:
         assert word in str(caught.value)
+
+
+def test_the_convention_of_a_csv_file_has_any_case(tmp_path):
+    text = SCARA_CSV.replace(": standard", ": Standard")
+    assert text != SCARA_CSV
+    assert read_dh(write(tmp_path, "arm.dh.csv", text)).convention == "standard"
 
 
 @pytest.mark.parametrize("rows", ["", "1,2,3\n4,5,6\n"])

@@ -69,6 +69,11 @@ def test_wrong_types_are_named(function: Any, arguments: tuple[Any, ...], messag
         ),
         ({"session": "x"}, UnknownNameError, "unknown session option 'x'; choose from auto, unordered, off"),
         ({"max_iterations": -1}, InvalidArgumentError, "max_iterations is -1; expected at least 1"),
+        (
+            {"max_iterations": 2.5},
+            InvalidArgumentError,
+            "max_iterations is 2.5; expected at least 1, a",
+        ),
         ({"method": "newton"}, UnknownNameError, "unknown method 'newton'; choose from lm, gn"),
         (
             {"loss": "l1"},

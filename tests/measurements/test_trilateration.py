@@ -60,6 +60,9 @@ def test_equations_as_printed_are_wrong():
             lambda: trilaterate_three_wires([[1, 1, 1], [0.1, 1, 1]], A, B, C),
             "lengths of sample 2 do not meet",
         ),
+        (lambda: trilaterate_three_wires([[np.nan, 1, 1]], A, B, C), "three wires: lengths"),
+        (lambda: trilaterate_three_wires([[1, 1, 1], [-1, 1, 1]], A, B, C), "sample 2 is negative"),
+        (lambda: trilaterate_three_wires([1, 1, 1], A, B, C), r"has shape \(3,\)"),
     ],
 )
 def test_impossible_anchors_and_lengths_are_refused(call, message):

@@ -21,7 +21,7 @@ from dhcal_pin.paper import (
     tool_error,
 )
 from dhcal_pin.paper.jacobian_check import numerical_jacobian
-from dhcal_pin.robot import DHTable
+from dhcal_pin.robot import Chain, DHTable
 
 ARMS = ["sim_6dof", "sim_6dof_actual", "sim_3dof", "sim_3dof_actual", "experiment", "experiment_published"]
 
@@ -174,3 +174,8 @@ def test_tool_error_is_nearly_the_logarithm():
 def test_modified_tables_are_an_error():
     with pytest.raises(DhcalError, match="standard"):
         error_factors(random_table(np.random.default_rng(0), "modified"), np.zeros((1, 1)))
+
+
+def test_a_chain_is_no_table():
+    with pytest.raises(DhcalError, match=r"table has type Chain; expected a DH table"):
+        error_factors(Chain.from_dh(paper("experiment")), np.zeros((1, 3)))  # pyright: ignore[reportArgumentType]

@@ -1,9 +1,11 @@
 """Sections of the report: statements about accuracy, outliers and few data."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration import Verdict, calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose, Position
 from dhcal_pin.report import Provenance, ReportContext
@@ -22,6 +24,13 @@ def test_sections_have_different_keys_and_titles(fit, quick):
     assert all(isinstance(section, Section) for section in sections)
     assert len({section.key for section in sections}) == len({section.title for section in sections})
     assert {"accuracy", "residuals", "observability"} <= {section.key for section in sections}
+
+
+@pytest.mark.parametrize("status", ["ok", "refused"])
+def test_a_refused_calibration_boasts_no_reduction(fit, status):
+    judged = replace(fit, decision=Verdict(status, ("Wrong.",) if status == "refused" else ()))
+    names = [name for _, name, _ in calibration_document(ReportContext(judged, Provenance()), "html").values]
+    assert names == ["before, RMS", "after, RMS", *(["smaller"] if status == "ok" else [])]
 
 
 def test_outliers_are_listed_with_file_row_and_size(sim_3dof, quick):

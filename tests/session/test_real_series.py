@@ -1,6 +1,6 @@
 """Changes that are added to real measurements of a robot are found, and nothing is found without them.
 
-No model has all errors of a real robot. Its joints move in other regions at the begin of the series than at
+No model has all errors of a real robot. Its joints move in other regions when the series begins than at
 its end, so that errors of the joints imitate a change of their zeros, and the other way round.
 """
 

@@ -127,7 +127,7 @@ def test_a_dot_is_where_its_axes_say():
     ]
     low, high, middle = dots_of(svg, "sample")
     assert middle == pytest.approx((low + high) / 2, abs=0.1)
-    assert dots_of(svg, "after")[0] == pytest.approx([middle[0], low[1]], abs=0.1)
+    assert dots_of(svg, "holdout")[0] == pytest.approx([middle[0], low[1]], abs=0.1)
 
 
 def test_panels_do_not_depend_on_the_panels_before():

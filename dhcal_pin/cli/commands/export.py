@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from keyword import iskeyword
+from pathlib import Path
 
 from .. import screens
 from ..options import JSON, ROBOT, URDF_OPTIONS, Options, read_one_robot
@@ -30,6 +32,10 @@ def run(args: Namespace) -> int:
     inputs = [args.robot, *existing_sidecars([args.robot])]
     checked_files(args, {"output": Output("source code", tuple(LANGUAGES)), "json": Output()}, inputs)
     text = model_code(read_one_robot(args.robot, args), args.output)
-    write_with_json({args.output: text}, args.json, {"output": args.output}, inputs)
-    screens.show(screens.files_screen([args.output]), args.verbosity)
+    name = Path(args.output)
+    notes = []
+    if name.suffix.lower() == ".py" and (not name.stem.isidentifier() or iskeyword(name.stem)):
+        notes.append(f"{args.output}: Python imports no module of this name; use letters, digits and _")
+    write_with_json({args.output: text}, args.json, {"output": args.output}, inputs, notes=notes)
+    screens.show(screens.files_screen([args.output], notes), args.verbosity)
     return 0

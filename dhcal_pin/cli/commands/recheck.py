@@ -18,7 +18,7 @@ from ..servo_zeros import other_zeros_warning
 EXAMPLE = "dhcal recheck ur10_calibrated.urdf check.csv --tip tool0 --history ur10.jsonl"
 
 # Reason of the verdict if a mistake in a file is the likely reason for the residuals.
-_MISTAKE = "The measurements contain a mistake, see the warning: correct them, and check again."
+_MISTAKE = "The measurements contain a mistake: {}. Correct them, and check again."
 # Exit status of each verdict.
 STATUS = {"ok": 0, "changed": 1, "cannot say": 2}
 
@@ -97,9 +97,12 @@ def run(args: Namespace) -> int:
     # Mistakes look like a change of the robot.
     suspects = [] if result.verdict == "ok" else files
     mistakes = {file.source: diagnostics.find_input_warnings(chain, file) for file in suspects}
-    if any(mistakes.values()) and any(change.kind == "robot" for change in result.changes):
+    texts = texts_by_file(mistakes)
+    if texts and any(change.kind == "robot" for change in result.changes):
         # Wrong units and the like change all parts of the robot at once.
-        result = replace(result, verdict="cannot say", reasons=(_MISTAKE,), changes=())
+        result = replace(
+            result, verdict="cannot say", reasons=(_MISTAKE.format(texts[0].rstrip(".")),), changes=()
+        )
     warnings = _with_fitted_rows(mistakes, files, io.read_fitted(sidecar))
     if servos is not None:
         are_fitted = any(warnings[file.source] != mistakes.get(file.source, []) for file in files)

@@ -183,14 +183,16 @@ def _judge(args: Namespace, given: Given) -> Judged:
     before = calibration.accuracy(chain, data, known)
     name = "fitted to these images" if _unstated_entries(given.rig) else "base and tool as given"
     accuracies, alone = {name: before}, before
+    # A sidecar with joint errors makes two models.
+    model = "URDF and sidecar, " if chain.error_families else ""
     if chain.error_families:
         alone = _accuracy_on_all(diagnostics.fit_frames(chain.urdf_alone, data, known), data, known)
-        accuracies = {"URDF alone, base and tool fitted": alone, name: before}
+        accuracies = {"URDF alone, base and tool fitted": alone, f"{model}{name}": before}
     judged = Judged(chain, known, None, before, accuracies, alone)
     if args.fit_frames:
         fit = diagnostics.fit_frames(chain, data, known)
         after = _accuracy_on_all(fit, data, known)
-        accuracies = accuracies | {"base and tool fitted": after}
+        accuracies = accuracies | {f"{model}base and tool fitted": after}
         alone = alone if chain.error_families else after
         judged = Judged(fit.chain, known | fit.instruments, fit, before, accuracies, alone)
     if not args.nominal:

@@ -74,7 +74,7 @@ def read_recorded_joints(path: PathLike, images: Sequence[str], joint_topic: str
         }
     notes = []
     if moving:
-        first = list_first(moving, 1, "images")
+        first = list_first(moving, 1, "image")
         notes.append(f"the robot moved at the time of {first}; take images while it stands still")
     return ImageJoints(joints, notes)
 

@@ -202,6 +202,8 @@ def _parse_table(
     complete = table
     table = _usable_rows(table, chain, kind, prefixes, skip_bad_rows)
     measured = value_table(table, chain)
+    joints = {prefix + name: joint_units(chain, name) for prefix in prefixes for name in chain.joint_names}
+    table.require_units({name: UNITS[each] for name, each in kind.columns.items() if UNITS[each]} | joints)
     values = parse_values(measured, kind)
     _require_all_sigmas(measured, kind, values)
     q = [parse_joint_positions(table, chain, prefix) for prefix in prefixes]

@@ -65,12 +65,18 @@ class Column:
         """Return the divisor that converts the column to SI units."""
         if self.unit in units:
             return units[self.unit]
-        choices = ", ".join(f"{self.name}[{unit}]" for unit in units if unit.isascii())
         if not self.unit:
-            raise FileFormatError(f"{where}: column {self.name!r} has no unit; write one of {choices}")
+            raise FileFormatError(f"{where}: {self.lacks_unit(units)}")
         raise UnknownNameError(
-            f"{where}: column {self.name!r} has unit {self.unit!r}; write one of {choices}"
+            f"{where}: column {self.name!r} has unit {self.unit!r}; {self._expected(units)}"
         )
+
+    def lacks_unit(self, units: Mapping[str, float]) -> str:
+        """Return the message that the column has no unit."""
+        return f"column {self.name!r} has no unit; {self._expected(units)}"
+
+    def _expected(self, units: Mapping[str, float]) -> str:
+        return f"write one of {', '.join(f'{self.name}[{unit}]' for unit in units if unit.isascii())}"
 
 
 @frozen(eq=False)
@@ -187,6 +193,16 @@ class DataTable:
         return f"{self.source}:{self.lines[row]}: column {column!r}"
 
     # ----------------------------------------------------------------------------------------- values
+    def require_units(self, units: Mapping[str, Mapping[str, float]]) -> None:
+        """Require the unit of each of some columns; an error names all that have none."""
+        columns = [self.columns[name] for name in units if name in self.columns]
+        missing = [column for column in columns if not column.unit]
+        if missing:
+            text = missing[0].lacks_unit(units[missing[0].name])
+            others = ", ".join(quote(column.name) for column in missing[1:])
+            others = f"; without a unit, too: {others}" if others else ""
+            raise FileFormatError(f"{self.header_location}: {text}{others}")
+
     def to_si(self, column: Column, units: Mapping[str, float]) -> Array:
         """Return the numbers of a column in SI units."""
         values = self.finite_numbers(column) / column.divisor(units, self.header_location)

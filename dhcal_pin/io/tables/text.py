@@ -276,6 +276,8 @@ def _divide_rows(
             good.append((line_number, text))
         elif count >= 0:
             hint = " and decimal points" if separator == "," else ""
+            if hint and count > width:
+                hint += "; decimal commas need semicolons"
             values, columns = (
                 f"{n} {word}{'s' * (n != 1)}" for n, word in ((count, "value"), (width, "column"))
             )

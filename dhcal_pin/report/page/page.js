@@ -50,7 +50,7 @@ function showControls(selection) {
       states.append(choice("radio", "state", state, state === selection.state, () => selection.update({ state }), { before: "before", after: "after" }[state]));
     bar.append(states);
   }
-  const roles = samples.roles.length > 1 ? samples.roles.map(role => [role, role, role === "fitted" ? "sample" : "after"]) : [];
+  const roles = samples.roles.length > 1 ? samples.roles.map(role => [role, role, role === "fitted" ? "sample" : "holdout"]) : [];
   if (samples.outlier.includes(1)) roles.push(["outlier", "outliers", "outlier"]);
   if (roles.length) {
     const sets = element("fieldset", {}, element("legend", {}, "Samples"));

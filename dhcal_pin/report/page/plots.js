@@ -68,7 +68,7 @@ class SamplePlot {
       for (const i of shown) {
         if (!Number.isFinite(this.y[state][i])) continue;
         const color = samples.outlier[i] ? "outlier" : state === "before" ? "before"
-          : samples.roleOf(i) === "fitted" && samples.roles.length > 1 ? "sample" : this.isError ? "after" : "measured";
+          : samples.roles.length > 1 ? samples.roleOf(i) === "fitted" ? "sample" : "holdout" : this.isError ? "after" : "measured";
         const key = `${color} ${samples.outlier[i] ? 5 : shown.length < 100 ? 5 : this.isError ? 3 : 2.6}`;
         (layers[key] ??= []).push(`M${this.toX(this.x[i]).toFixed(1)} ${this.toY(this.y[state][i]).toFixed(1)}h0`);
       }
