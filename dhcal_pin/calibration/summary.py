@@ -97,6 +97,15 @@ def position_notes(std: float | None) -> list[str]:
     ]
 
 
+def prediction_notes(fit: Evidence) -> list[str]:
+    """Return a sentence on the predicted position error of an arm that images correct, if it is known."""
+    # The error at the board is that across the line of sight, in images such as the measured ones.
+    if not (fit.camera_stages and fit.errors.has_arm and np.isfinite(fit.position_std)):
+        return []
+    size = Quantity.error(fit.position_std, "m")
+    return [f"Tool in the measured region: predicted position error {size}, with the best base and tool."]
+
+
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:
     """Sort the corrections x of the robot by their effect on the measured values."""
     order = np.argsort(-np.abs(x) * system.column_norms, kind="stable")
