@@ -341,7 +341,16 @@ class CameraCorners(Measurement):
         return bool(self.jitter.any())
 
     def with_jitter(self, jitter: Array, largest: float = 1.0) -> Self:
-        """Return a copy with another jitter, shape (m, 2, 6) [px], and the largest one relative to it."""
+        """Return a copy with another jitter.
+
+        Args:
+            jitter: Derivative of the image coordinates by the displacement of the tool, in units of its
+                standard deviations, (m, 2, 6) [px].
+            largest: Largest jitter that the images do not exclude, relative to `jitter`.
+
+        Returns:
+            The copy.
+        """
         return self.replace(jitter=jitter, largest_jitter=largest)
 
     def at_largest_noise(self) -> Self:

@@ -13,9 +13,7 @@ R factor of the rows V^(-1/2)·[J r] of all images and of the priors, V = I + c�
     log L(c) = -½·log det V - log det R - ½·C
 
 With a uniform prior of c, the estimates have the RMS scatter of L(c), and their uncertainty the quantile
-`CONFIDENCE` of it. Both fall with the number of images. Errors of the joints are smooth, and near
-configurations share them: in the uncertainty their variance is larger by the design effect of the
-configurations (`identifiability.residual_correlation`).
+`CONFIDENCE` of it. Both fall with the number of images.
 
 Reference: H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal,
 Biometrika 58, 1971.
@@ -29,25 +27,21 @@ from ..._kernels.types import FrameBatch
 from ..._typing import Array
 from ...estimation.problem import Problem
 from ...estimation.qr import TriangularSystem, merge_r_factors
-from ...identifiability.residual_correlation import design_effect
 from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
-from ..partition import different_configurations
 from ..reweighting import Fit
 from .jitter import MIN_STD, with_displacements
 
 # Probability that the scatter is smaller than the largest one.
-CONFIDENCE = 0.9
+CONFIDENCE = 0.95
 # Scatter for which the displacements of images are computed, and smallest and largest one [rad or m].
-_UNIT, _SMALLEST, _LARGEST, _N_SCATTERS = 1e-3, 1e-6, 1e-2, 60
+_UNIT, _SMALLEST, _LARGEST, _N_SCATTERS = 1e-3, 1e-6, 1e-2, 120
 
 
 def fit_with_joint_scatter(fit: Fit, noise: float, max_iterations: int) -> Fit:
     """Fit again with the expected scatter of the joints and the noise of corners."""
     unit = _scattered(fit, noise, _UNIT)
     expected, largest = estimate_scatter(unit.problem, unit.solution.x)
-    configurations = different_configurations(fit.without_rejected().data)[0]
-    largest *= np.sqrt(design_effect(configurations, fit.problem.errors.chain.is_prismatic))
     return _scattered(fit, noise, expected, largest / expected).solved(max_iterations)
 
 
