@@ -179,12 +179,11 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     if not gate.is_open:
         kept = _kept_fit(nominal, is_right, folds, max_iterations)
         return GatedFit(kept, nominal, best.closed, gate, None if is_complete else shared)
-    model, opened_at = best.model, 1.0
+    model, opened_at = best.model, temperature(n_configurations, OPEN_SAMPLES)
     if is_complete:
-        model = fit_with_joint_scatter(fit, jitter.noise, max_iterations)
-    else:
-        factor = 1.0 if model is shared else share
-        opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
+        model, opened_at = fit_with_joint_scatter(fit, jitter.noise, opened_at, max_iterations), 1.0
+    elif model is not shared:
+        opened_at *= share
     opened = _solve(model, model.problem, opened_at, max_iterations)
     gate = replace(gate, temperature=opened_at)
     return GatedFit(opened, nominal, opened, gate, None if is_complete else shared)

@@ -13,7 +13,9 @@ R factor of the rows V^(-1/2)·[J r] of all images and of the priors, V = I + c�
     log L(c) = -½·log det V - log det R - ½·C
 
 With a uniform prior of c, the estimates have the RMS scatter of L(c), and their uncertainty the quantile
-`CONFIDENCE` of it. Both fall with the number of images.
+`CONFIDENCE` of it. Both fall with the number of images. Errors of the joints are smooth, and near
+configurations share them: in the uncertainty, a scatter that the images show (log L(c) - log L(0) above the
+limit of `jitter`) has a variance T times as large, with the temperature T of an open gate.
 
 Reference: H. D. Patterson and R. Thompson, Recovery of inter-block information when block sizes are unequal,
 Biometrika 58, 1971.
@@ -23,6 +25,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..._frozen import frozen
 from ..._kernels.types import FrameBatch
 from ..._typing import Array
 from ...estimation.problem import Problem
@@ -30,19 +33,31 @@ from ...estimation.qr import TriangularSystem, merge_r_factors
 from ...measurements.camera import CameraCorners
 from ...robot.chain import Chain
 from ..reweighting import Fit
-from .jitter import MIN_STD, with_displacements
+from .jitter import MIN_LOG_LIKELIHOOD_RATIO, MIN_STD, with_displacements
 
 # Probability that the scatter is smaller than the largest one.
-CONFIDENCE = 0.95
+CONFIDENCE = 0.9
 # Scatter for which the displacements of images are computed, and smallest and largest one [rad or m].
 _UNIT, _SMALLEST, _LARGEST, _N_SCATTERS = 1e-3, 1e-6, 1e-2, 120
 
 
-def fit_with_joint_scatter(fit: Fit, noise: float, max_iterations: int) -> Fit:
+@frozen
+class JointScatter:
+    """Scatter of the joints by its restricted likelihood."""
+
+    expected: float  # RMS scatter [rad or m]
+    largest: float  # Scatter that the images do not exclude [rad or m]
+    log_likelihood_ratio: float  # Logarithm of the largest likelihood over that without scatter
+
+
+def fit_with_joint_scatter(fit: Fit, noise: float, temperature: float, max_iterations: int) -> Fit:
     """Fit again with the expected scatter of the joints and the noise of corners."""
     unit = _scattered(fit, noise, _UNIT)
-    expected, largest = estimate_scatter(unit.problem, unit.solution.x)
-    return _scattered(fit, noise, expected, largest / expected).solved(max_iterations)
+    scatter = estimate_scatter(unit.problem, unit.solution.x)
+    largest = scatter.largest / scatter.expected
+    if scatter.log_likelihood_ratio > MIN_LOG_LIKELIHOOD_RATIO:
+        largest *= np.sqrt(temperature)
+    return _scattered(fit, noise, scatter.expected, largest).solved(max_iterations)
 
 
 def _scattered(fit: Fit, noise: float, scatter: float, largest: float = 1.0) -> Fit:
@@ -56,8 +71,8 @@ def _scattered(fit: Fit, noise: float, scatter: float, largest: float = 1.0) -> 
     return fit.with_sigmas(data)
 
 
-def estimate_scatter(problem: Problem, x: Array) -> tuple[float, float]:
-    """Return the RMS scatter that images with the scatter `_UNIT` expect, and the largest one [rad or m]."""
+def estimate_scatter(problem: Problem, x: Array) -> JointScatter:
+    """Estimate the scatter of the joints from a problem whose images have the scatter `_UNIT`."""
     linearization = problem.linearize(x)
     displaced, sizes, others = [np.empty((0, len(x) + 1))], [np.empty(0)], []
     for chunk in problem.chunks:
@@ -78,9 +93,11 @@ def estimate_scatter(problem: Problem, x: Array) -> tuple[float, float]:
         rank = rank or system.rank
         log_determinant = np.sum(np.log(std)) + np.sum(np.log(system.singular_values[:rank]))
         log_likelihoods.append(-log_determinant - system.min_cost / 2)
-    density = np.exp(np.array(log_likelihoods) - max(log_likelihoods))
+    best = max(log_likelihoods)
+    density = np.exp(np.array(log_likelihoods) - best)
     shares = (density[1:] + density[:-1]) / 2 * np.diff(scatters)
     squares = (scatters[1:] ** 2 + scatters[:-1] ** 2) / 2
     cumulated = np.append(0.0, np.cumsum(shares))
     largest = float(np.interp(CONFIDENCE * cumulated[-1], cumulated, scatters))
-    return float(np.sqrt(np.average(squares, weights=shares))), largest
+    expected = float(np.sqrt(np.average(squares, weights=shares)))
+    return JointScatter(expected, largest, float(best - log_likelihoods[0]))
