@@ -71,7 +71,7 @@ def open_fits(seeds, n_images: int) -> list[tuple[Result, Setup, int]]:
     ],
 )
 def test_stated_accuracy_covers_the_true_one(seeds, n_images):
-    """With independent corners, a quarter of the predictions from 15 images were too small, up to 2.5 times."""
+    """With independent corners, predictions from 15 images were up to 2.5 times too small."""
     fits = open_fits(seeds, n_images)
     true = np.array([true_error(fit, setup.truth) for fit, setup, _ in fits])
     ratios = true / [position_error_of_images(fit) for fit, *_ in fits]
