@@ -274,6 +274,15 @@ def wrong_arm(chain: Chain, size: float, rng: np.random.Generator) -> Chain:
     return errors.at(std * rng.standard_normal(len(std)))
 
 
+def uneven_arm(chain: Chain, size: float, rng: np.random.Generator) -> Chain:
+    """Return an arm with errors of links as in `wrong_arm`, with eccentric joints that yield to gravity."""
+    errors: ErrorModel = select_parameters(chain, "placement,harmonics,compliance")
+    sizes = {"m": size, "rad": 3 * size, "rad/Nm": 3e-6}
+    orders = {"1": 1e-4, "2": 3e-5}
+    std = np.array([orders[p.name[-1]] if p.name[-1] in orders else sizes[p.unit] for p in errors.parameters])
+    return errors.at(std * rng.standard_normal(len(std)))
+
+
 def random_setup(seed: int) -> Setup:
     """Return one of the set-ups: any arm, camera on the wrist or fixed, 15 to 60 images."""
     rng = np.random.default_rng(seed)

@@ -84,10 +84,17 @@ class Fit:
 
     def solved_with(self, data: Sequence[Measurement], max_iterations: int) -> Fit:
         """Solve loosely again with other standard deviations of the same measurements."""
+        return self.with_sigmas(data).solved(max_iterations)
+
+    def with_sigmas(self, data: Sequence[Measurement]) -> Fit:
+        """Return the fit, not solved again, with other standard deviations of the same measurements."""
         weighted = [item.with_weights(w) for item, w in zip(data, self.weights, strict=True)]
-        problem = replace(self.problem, data=tuple(weighted))
-        solution = minimize(problem, "lm", self.solution.x, max_iterations, loose=True)
-        return replace(self, problem=problem, solution=solution, previous_iterations=self.iterations)
+        return replace(self, problem=replace(self.problem, data=tuple(weighted)))
+
+    def solved(self, max_iterations: int) -> Fit:
+        """Solve the problem loosely from the solution."""
+        solution = minimize(self.problem, "lm", self.solution.x, max_iterations, loose=True)
+        return replace(self, solution=solution, previous_iterations=self.iterations)
 
     def solved_with_weights(self, weights: tuple[Array, ...], max_iterations: int) -> Fit:
         """Solve loosely again with other robust weights."""

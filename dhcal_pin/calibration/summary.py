@@ -97,6 +97,24 @@ def position_notes(std: float | None) -> list[str]:
     ]
 
 
+def position_error_of_images(fit: Evidence) -> float | None:
+    """Return the position error [m] of the tool of an arm that images correct; None for other arms."""
+    if not (fit.camera_stages and fit.errors.has_arm and np.isfinite(fit.position_std)):
+        return None
+    # The prediction lacks errors that the links imitate; left-out images lack those along the line of sight.
+    shown = fit.comparisons[0].after.groups.get("board")
+    return max(fit.position_std, shown.rms) if shown else fit.position_std
+
+
+def position_error_notes(fit: Evidence) -> list[str]:
+    """Return a sentence on the position error of the tool of an arm that images correct."""
+    error = position_error_of_images(fit)
+    if error is None:
+        return []
+    size = Quantity.error(error, "m")
+    return [f"Tool in the measured region: position error of about {size} with the best base and tool."]
+
+
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:
     """Sort the corrections x of the robot by their effect on the measured values.
 

@@ -81,6 +81,8 @@ MAX_FRAME_RATIO = 1 / 3
 # Positions are wrong by more than the residuals suggest if the predicted error exceeds these by this factor.
 # The ratio is at most 0.8 if positions, poses or enough lengths in several directions are measured.
 MAX_HIDDEN_RATIO = 2.0
+# The same of images, which show two of the three components of an error.
+MAX_HIDDEN_IMAGE_RATIO = math.sqrt(3 / 2)
 # Reasons for such errors, each with what to measure.
 PART_OF_POSITION = (
     "the measurements show only a part of the position",
@@ -90,6 +92,7 @@ FEW_CONFIGURATIONS = (
     "the measured configurations do not determine the errors between them",
     "measure more poses, in random configurations",
 )
+FEW_IMAGES = "so few images do not determine the errors between them"
 FEW_POINTS = (
     "the measured configurations do not determine the errors between them",
     "touch more points, at known distances from each other",
@@ -746,7 +749,8 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
         return []
     unknown = explain_unknown_size(ObservabilityProbe(fit.problem.shown, fit.x))
     std, shown = fit.position_std, _shown_position_error(fit)
-    if unknown is None and not std > MAX_HIDDEN_RATIO * shown:
+    max_ratio = MAX_HIDDEN_IMAGE_RATIO if _has_only_images(fit) else MAX_HIDDEN_RATIO
+    if unknown is None and not std > max_ratio * shown:
         return []
     statement, advice = unknown or _hidden_cause(fit)
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
@@ -757,12 +761,28 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
 def _hidden_cause(fit: Evidence) -> tuple[str, str]:
     """Return why residuals do not show the errors of positions, and what to measure."""
     of_arm = [item for item in fit.data if item.configurations_per_row]
+    if _has_only_images(fit):
+        return FEW_IMAGES, f"take at least {needed_images(fit)} different images"
     if all(isinstance(item, PointContact) for item in of_arm):
         is_stated = all(item.has_stated_sigma for item in fit.data if not item.configurations_per_row)
         return FEW_POINTS if is_stated else UNSTATED_DISTANCES
     if not all(len(item.positions()) == len(item.rows) for item in fit.data):
         return PART_OF_POSITION
     return SAME_ORIENTATION if _keeps_orientation(fit) else FEW_CONFIGURATIONS
+
+
+def _has_only_images(fit: Evidence) -> bool:
+    """Return whether all measurements are images."""
+    return all(item.n_images for item in fit.data)
+
+
+def needed_images(fit: Evidence) -> int:
+    """Return the number of different images with which the residuals show the errors of positions."""
+    # The variance of the predicted error falls with the number of images. The error at the board falls with
+    # it, but not below that of the fitted images.
+    shown = next(each for each in fit.comparisons if each.title == "fitted").after.groups["board"].rms
+    n_images = len(np.unique(configuration_groups(fit.data)))
+    return math.ceil(n_images * (fit.position_std / (MAX_HIDDEN_IMAGE_RATIO * shown)) ** 2)
 
 
 def _keeps_orientation(fit: Evidence) -> bool:

@@ -151,6 +151,7 @@ class Problem:
         """The problem whose rows show what was measured: without motions of base and tool beside contacts."""
         # A motion that was estimated from contacts is no length: it grows with the robot, as their misses do.
         data = [_unmoved(item) for item in self.data] if self.scale_gauge else self.data
+        data = [item.at_largest_noise() for item in data]
         is_same = all(new is old for new, old in zip(data, self.data, strict=True))
         return self if is_same else self.with_data(data)
 

@@ -262,6 +262,10 @@ class Measurement(ABC):
         (scale,) = scales.values()
         return self.replace(sigma=self.sigma * scale)
 
+    def at_largest_noise(self) -> Self:
+        """Return a copy with the largest noise that the measurement does not exclude, for uncertainties."""
+        return self
+
     def with_weights(self, weights: Array) -> Self:
         """Return a copy whose standard deviations are divided by the square roots of sample weights, (m,)."""
         return self.replace(sigma=self.sigma / np.sqrt(weights)[:, None])

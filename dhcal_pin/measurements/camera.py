@@ -139,6 +139,7 @@ class CameraCorners(Measurement):
         image_names: Name of each sample's photograph, (m,); empty if it is not known.
         jitter: Derivative of the image coordinates by the displacement of the tool, in units of its standard
             deviations, (m, 2, 6) [px]; zero without jitter.
+        largest_jitter: Largest jitter that the images do not exclude, relative to `jitter`.
     """
 
     rig: MountedRig
@@ -149,6 +150,7 @@ class CameraCorners(Measurement):
     corner: Array
     image_names: Array
     jitter: Array
+    largest_jitter: float
 
     kind = "camera"
     residual_groups: ClassVar = {
@@ -210,6 +212,7 @@ class CameraCorners(Measurement):
             corner=_corner_numbers(corner, rig, board_index),
             image_names=name_array(image_names, m),
             jitter=np.zeros((m, 2, 6)),
+            largest_jitter=1.0,
             has_stated_sigma=sigma is not None,
             instrument_parameters=rig_parameters(rig),
         )
@@ -335,9 +338,22 @@ class CameraCorners(Measurement):
         """Whether the corners of an image share a displacement."""
         return bool(self.jitter.any())
 
-    def with_jitter(self, jitter: Array) -> Self:
-        """Return a copy with another jitter, shape (m, 2, 6) [px]."""
-        return self.replace(jitter=jitter)
+    def with_jitter(self, jitter: Array, largest: float = 1.0) -> Self:
+        """Return a copy with another jitter.
+
+        Args:
+            jitter: Derivative of the image coordinates by the displacement of the tool, in units of its
+                standard deviations, (m, 2, 6) [px].
+            largest: Largest jitter that the images do not exclude, relative to `jitter`.
+
+        Returns:
+            The copy.
+        """
+        return self.replace(jitter=jitter, largest_jitter=largest)
+
+    def at_largest_noise(self) -> Self:
+        """Return a copy with the largest jitter that the images do not exclude, for uncertainties."""
+        return self if self.largest_jitter == 1 else self.with_jitter(self.largest_jitter * self.jitter)
 
     def description(self) -> list[str]:
         """Return what `repr` says besides the number of samples."""

@@ -22,7 +22,8 @@ independently (`corner_noise`) predict the left-out clusters better. Then T is l
 coordinates per component of the displacement of an image.
 
 The temperature protects the arm from errors that the model lacks. If a shared displacement does not raise the
-likelihood of the images after the arm was estimated, the model lacks nothing, and T = 1.
+likelihood of the images after the arm was estimated, T = 1, and the images count with the errors of the
+joints that they do not exclude (`joint_scatter`).
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from ..reweighting import Fit
 from .arm_types import CORNERS, IMAGES, INDUSTRIAL, ArmType
 from .corner_noise import fit_with_corner_noise
 from .jitter import Jitter, estimate_jitter, with_jitter
+from .joint_scatter import fit_with_joint_scatter
 from .sets import MAX_POINTS, count_corners
 from .stages import Stage, fitted_error, format_ratio, held_out_error
 from .target_points import TargetPoints, boards_of, try_target_points, with_free_points
@@ -177,11 +179,12 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
     if not gate.is_open:
         kept = _kept_fit(nominal, is_right, folds, max_iterations)
         return GatedFit(kept, nominal, best.closed, gate, None if is_complete else shared)
-    opened_at = 1.0
-    if not is_complete:
-        factor = 1.0 if best.model is shared else share
-        opened_at = factor * temperature(n_configurations, OPEN_SAMPLES)
-    opened = _solve(best.model, best.model.problem, opened_at, max_iterations)
+    model, opened_at = best.model, temperature(n_configurations, OPEN_SAMPLES)
+    if is_complete:
+        model, opened_at = fit_with_joint_scatter(fit, jitter.noise, opened_at, max_iterations), 1.0
+    elif model is not shared:
+        opened_at *= share
+    opened = _solve(model, model.problem, opened_at, max_iterations)
     gate = replace(gate, temperature=opened_at)
     return GatedFit(opened, nominal, opened, gate, None if is_complete else shared)
 

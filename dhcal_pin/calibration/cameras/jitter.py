@@ -20,7 +20,7 @@ J. Royal Statistical Society B 39, 1977.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -166,15 +166,31 @@ def with_jitter(
     problem: Problem, x: Array, data: Sequence[Measurement], jitter: Jitter
 ) -> tuple[Measurement, ...]:
     """Give image coordinates the noise and the jitter that were estimated."""
+
+    def covariance(chain: Chain, frames: FrameBatch) -> Array:
+        motions = _joint_motions(chain, frames)
+        of_tool = np.diag([jitter.position**2] * 3 + [jitter.rotation**2] * 3)
+        return of_tool + jitter.joints**2 * motions @ motions.swapaxes(1, 2)
+
+    return with_displacements(problem, x, data, jitter.noise, covariance)
+
+
+def with_displacements(
+    problem: Problem,
+    x: Array,
+    data: Sequence[Measurement],
+    noise: float,
+    covariance: Callable[[Chain, FrameBatch], Array],
+    largest: float = 1.0,
+) -> tuple[Measurement, ...]:
+    """Give image coordinates a noise and the displacements of the tool of a covariance, (m, 6, 6)."""
     chain = problem.chain(x)
     out: list[Measurement] = []
     for item in data:
         if isinstance(item, CameraCorners):
             frames = chain.forward_kinematics(item.conditions())
             derivative = item.displacement_derivative(frames, problem.instrument_values_of(item, x))
-            motions = _joint_motions(chain, frames)
-            of_tool = np.diag([jitter.position**2] * 3 + [jitter.rotation**2] * 3)
-            root = np.linalg.cholesky(of_tool + jitter.joints**2 * motions @ motions.swapaxes(1, 2))
-            item = item.with_scaled_sigma({"pixels": jitter.noise}).with_jitter(derivative @ root)
+            root = np.linalg.cholesky(covariance(chain, frames))
+            item = item.with_scaled_sigma({"pixels": noise}).with_jitter(derivative @ root, largest)
         out.append(item)
     return tuple(out)

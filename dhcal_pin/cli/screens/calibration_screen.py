@@ -216,6 +216,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
         Block(table, noun="figure", rank=7, n_kept=len(rows), has_space=True),
         Block(sentences),
         Block(summary.position_notes(fit.hand_eye_std)),
+        Block(summary.position_error_notes(fit)),
         Block(summary.regressions(fit, fit.comparisons), "yellow"),
     ]
 
