@@ -39,7 +39,7 @@ from ..plausibility.diagnosis import Diagnosis, is_suspicious
 from ..plausibility.displacement import CorrectionSize, measure_correction, workspace_radius
 from ..plausibility.drawn_samples import fit_drawn_samples
 from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
-from ..plausibility.robot_files import LARGEST_ARM, sum_of_links
+from ..plausibility.robot_files import LARGEST_ARM, length_of_links
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
 from . import cameras
@@ -456,11 +456,11 @@ def _sufficient_iterations(fit: Evidence) -> int | None:
 
 def _impossible_size(fit: Evidence) -> list[Finding]:
     """Refuse a robot that is larger than any arm, whether measurements agree with it or not."""
-    if (size := sum_of_links(fit.errors.chain)) <= LARGEST_ARM:
+    if (size := length_of_links(fit.errors.chain)) <= LARGEST_ARM:
         return []
     text = (
-        f"The links of the robot are {size:.0f} m long together. Correct the unit of the lengths in the "
-        "robot file, and that of the measurements if it is the same."
+        f"The links of the robot are about {size:.0f} m long together. Correct the unit of the lengths in "
+        "the robot file, and that of the measurements if it is the same."
     )
     return [Finding("refused", text)]
 
@@ -762,7 +762,8 @@ def _hidden_cause(fit: Evidence) -> tuple[str, str]:
     """Return why residuals do not show the errors of positions, and what to measure."""
     of_arm = [item for item in fit.data if item.configurations_per_row]
     if _has_only_images(fit):
-        return FEW_IMAGES, f"take at least {needed_images(fit)} different images"
+        count = f"at least {needed_images(fit)} different" if np.isfinite(fit.position_std) else "more"
+        return FEW_IMAGES, f"take {count} images"
     if all(isinstance(item, PointContact) for item in of_arm):
         is_stated = all(item.has_stated_sigma for item in fit.data if not item.configurations_per_row)
         return FEW_POINTS if is_stated else UNSTATED_DISTANCES

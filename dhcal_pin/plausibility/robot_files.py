@@ -17,7 +17,7 @@ from .diagnosis import MIN_LOG_RATIO, Diagnosis
 from .evidence import Evidence, fit_evidence
 from .hypotheses import Hypothesis, JointChange, describe_misread
 
-# Sums of the lengths of all links beyond which the unit of a robot is wrong [m].
+# Lengths of all links together beyond which the unit of a robot is wrong [m].
 SMALLEST_ARM, LARGEST_ARM = 0.01, 50.0
 # Convention of a table by the default parameter set of its chain.
 _CONVENTIONS: dict[str, Convention] = {"dh": "standard", "modified-dh": "modified"}
@@ -28,16 +28,19 @@ _TOLERANCE = 1e-9
 _Mistake = tuple[str, str, Chain]
 
 
-def sum_of_links(chain: Chain) -> float:
-    """Return the sum of the lengths of all links between joints [m]."""
-    return float(np.linalg.norm(chain.origins[1:-1, :3, 3], axis=1).sum())
+def length_of_links(chain: Chain) -> float:
+    """Return the length of all links between joints, if each has the median length [m]."""
+    # One wrong origin is no wrong unit.
+    lengths = np.linalg.norm(chain.origins[1:-1, :3, 3], axis=1)
+    lengths = lengths[lengths > _TOLERANCE]
+    return float(len(lengths) * np.median(lengths)) if len(lengths) else 0.0
 
 
 def find_wrong_lengths(
     chain: Chain, samples: Sequence[Measurement], sets: str, before: Evidence
 ) -> Diagnosis | None:
     """Look for another unit of length of a robot of impossible size; None without one."""
-    size = sum_of_links(chain)
+    size = length_of_links(chain)
     if SMALLEST_ARM <= size <= LARGEST_ARM:
         return None
     mistakes = []

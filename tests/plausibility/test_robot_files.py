@@ -109,7 +109,7 @@ def test_a_robot_and_measurements_of_kilometres_are_refused():
     wrong = Chain.from_dh(replace(right, a=1e3 * right.a, d=1e3 * right.d))
     found = calibrate(wrong, data.replace(values=1e3 * data.values), "minimal,base,tool").verdict
     assert found.status == "refused"
-    assert found.reasons[0].startswith("The links of the robot are 1511 m long together")
+    assert found.reasons[0].startswith("The links of the robot are about 1832 m long together")
 
 
 @pytest.mark.parametrize("name", ["kuka", "panda", "scara"])
