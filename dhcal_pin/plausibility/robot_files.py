@@ -61,7 +61,7 @@ def find_wrong_table(
     table = _read_table(chain)
     if table is None:
         return None
-    other = "modified" if table.convention == "standard" else "standard"
+    other = _with_other_convention(table).convention
     mistakes = [
         (text.format(other), instead.format(other), Chain.from_dh(change(table)))
         for text, instead, change in _MISTAKES

@@ -3,7 +3,7 @@
 Eccentricity, elasticity and backlash turn each joint by a small angle that a model of the links lacks. In few
 images the errors of the links imitate most of it, and what remains is no larger than noise. Images that do
 not show a displacement (`jitter`) are then no evidence that there is none. With independent corners, the true
-errors of a third of the arms from 10 to 20 images were more than 1.5 times the stated ones, up to 6 times.
+errors of 40 % of the simulated arms from 10 to 20 images were more than 1.5 times the stated ones.
 
 The scatter δ ~ N(0, c²) of every joint [rad or m] displaces all corners of an image by A·J·δ, with the
 whitened derivative A by the displacement of the tool and the motions J of the tool by the joints. The
