@@ -62,6 +62,7 @@ def image_section(context: ReportContext) -> Section | None:
         items = [f"{stage.name}: {stage.reason}" for stage in stages if stage.reason]
         tables.append(stage_table(stages))
     sentences += summary.position_notes(context.fit.hand_eye_std)
+    sentences += summary.position_error_notes(context.fit)
     hand_eye = context.fit.hand_eye
     if hand_eye is not None:
         likely = "" if hand_eye.is_noise else hand_eye.likely

@@ -14,7 +14,7 @@ from dhcal_pin.report import Provenance, ReportContext
 from dhcal_pin.report.calibration_report import calibration_document
 from dhcal_pin.report.figures import accuracy_figures
 from dhcal_pin.report.html import html_page
-from dhcal_pin.report.images import image_figures, image_table, stage_table
+from dhcal_pin.report.images import image_figures, image_section, image_table, stage_table
 from dhcal_pin.report.json_document import json_text, result_to_dict
 from dhcal_pin.report.sections import sections_of
 from dhcal_pin.visualization.image_plots import plot_reprojection
@@ -38,6 +38,16 @@ def test_stages_are_those_of_the_json(result):
     for row, stage in zip(table.texts, stages, strict=True):
         assert float(row[3]) == pytest.approx(stage["fitted"]["residual_rms_px"], rel=0.01)
         assert float(row[8]) == pytest.approx(1e3 * stage["by_region"]["board_rms_m"], rel=0.01)
+
+
+def test_the_position_error_of_the_tool_is_stated(result, quick):
+    """It is the larger one of the predicted error and that of left-out images."""
+    stated = result_to_dict(result, {}, {})["position_error_of_images_m"]
+    assert stated == max(result.position_std, result.comparisons[0].after.groups["board"].rms)
+    section = image_section(ReportContext(result, Provenance(names=["corners.csv"])))
+    assert section is not None
+    (text,) = (text for text in section.sentences if "position error" in text)
+    assert float(text.split("about ")[1].split(" mm")[0]) == pytest.approx(1e3 * stated, rel=0.1)
 
 
 def test_images_with_the_largest_errors_are_listed(result, quick):
