@@ -231,9 +231,11 @@ def test_robot_without_errors_is_kept(run, robot_folder, unsuspected_once):
     for truth, is_kept in ((), True), (("--truth", URDF / "sim_6dof_actual.dh.toml"), False):
         arm = URDF / "sim_6dof.dh.toml"
         stdout_of(run("simulate", arm, *truth, "-m", "30", "--noise", "0.1mm,0.01deg", "-o", "exact.csv"))
-        document = json_of(run("calibrate", arm, "exact.csv", "-o", "calibrated.urdf", "--json", "-"))
+        _, out, err = run("calibrate", arm, "exact.csv", "-o", "calibrated.urdf", "--json", "-")
+        document = parse_json(out)
         reasons = document["verdict"]["reasons"]
         assert document["verdict"]["status"] == ("caution" if is_kept else "ok")
+        assert ("; the nominal robot is kept" in unfolded(err)) is is_kept
         assert any("not significantly better than the nominal one" in text for text in reasons) is is_kept
         assert (document["after"] == document["before"]) is is_kept
 

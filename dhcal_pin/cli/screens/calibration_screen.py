@@ -108,6 +108,8 @@ def _robot_lines(fit: Result, robot: str, sets: str) -> list[str]:
     added += f" (and {', '.join(others)}, shrunk by priors)" if others else ""
     if any(stage.name == "arm" and not stage.is_kept for stage in fit.camera_stages):
         sets, added = ",".join(split_sets(sets)[1]), "; the arm is kept"
+    elif fit.is_kept_nominal:
+        added = "; the nominal robot is kept"
     return [
         robot_line(robot, fit.chain),
         f"estimated: {sets.replace(',', ', ')} ({len(fit.parameters)} parameters){added}",
