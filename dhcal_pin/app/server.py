@@ -290,6 +290,7 @@ class _FollowHandler(_Handler):
         self.set_header("Content-Type", "application/x-ndjson")
 
     def on_connection_close(self) -> None:
+        super().on_connection_close()
         if self._answer:
             self._answer.cancel()
 
@@ -328,6 +329,10 @@ class _RunHandler(_FollowHandler):
 
     def data_received(self, chunk: bytes) -> None:
         self._body += chunk
+
+    def on_connection_close(self) -> None:
+        super().on_connection_close()
+        self._body.clear()
 
     async def post(self) -> None:
         try:

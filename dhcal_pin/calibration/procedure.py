@@ -273,7 +273,7 @@ class _Setup:
     priors: Priors  # Priors of the options, or those of the method
     progress: Progress | None
     signs: plausibility.SignDecision | None  # Signs of the joints; None if they are those of the URDF
-    mistakes: cameras.RigMistakes  # Mistakes in the rig, which are corrected
+    mistakes: cameras.RigMistakes | None  # Mistakes in the rig, which are corrected; None without images
     known: Mapping[str, float]  # Values of the instrument parameters that are held
     errors: ErrorModel  # Unknown errors of the robot
     first: Mapping[str, float]  # Errors at which a low-cost arm starts, by name
@@ -304,7 +304,7 @@ def _set_up(
     require_joint_values((*data, *holdout), [*robot_sets, *free])
     signs = _joint_signs(chain, data, turned, is_low_cost, progress)
     chain = signs.apply(chain) if signs else chain
-    mistakes = cameras.RigMistakes()
+    mistakes = None
     stated = _validated_known(data, options.known or {})
     if has_images(data):
         shown = with_shown_entries((*data, *holdout))
@@ -501,6 +501,7 @@ def _calibrate_samples(
 def _calibrate_images(setup: _Setup, begun: SessionFit, groups: PriorGroups) -> Result:
     """Calibrate from images, and look for the scale of the positions beside them."""
     options, found = setup.options, begun.session
+    assert setup.mistakes is not None
     stages = robust.LOSSES[options.loss].stages
     fitting = cameras.ImageFitting(
         groups, stages, options.max_iterations, setup.progress, arm_type(setup.robot_sets)

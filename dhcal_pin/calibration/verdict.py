@@ -1022,6 +1022,8 @@ def _outliers(fit: Evidence) -> list[Finding]:
 
 def _outlying_cameras(fit: Evidence) -> list[Finding]:
     """Refuse one of several cameras most of whose images are outliers: it was fitted to others."""
+    if not cameras.has_images(fit.data):
+        return []
     counts = cameras.count_outlying_images(list(zip(fit.data, fit.is_counted, strict=True)))
     texts = [
         f"{n_outliers} of {n_images} images of camera {name!r} are outliers: it is not calibrated. Check "
@@ -1067,6 +1069,8 @@ def _deviating_lines(fit: Evidence) -> list[Finding]:
 
 def _outlying_end(fit: Evidence) -> list[Finding]:
     """Advise caution if all images from some image on, or up to one, are outliers."""
+    if not cameras.has_images((*fit.data, *fit.holdout)):
+        return []
     parts = [
         *zip(fit.data, fit.is_counted, strict=True),
         *zip(fit.holdout, fit.is_holdout_counted, strict=True),

@@ -312,6 +312,17 @@ def test_a_wrong_token_is_refused_by_the_header(app):
             assert server.memory_info().rss - before < 10_000_000
 
 
+def test_an_interrupted_upload_leaves_no_memory(app):
+    server, parts = psutil.Process(app.process.pid), urlsplit(app.url)
+    before = server.memory_info().rss
+    head = f"POST {parts.path}calibrate HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
+    for _ in range(3):
+        with socket.create_connection((parts.hostname, parts.port), timeout=30) as connection:
+            connection.sendall(f"{head}Content-Length: 95000000\r\n\r\n".encode() + bytes(40_000_000))
+            wait_until(lambda: server.memory_info().rss - before > 30_000_000)
+        wait_until(lambda: server.memory_info().rss - before < 10_000_000)
+
+
 @pytest.mark.parametrize("n_files", [MAX_FILES + 1, 300])
 def test_too_many_files_are_one_line(app, n_files):
     names = [f"{i}.csv" for i in range(n_files)]

@@ -251,4 +251,8 @@ def test_names_of_joints_that_a_browser_would_execute(run, robot_folder):
 def test_names_of_joints_that_no_column_can_have(assert_refused, name):
     text = Path("arm.urdf").read_text().replace('"joint_1"', quoteattr(name))
     Path("arm.urdf").write_text(text)
-    assert_refused(["joint name", "rename the joint"], "calibrate", "arm.urdf", "data.csv", "-o", "o.urdf")
+    for words in (
+        ("calibrate", "arm.urdf", "data.csv", "-o", "o.urdf"),
+        ("inspect", "data.csv", "--robot", "arm.urdf"),
+    ):
+        assert_refused(["joint name", "rename the joint"], *words)

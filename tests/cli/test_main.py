@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from command_line import CALIBRATE, folder_contents, parse_json, stdout_of
 
+from dhcal_pin import robot
 from dhcal_pin.calibration import model_selection
 from dhcal_pin.cli import main
-from dhcal_pin.robot import sampling
 
 COMMANDS = tuple(main.COMMANDS)
 
@@ -44,6 +44,25 @@ def test_help_and_argument_errors_load_nothing_heavy(args):
     )
     done = subprocess.run([sys.executable, "-c", script, *args], capture_output=True, text=True, check=True)
     assert done.stderr.splitlines()[-1] == ""
+
+
+def test_a_calibration_loads_neither_searches_in_images_nor_other_commands(robot_folder):
+    script = (
+        "import sys\n"
+        "from dhcal_pin.cli.main import main\n"
+        "main(sys.argv[1:])\n"
+        "print(*(name for name in sys.modules if name.startswith('dhcal_pin.')))"
+    )
+    command = [sys.executable, "-c", script, *CALIBRATE]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert "dhcal_pin.calibration.verdict" in loaded
+    others = (
+        "calibration.cameras.image_checks",
+        "calibration.cameras.mistakes",
+        "diagnostics.inspection",
+        "planning",
+    )
+    assert not {f"dhcal_pin.{name}" for name in others} & {*loaded}
 
 
 def test_installed_command(robot_folder):
@@ -109,7 +128,7 @@ def test_lack_of_memory_is_one_line(assert_refused, monkeypatch):
     def fail(*_):
         raise MemoryError
 
-    monkeypatch.setattr(sampling, "joint_range", fail)
+    monkeypatch.setattr(robot, "joint_range", fail)
     assert_refused(
         ["not enough memory", "fewer"], "simulate", "arm.urdf", "-m", "1000000000000", "-o", "s.csv"
     )

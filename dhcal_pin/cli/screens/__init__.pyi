@@ -16,8 +16,8 @@ from .result_screens import files_screen as files_screen
 from .result_screens import inspection_screen as inspection_screen
 from .result_screens import plan_screen as plan_screen
 from .result_screens import recheck_screen as recheck_screen
-from .result_screens import robot_line as robot_line
 from .result_screens import robot_screen as robot_screen
 from .result_screens import simulation_screen as simulation_screen
 from .result_screens import study_screen as study_screen
 from .result_screens import validation_screen as validation_screen
+from .screen import robot_line as robot_line

@@ -20,8 +20,7 @@ from ...measurements.images.names import list_images
 from ...report.provenance import Provenance, short_names
 from ..job import Job
 from ..run_job import CalibrationOutcome
-from .result_screens import robot_line
-from .screen import Block, Screen, section_blocks
+from .screen import Block, Screen, robot_line, section_blocks
 
 # Number of corrections that are shown.
 N_CORRECTIONS = 5

@@ -15,7 +15,7 @@ from ...formatting import Quantity, Table, format_count, format_lines, list_firs
 from ...measurements.groups import ERROR_GROUPS, in_order
 from ...planning.views import views_table
 from ...report.provenance import short_names
-from .screen import Block, Screen
+from .screen import Block, Screen, robot_line
 
 if TYPE_CHECKING:
     from ..._typing import Array
@@ -53,13 +53,6 @@ def warnings_block(warnings: Mapping[str, Sequence[str]]) -> Block:
 def files_block(paths: Iterable[object]) -> Block:
     """Describe the files that were written."""
     return Block([f"wrote {path}" for path in paths], noun="file written", rank=3)
-
-
-def robot_line(path: str, chain: Chain) -> str:
-    """Describe a robot by its tip and its joints."""
-    first, *_, last = chain.joint_names * 2
-    joints = f"{chain.n_joints} joints from {first} to {last}" if chain.n_joints > 1 else f"joint {first}"
-    return f"{path}: tip {chain.tip}, {joints}"
 
 
 def simulation_screen(robot: str, paths: Iterable[object]) -> Screen:

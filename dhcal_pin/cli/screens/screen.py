@@ -18,6 +18,7 @@ from ...messages import escape_control_characters
 
 if TYPE_CHECKING:
     from ...report.document import Section
+    from ...robot import Chain
 
 # Views of a screen: the verdict only, one screen, everything.
 Verbosity = Literal["quiet", "normal", "verbose"]
@@ -74,6 +75,13 @@ class Screen:
         if verbosity == "verbose":
             return _full_lines([*self.details(), *self.blocks], width)
         return _shortened_lines(self.blocks, min(width or WIDTH, WIDTH), HEIGHT)
+
+
+def robot_line(path: str, chain: Chain) -> str:
+    """Describe a robot by its tip and its joints."""
+    first, *_, last = chain.joint_names * 2
+    joints = f"{chain.n_joints} joints from {first} to {last}" if chain.n_joints > 1 else f"joint {first}"
+    return f"{path}: tip {chain.tip}, {joints}"
 
 
 def section_blocks(sections: Sequence[Section]) -> list[Block]:

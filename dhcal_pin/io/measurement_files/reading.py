@@ -137,7 +137,6 @@ def read_measurement_file(
     max_rows: int | None = None,
 ) -> MeasurementFile:
     """Read a measurement file with its hold-out samples, of many rows `max_rows` drawn at random."""
-    check_joint_names(chain)
     table = open_measurement_table(source, chain, columns, servos, sheet)
     table = table.thinned(max_rows) if max_rows else table
     return parse_measurements(table, chain, skip_bad_rows, rig)
@@ -151,6 +150,7 @@ def open_measurement_table(
     sheet: str = "",
 ) -> DataTable:
     """Read the table of a measurement file, through a column map and a servo file if they are given."""
+    check_joint_names(chain)
     if columns is None:
         table = read_table(source, TextLayout(sheet=sheet, names=known_columns(chain)))
         if not has_titles(table, chain):

@@ -16,7 +16,7 @@ from ...robot.chain import Chain
 from ...units import TIMES
 from ..tables import DataTable
 from . import reading
-from .columns import QUATERNION, ROTVEC, check_joint_names
+from .columns import QUATERNION, ROTVEC
 from .standstills import JointSeries, PoseSeries, describe_stops, find_stops, have_common_times, stops_text
 from .targets import parse_tool_values
 
@@ -27,7 +27,6 @@ def convert_tables(
     joint_path: PathLike, pose_path: PathLike, chain: Chain, columns: PathLike | None
 ) -> tuple[str, list[str]]:
     """Make the text of a measurement file from the stops of two recorded tables; return it, and notes."""
-    check_joint_names(chain)
     joint_table = _read(joint_path, chain, columns, chain.joint_names)
     pose_table = _read(pose_path, chain, columns, (*_XYZ, *QUATERNION, *ROTVEC))
     joint_times, pose_times = _times(joint_table), _times(pose_table)

@@ -80,7 +80,6 @@ def read_configurations(
     path: PathLike, chain: Chain, columns: PathLike | None = None, sheet: str = ""
 ) -> Array:
     """Read the joint positions of a file; measured values beside them are ignored."""
-    check_joint_names(chain)
     table = reading.open_measurement_table(path, chain, columns, sheet=sheet)
     with table.notes_in_errors():
         table.require_good_rows()
