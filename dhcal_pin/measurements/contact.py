@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -65,15 +66,14 @@ class PointContact(NamedPointMeasurement):
 
     def model(self, points: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return the tool points relative to the touched points, and their derivatives."""
-        m = points.shape[-1]
-        is_touched = self.label[None] == np.arange(len(self.names))[:, None]
-        jacobian = -1.0 * is_touched[:, None, None, :] * np.eye(3)[None, :, :, None]
-        touched = u.reshape(-1, 3)[self.label].T
-        return (
-            points[0] - touched,
-            np.tile(np.eye(3)[None, :, :, None], (1, 1, 1, m)),
-            jacobian.reshape(-1, 3, m),
-        )
+        by_tool = np.broadcast_to(np.eye(3)[None, :, :, None], (1, 3, 3, points.shape[-1]))
+        return points[0] - u.reshape(-1, 3)[self.label].T, by_tool, self._by_touched_points
+
+    @cached_property
+    def _by_touched_points(self) -> Array:
+        """Derivatives (s, 3, m) of the model by the coordinates of the touched points."""
+        is_touched = self.label == np.arange(len(self.names))[:, None]
+        return -np.einsum("pm,ij->pijm", is_touched, np.eye(3)).reshape(-1, 3, len(self.label))
 
     def initialized(self, chain: Chain) -> Self:
         """Return a copy in which each point starts at the mean of the chain's tool points that touch it."""

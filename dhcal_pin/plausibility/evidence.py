@@ -136,8 +136,15 @@ def with_noise_of(
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
-    errors = _initialized_frames(chain, equal, sets)
-    return _fit(errors, tuple(item.initialized(errors.chain) for item in equal), sets)
+    return _fit_initialized(_initialized_frames(chain, equal, sets), equal, sets)
+
+
+def fit_evidence_near(near: Evidence, chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
+    """Compute the evidence of a fit that begins with the base and the tool of another fit."""
+    assert near.chain is not None
+    started = chain.with_base_and_tool(near.chain.base, near.chain.tool)
+    equal = tuple(_with_equal_sigmas(item) for item in data)
+    return _fit_initialized(select_parameters(started, sets), equal, sets)
 
 
 def fit_without_gross_outliers(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence | None:
@@ -163,6 +170,11 @@ def _initialized_frames(chain: Chain, data: tuple[Measurement, ...], sets: str) 
     if any(item.is_contact for item in data):
         errors = compare_tools(errors, data, {}, _N_FRAME_ITERATIONS)
     return errors
+
+
+def _fit_initialized(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Evidence:
+    """Fit errors of a robot to measurements that are initialized from it and compute the evidence."""
+    return _fit(errors, tuple(item.initialized(errors.chain) for item in data), sets)
 
 
 def _fit(errors: ErrorModel, data: tuple[Measurement, ...], sets: str) -> Evidence:

@@ -16,7 +16,7 @@ from .._typing import Array, Progress
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from .diagnosis import MIN_LOG_ADVANTAGE, MIN_LOG_RATIO, Diagnosis, is_fitted, leaves_residuals
-from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence
+from .evidence import HAND_BUILT, MANUFACTURED, Evidence, fit_evidence, fit_evidence_near
 from .hypotheses import (
     AxisChange,
     AxisScale,
@@ -268,9 +268,9 @@ def _most_explaining(
     trial: Trial, kinds: Sequence[Callable[[float], Hypothesis]], sizes: Sequence[float]
 ) -> list[Callable[[float], Hypothesis]]:
     """Return the kind of mistake that explains most at one of several sizes, if it explains anything."""
-    costs = [_costs(trial, _with_sizes(trial, kind, sizes)).min() for kind in kinds]
-    is_explaining = -min(costs, default=np.inf) > trial.before.log + _MAX_LOG_TIE
-    return [kinds[int(np.argmin(costs))]] if is_explaining else []
+    logs = [_logs_near(trial, trial.before, _with_sizes(trial, kind, sizes)).max() for kind in kinds]
+    is_explaining = max(logs, default=-np.inf) > trial.before.log + _MAX_LOG_TIE
+    return [kinds[int(np.argmax(logs))]] if is_explaining else []
 
 
 def _ratio_of_logarithm(chain: Chain, joints: Sequence[int], size: float) -> Hypothesis:
@@ -306,11 +306,10 @@ def _refine(
     for of_size, best, candidate in found:
         if candidate.misfit > largest:
             continue
+        near = fit_evidence(trial.chain, candidate.changed, trial.sets)
         for reach, step in steps:
             sizes = np.arange(best - reach, best + reach + step / 2, step).round(1).tolist()
-            changed = _with_sizes(trial, of_size, sizes)
-            evidence = [fit_evidence(trial.chain, each, trial.sets).log for each in changed]
-            best = sizes[int(np.argmax(evidence))]
+            best = sizes[int(np.argmax(_logs_near(trial, near, _with_sizes(trial, of_size, sizes))))]
         if abs(best) >= smallest:
             refined += _measured(trial, of_size, best)
     return refined
@@ -321,6 +320,11 @@ def _costs(trial: Trial, variants: Sequence[Sequence[Measurement]]) -> Array:
     if trial.compares_nominal:
         return nominal_misfits(trial.chain, variants)
     return np.array([-fit_evidence(trial.chain, each, trial.sets).log for each in variants])
+
+
+def _logs_near(trial: Trial, near: Evidence, variants: Sequence[Sequence[Measurement]]) -> Array:
+    """Return the logarithms of the evidence of variants of the samples, fitted from near another fit."""
+    return np.array([fit_evidence_near(near, trial.chain, each, trial.sets).log for each in variants])
 
 
 def _pairs(singles: Sequence[_Candidate]) -> Iterator[tuple[_Candidate, _Candidate]]:

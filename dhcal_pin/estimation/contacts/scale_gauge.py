@@ -33,6 +33,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ... import se3
 from ..._frozen import frozen
 from ..._typing import Array
 from ...robot.chain import Chain
@@ -72,9 +73,9 @@ class ScaleGauge:
                 _N_SAMPLES * _rms_radius(offsets) * self.nominal
             )
             inertia = np.vdot(offsets, offsets) * np.eye(3) - offsets @ offsets.T
-            rates[:, 1:] = np.cross(offsets[None], velocities, axis=1).sum(-1) @ np.linalg.pinv(
-                inertia, hermitian=True
-            )
+            product = offsets @ velocities.swapaxes(1, 2)
+            turned = (product - product.swapaxes(1, 2))[:, [1, 2, 0], [2, 0, 1]]
+            rates[:, 1:] = turned @ np.linalg.pinv(inertia, hermitian=True)
         return rates
 
 
@@ -94,4 +95,4 @@ def normalize_by_scale(block: Array, size: float, rates: Array, are_vectors: boo
     residual = block[-1]
     block[: len(rates)] += (rates[:, 0] / size)[:, None, None] * residual
     if are_vectors:
-        block[: len(rates)] += np.cross(rates[:, 1:, None], residual[None], axis=1)
+        block[: len(rates)] += se3.skew(rates[:, 1:]) @ residual
