@@ -251,15 +251,15 @@ def covariance_root(rows: Array, prior: Array) -> Array:
 
 
 def solve_information(information: Array, right: Array) -> Array:
-    """Return the inverse of a matrix of information times a vector."""
+    """Return the inverses of matrices of information (..., p, p) times vectors (..., p)."""
     unit, scale = _with_unit_diagonal(information)
-    return np.linalg.solve(unit, right / scale) / scale
+    return np.linalg.solve(unit, (right / scale)[..., None])[..., 0] / scale
 
 
 def _with_unit_diagonal(information: Array) -> tuple[Array, Array]:
-    """Scale a matrix of information to unit diagonal, and raise the diagonal for undetermined directions."""
-    scale = np.sqrt(np.diag(information))
+    """Scale matrices of information to unit diagonal, and raise the diagonal for undetermined directions."""
+    scale = np.sqrt(np.einsum("...ii->...i", information))
     scale[scale == 0] = 1.0
-    unit = information / scale / scale[:, None]
-    unit.flat[:: len(unit) + 1] += MIN_INFORMATION
+    unit = information / scale[..., None, :] / scale[..., None]
+    np.einsum("...ii->...i", unit)[...] += MIN_INFORMATION
     return unit, scale

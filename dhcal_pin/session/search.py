@@ -284,7 +284,7 @@ class _Search:
         value = np.concatenate([self.x, *(cause.values for cause in causes)])
         is_row = self.groups >= 0
         flat = columns.reshape(-1, columns.shape[-1])
-        products = [part.T @ part for part in (flat[chosen] for chosen in self.members)]
+        products = [part.T @ part for part in (flat.take(chosen, 0) for chosen in self.members)]
         noise, weights = np.ones(residual.shape), np.ones(len(rows))
 
         def information_with(weights: Array) -> Array:
@@ -926,16 +926,16 @@ def _predicted_gain(
         total = parts.sum(0) + timeless.T @ timeless
         used = np.arange(stack.shape[-1] - 1)
         inside.append(_cost(total, total, prior, used))
-        predicted.append(sum(_cost(total - part, part, prior, used) for part in parts))
+        predicted.append(float(np.sum(_cost(total - parts, parts, prior, used))))
     return inside[0] - inside[1], predicted[0] - predicted[1]
 
 
-def _cost(kept: Array, out: Array, prior: Array, used: Array) -> float:
+def _cost(kept: Array, out: Array, prior: Array, used: Array) -> Array:
     """Return the squared residuals with products `out`, for the fit of some columns to products `kept`."""
-    matrix = kept[np.ix_(used, used)] + np.diag(prior[used] ** 2)
-    x = np.append(-solve_information(matrix, kept[used, -1]), 1.0)
-    chosen = np.append(used, len(kept) - 1)
-    return float(x @ out[np.ix_(chosen, chosen)] @ x)
+    own = np.ix_(used, used)
+    x = -solve_information(kept[..., *own] + np.diag(prior[used] ** 2), kept[..., used, -1])
+    along = out[..., *own] @ x[..., None] + 2 * out[..., used, -1:]
+    return out[..., -1, -1] + np.sum(x[..., None] * along, (-2, -1))
 
 
 def _bounded_cost(residual: Array) -> Array:
