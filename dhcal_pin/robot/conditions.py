@@ -180,13 +180,11 @@ class SampleState(JointState):
 
 def concatenate_conditions(parts: Sequence[Conditions | None]) -> Conditions | None:
     """Join the conditions of several sets of samples; a condition has to be known of all of them."""
-    known_parts = [part for part in parts if part is not None]
-    if len(known_parts) < len(parts):
+    if any(part is None for part in parts):
         return None
-    known = frozenset.intersection(*(part.names for part in known_parts)) | {"q"}
-    return Conditions(
-        **{name: np.concatenate([getattr(part, name) for part in known_parts]) for name in known}
-    )
+    values = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Conditions)}
+    known = {name: each for name, each in values.items() if not any(value is None for value in each)}
+    return Conditions(**{name: np.concatenate(each) for name, each in known.items()})
 
 
 def directions_in_order(q: Array) -> Array:
