@@ -157,7 +157,7 @@ def ordered_axes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 
 @pytest.fixture
 def inside_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the calibrations without each region of joint space, which reports and JSON documents need."""
+    """Leave out the calibrations without each region of joint space, for reports and JSON documents."""
     original = evidence.estimate_generalization
     monkeypatch.setattr(evidence, "estimate_generalization", lambda *args: original(*args[:-1], ()))
 

@@ -369,6 +369,7 @@ def test_poses_and_positions_are_fitted_together(run, robot_folder, unsuspected_
     assert document["after"]["orientation_rms_rad"] < 1e-9
 
 
+@pytest.mark.usefixtures("unsuspected_once", "inside_only")
 def test_exact_data_give_the_true_parameters(run, robot_folder):
     sim, actual = URDF / "sim_6dof.dh.toml", URDF / "sim_6dof_actual.dh.toml"
     stdout_of(run("simulate", sim, "--truth", actual, "-m", "20", "-o", "fit.csv"))
