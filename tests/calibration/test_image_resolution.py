@@ -16,7 +16,7 @@ from dhcal_pin.cameras import Camera
 from dhcal_pin.cameras.resolution import FACTORS, find_resolution, is_far
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "ordered_axes")
 
 STATED = np.array([1000.0, 1000.0, 640.0, 480.0, 0, 0, 0, 0, 0])
 

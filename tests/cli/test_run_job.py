@@ -437,7 +437,7 @@ def test_restricted_parameters_are_reported(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_default_parameters_of_a_dh_file(run, tmp_path, monkeypatch, convention):
+def test_default_parameters_of_a_dh_file(run, tmp_path, monkeypatch, inside_only, convention):
     """They are those of its convention. An error of the base is a reason for caution; the remedy helps."""
     monkeypatch.chdir(tmp_path)
     rows = [
