@@ -19,7 +19,7 @@ from robots import missing, nominal_arm, paper
 
 from dhcal_pin import plots
 from dhcal_pin.calibration import evidence, procedure, verdict
-from dhcal_pin.calibration.cameras import diagnosis
+from dhcal_pin.calibration.cameras import diagnosis, image_session
 from dhcal_pin.calibration.cameras.mistakes import rig
 from dhcal_pin.cli import main
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
@@ -98,10 +98,17 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots.SvgPanels, "draw", lambda self, plot, key, *_, **__: f'<svg id="{key}"></svg>')
 
 
+def leave_out_events(patch: pytest.MonkeyPatch) -> None:
+    """Leave out the search for events of a measurement."""
+    patch.setattr(procedure, "can_have_session", lambda _: False)
+    # Otherwise the poses of the images are calibrated for an event that is then not looked for.
+    patch.setattr(image_session, "find_image_session", lambda *_: None)
+
+
 def leave_out_mistakes(patch: pytest.MonkeyPatch) -> None:
     """Leave out the search for mistakes and events of a measurement, which takes seconds for some arms."""
     patch.setattr(evidence, "diagnose_mixups", lambda *_: Diagnosis(NO_EVIDENCE))
-    patch.setattr(procedure, "can_have_session", lambda _: False)
+    leave_out_events(patch)
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +132,7 @@ def uneventful(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     Mistakes in the joint values of the images are a part of it. `session/test_image_session.py` is about it.
     """
     if not request.node.get_closest_marker("slow"):
-        monkeypatch.setattr(procedure, "can_have_session", lambda _: False)
+        leave_out_events(monkeypatch)
 
 
 @pytest.fixture
@@ -146,6 +153,13 @@ def ordered_axes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
     """
     if not request.node.get_closest_marker("slow"):
         monkeypatch.setattr(rig, "exchange_axes", lambda _, data: (tuple(data), ()))
+
+
+@pytest.fixture
+def inside_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the calibrations without each region of joint space, for reports and JSON documents."""
+    original = evidence.estimate_generalization
+    monkeypatch.setattr(evidence, "estimate_generalization", lambda *args: original(*args[:-1], ()))
 
 
 @pytest.fixture(scope="module")

@@ -566,7 +566,7 @@ def test_targets_in_the_wrong_frame_are_hinted_at(place, run):
 @pytest.mark.parametrize(("stated", "unit"), [("m", "mm"), ("mm", "m")])
 def test_another_unit_is_suggested_if_the_targets_are_then_reached(place, run, stated, unit):
     nominal, true = place
-    poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 30, np.random.default_rng(3)))
+    poses = replace(true, base=np.eye(4), tool=np.eye(4)).poses(draw(nominal, 8, np.random.default_rng(3)))
     hint = f"hint: most targets are reached if they are in {unit}; check the units in the header"
     for offset, is_hinted in ((0.0, True), (50.0, False)):
         moved = poses + se3.translation([offset, 0, 0]) - np.eye(4)

@@ -448,6 +448,7 @@ def test_a_known_rig_judges_the_arm_alone():
     assert kept.errors.parameters == ()
 
 
+@pytest.mark.usefixtures("ordered_axes")
 def test_few_held_out_images_do_not_discard_cameras_and_boards():
     """Five images cannot show that the arm is better; the poses that were estimated must not be lost for it.
 

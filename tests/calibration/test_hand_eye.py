@@ -42,7 +42,7 @@ from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.plausibility.hypotheses import mend
 from dhcal_pin.report.json_document import json_text, result_to_dict
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "ordered_axes")
 
 # Cause that should be named for each fault.
 CAUSES = {

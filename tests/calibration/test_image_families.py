@@ -25,7 +25,7 @@ from dhcal_pin.estimation.problem import Problem, linearize_and_factor
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.measurements import CameraCorners
 
-pytestmark = pytest.mark.usefixtures("untried", "ordered_axes")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
 
 
 def rms(errors: np.ndarray) -> float:

@@ -16,7 +16,7 @@ from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.calibration.summary import position_error_of_images
 from dhcal_pin.se3 import exp3
 
-pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried")
+pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "untried", "ordered_axes")
 
 
 def uneven_setup(seed: int, n_images: int) -> Setup:

@@ -27,7 +27,7 @@ from dhcal_pin.measurements.camera import simulated_rig
 from dhcal_pin.report import write_report
 from dhcal_pin.se3 import exp6
 
-pytestmark = pytest.mark.usefixtures("untried")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
 
 # Known distances between points need contacts with these points: see `test_kinds`.
 PAIRS = list(combinations([name for name in KINDS if name != "point_distance"], 2))

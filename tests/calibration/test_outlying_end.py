@@ -11,7 +11,7 @@ import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import describe_outlying_end
 from dhcal_pin.calibration.evaluation import compute_errors
 
-pytestmark = pytest.mark.usefixtures("own_loss")
+pytestmark = pytest.mark.usefixtures("own_loss", "untried", "ordered_axes")
 
 
 def photograph(seed, n_moved, at_begin=False, n_images=40):

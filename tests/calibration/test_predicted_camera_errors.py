@@ -16,6 +16,8 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import Result
 from dhcal_pin.io.sidecar import read_uncertainty
 
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
+
 SETS = "placement,offset,camera,board,intrinsics"
 
 

@@ -83,7 +83,7 @@ def test_inverse_poses_that_are_held_are_the_cause(case, kind, has_joint_values)
     name, seed, is_on_wrist = case
     chain = ARMS[name]()
     setup = simulate(
-        chain, chain, np.random.default_rng(seed), is_on_wrist=is_on_wrist, n_images=15, sigma=0.2
+        chain, chain, np.random.default_rng(seed), is_on_wrist=is_on_wrist, n_images=12, sigma=0.2
     )
     others = {"camera": "board,intrinsics", "board": "camera,intrinsics"}[kind]
     images = with_stated(setup, *STATED[kind]).replace(has_joint_values=has_joint_values)

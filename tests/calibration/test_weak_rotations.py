@@ -27,6 +27,8 @@ from dhcal_pin.formatting import Quantity
 from dhcal_pin.measurements import CameraCorners
 from dhcal_pin.report.json_document import result_to_dict
 
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
+
 AXES = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
 # Rotations of the tool: none, up to ±20° about one axis, and up to ±40° about two axes.
 NONE, ONE_AXIS, TWO_AXES = np.zeros((1, 3)), np.deg2rad(20) * AXES[:1], np.deg2rad(40) * AXES[:2]

@@ -61,7 +61,7 @@ def rms(fit):
     return np.sqrt(np.mean(residual**2))
 
 
-FAST = [("slide", "circle", [2]), ("ur5", "circle", [0]), ("ur5", "plane", [2]), ("panda", "line", [1])]
+FAST = [("ur5", "circle", [0]), ("panda", "line", [1])]
 SLOW = [(arm, path, range(6)) for arm in ("slide", "ur5", "panda") for path in ("plane", "line", "circle")]
 
 

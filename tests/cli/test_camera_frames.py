@@ -15,7 +15,7 @@ from dhcal_pin.cameras import Board, Camera, Rig
 from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
-pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes", "inside_only")
 
 NOISE = 0.05
 BASE = se3.transform(se3.exp3([0, 0, 0.3]), [0.1, 0, 0.02])

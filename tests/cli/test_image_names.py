@@ -13,7 +13,7 @@ from dhcal_pin.cameras import Rig
 from dhcal_pin.io.rig_file import rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
-pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes", "inside_only")
 
 # Images whose corners are those of another image; the last four are held out.
 WRONG, N_IMAGES, N_HELD_OUT = (2, 5, 11, 15), 20, 4

@@ -369,6 +369,7 @@ def test_poses_and_positions_are_fitted_together(run, robot_folder, unsuspected_
     assert document["after"]["orientation_rms_rad"] < 1e-9
 
 
+@pytest.mark.usefixtures("unsuspected_once", "inside_only")
 def test_exact_data_give_the_true_parameters(run, robot_folder):
     sim, actual = URDF / "sim_6dof.dh.toml", URDF / "sim_6dof_actual.dh.toml"
     stdout_of(run("simulate", sim, "--truth", actual, "-m", "20", "-o", "fit.csv"))
@@ -436,7 +437,7 @@ def test_restricted_parameters_are_reported(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_default_parameters_of_a_dh_file(run, tmp_path, monkeypatch, convention):
+def test_default_parameters_of_a_dh_file(run, tmp_path, monkeypatch, inside_only, convention):
     """They are those of its convention. An error of the base is a reason for caution; the remedy helps."""
     monkeypatch.chdir(tmp_path)
     rows = [

@@ -35,7 +35,7 @@ def assert_fits(err):
     "kind",
     some_slow(list(KINDS), [list(KINDS).index(kind) for kind in ("position", "pose", "point", "camera")]),
 )
-def test_calibrations_of_all_kinds(run, robot_folder, kind):
+def test_calibrations_of_all_kinds(run, robot_folder, kind, unsuspected_once):
     arm = URDF / "experiment.dh.toml"
     stdout_of(run("simulate", arm, "--errors", "1mm,0.3deg", "-m", 40, "--kind", kind, "-o", "k.csv"))
     rig = ["--rig", "k.rig.toml"] if Path("k.rig.toml").exists() else []
@@ -60,7 +60,7 @@ def test_calibrations_of_several_robots(run, robot_folder, arm):
 
 
 @pytest.mark.parametrize("n_files", some_slow([1, 8, 40], {0, 1}))
-def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspected_once):
+def test_long_paths_and_many_files(run, robot_folder, n_files, undrawn, unsuspected_once, inside_only):
     folder = Path(LONG_FOLDER)
     folder.mkdir(parents=True)
     names = [str(folder / f"{'position of the reflector ' * 4}{i}.csv") for i in range(n_files)]

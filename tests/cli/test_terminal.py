@@ -44,6 +44,7 @@ def test_paths(run, robot_folder, wrong):
     assert_harmless(run("calibrate", robot, data, "-o", "o.urdf", "--method", HOSTILE)[2])
 
 
+@pytest.mark.usefixtures("unsuspected_once")
 def test_labels_of_points(run, robot_folder):
     rng = np.random.default_rng(0)
     rows = [

@@ -17,7 +17,7 @@ from dhcal_pin.cli import main
 from dhcal_pin.io.rig_file import read_calibrated_rig, rig_text
 from dhcal_pin.measurements import mount_rig, project_board
 
-pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
+pytestmark = pytest.mark.usefixtures("uneventful", "untried", "ordered_axes", "inside_only")
 
 NOISE = 0.1
 N_FITTED, N_OTHER = 20, 12

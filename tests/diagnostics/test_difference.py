@@ -9,6 +9,7 @@ import pytest
 from robots import paper
 from scipy import stats
 from sessions import ANGLE_NOISE, NOISE, Simulation
+from slow_cases import some_slow
 
 from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
@@ -70,7 +71,7 @@ def reduced(found: Difference) -> float:
     return found.overall.reduced
 
 
-@pytest.mark.parametrize("arm", ["ur10", "panda", "xarm7"])
+@pytest.mark.parametrize("arm", some_slow(["ur10", "panda", "xarm7"], {0}))
 def test_a_calibrated_robot_differs_from_the_nominal_one(arm):
     """Positions do not determine the orientation of the tool, which no distance depends on."""
     sim = Simulation(arm, 60, 3)

@@ -385,6 +385,7 @@ def test_warnings_on_the_command_line(tmp_path, monkeypatch, capsys, command):
     assert found[0].startswith("data.csv: warning: line 14: identical to other rows")
 
 
+@pytest.mark.usefixtures("unsuspected_once")
 def test_two_anchors_with_one_name_give_warnings(tmp_path, monkeypatch, capsys):
     """One estimated anchor cannot fit the lengths of two files that use different anchors."""
     monkeypatch.chdir(tmp_path)

@@ -84,7 +84,7 @@ def test_long_offsets_of_parallel_axes_that_cancel_get_no_warning():
 def test_commands_name_the_joint(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     chain = nominal_arm("ur10")
-    q = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 6))
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (12, 6))
     data = Position.simulate(chain, q, Noise(1e-4), np.random.default_rng(1))
     Path("data.csv").write_text(measurement_text(data, chain))
     Path("arm.urdf").write_bytes(in_millimetres(chain, "wrist_1_joint"))

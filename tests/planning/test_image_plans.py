@@ -449,7 +449,7 @@ def test_plan_says_what_the_corners_of_a_board_cost_if_they_must_be_estimated():
     """With `points = "auto"` the corners are exact in the plan; the error otherwise is stated beside it."""
     arm, rig = setup("ur10-wrist")
     rig = with_points(rig, columns=5, rows=4)
-    options = {"noise": NOISE, "candidates": 24, "space": FLOOR}
+    options = {"noise": NOISE, "candidates": 20, "space": FLOOR}
     auto = plan(arm, 5, images=PlannedImages(rig), **options)
     prior = plan(arm, 5, images=PlannedImages(with_points(rig, has_free_points=True)), **options)
     fixed = plan(arm, 5, images=PlannedImages(with_points(rig, has_exact_points=True)), **options)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import interrupted_saves
 import pytest
+from slow_cases import some_slow
 
 SCRIPT = Path(interrupted_saves.__file__)
 
@@ -20,7 +21,8 @@ def outcomes(folder: Path, name: str, start: int, stride: int) -> dict[str, int]
 
 
 @pytest.mark.parametrize(
-    ("name", "start"), [("SIGINT", 11), ("SIGTERM", 150), ("SIGHUP", 290), ("SIGKILL", 70)]
+    ("name", "start"),
+    some_slow([("SIGINT", 11), ("SIGTERM", 150), ("SIGHUP", 290), ("SIGKILL", 70)], {0, 1, 3}),
 )
 def test_interrupted_saves_leave_all_files_or_none(tmp_path, name, start):
     left = outcomes(tmp_path, name, start, 401)

@@ -575,11 +575,12 @@ def test_few_poses_of_one_robot_are_not_those_of_two(seed):
     assert fit.verdict.status != "refused", fit.verdict.reasons
 
 
-@pytest.mark.parametrize(
-    ("kind", "size", "count"), [(Pose, 3e-4, 25), (Pose, 8e-3, 40), (Position, 8e-3, 60)]
-)
-@pytest.mark.parametrize("n_files", [1, 2])
-def test_two_robots_of_any_difference_are_refused(kind, size, count, n_files):
+TWO_ROBOTS = list(product([1, 2], [(Pose, 3e-4, 25), (Pose, 8e-3, 40), (Position, 8e-3, 60)]))
+
+
+@pytest.mark.parametrize(("n_files", "case"), some_slow(TWO_ROBOTS, {0, 2, 3}))
+def test_two_robots_of_any_difference_are_refused(n_files, case):
+    kind, size, count = case
     simulation = Simulation("xarm7", 120, 7, errors=(size, 2 * size))
     first = simulation.measure(kind).take(np.arange(120 - count)).replace(source="1.csv")
     simulation.disturb(simulation.model)

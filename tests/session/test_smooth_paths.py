@@ -59,7 +59,7 @@ class ElasticArm:
 CASES = [(name, seed) for seed in range(20) for name in ("ur5", "ur10")]
 
 
-@pytest.mark.parametrize(("name", "seed"), some_slow(CASES, {0, 1}))
+@pytest.mark.parametrize(("name", "seed"), some_slow(CASES, {1}))
 def test_nothing_changes_along_a_smooth_path(name, seed):
     arm = ElasticArm(name, seed)
     times = np.linspace(0, 1, N_SAMPLES)
