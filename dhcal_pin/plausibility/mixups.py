@@ -168,6 +168,9 @@ def _find_single(
     if is_fitting:
         samples = [*samples, *lengths]
         before = fit_samples(chain, samples, sets) if lengths else before
+        # Distances may be between points that the drawn samples do not touch.
+        if before.chain is None:
+            return Diagnosis(before), None
         return try_ratios(chain, samples, sets, before, progress), None
     found, trial = try_hypotheses(chain, samples, neighbourhood, sets, before, progress)
     if trial and (table := find_wrong_table(chain, samples, sets, before)):

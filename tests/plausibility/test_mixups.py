@@ -19,7 +19,7 @@ from dhcal_pin.calibration import calibrate
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import UnknownNameError
 from dhcal_pin.io import read_robot
-from dhcal_pin.measurements import Distance, Noise, PointContact, Pose, Position, Wires
+from dhcal_pin.measurements import Distance, Noise, PointContact, PointDistance, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups, trials
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
@@ -540,6 +540,14 @@ def test_other_instruments_show_mixed_up_joints(ur10, kind):
     wrong = with_joints(data, flipped(2))
     assert "sign:elbow_joint" in [hypothesis.key for hypothesis in diagnose_mixups(ur10, [wrong]).hypotheses]
     assert not diagnose_mixups(ur10, [data]).hypotheses
+
+
+def test_distances_between_points_that_no_drawn_sample_touches_say_nothing(ur10):
+    rng = np.random.default_rng(0)
+    data = PointContact.simulate(ur10, rng.uniform(-2, 2, (24, 6)), Noise(1e-4), rng)
+    pairs = [(f"a{i}", f"b{i}") for i in range(20)]
+    found = diagnose_mixups(ur10, [data, PointDistance(6, pairs, np.ones(20))])
+    assert not (found.hypotheses or found.zero or found.is_suspicious)
 
 
 @pytest.mark.parametrize("seed", some_slow(list(range(10)), {2}))
