@@ -4,6 +4,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 # The workers of pytest share the processors, and NumPy reads this when it is loaded.
@@ -158,8 +159,8 @@ def ordered_axes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 @pytest.fixture
 def inside_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the calibrations without each region of joint space, for reports and JSON documents."""
-    original = evidence.estimate_generalization
-    monkeypatch.setattr(evidence, "estimate_generalization", lambda *args: original(*args[:-1], ()))
+    without_regions = partial(evidence.estimate_generalization, folds=())
+    monkeypatch.setattr(evidence, "estimate_generalization", lambda *args: without_regions(*args[:-1]))
 
 
 @pytest.fixture(scope="module")
