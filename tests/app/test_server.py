@@ -297,14 +297,23 @@ def test_large_files_are_refused_before_they_are_read(tmp_path):
         assert app.stop() == 0
 
 
+def begin_upload(app, path):
+    """Connect to the app and send the head of an upload of 95 MB."""
+    parts = urlsplit(app.url)
+    connection = socket.create_connection((parts.hostname, parts.port), timeout=30)
+    connection.sendall(
+        f"POST {path} HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
+        "Content-Length: 95000000\r\n\r\n".encode()
+    )
+    return connection
+
+
 def test_a_wrong_token_is_refused_by_the_header(app):
     """The answer comes before the body, none of which is kept."""
-    server, parts = psutil.Process(app.process.pid), urlsplit(app.url)
+    server = psutil.Process(app.process.pid)
     before = server.memory_info().rss
-    head = f"POST /wrong/calibrate HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
     for _ in range(3):
-        with socket.create_connection((parts.hostname, parts.port), timeout=30) as connection:
-            connection.sendall(f"{head}Content-Length: 95000000\r\n\r\n".encode())
+        with begin_upload(app, "/wrong/calibrate") as connection:
             assert b" 404 " in connection.recv(1000)
             with suppress(ConnectionError):
                 for _ in range(30):
@@ -313,12 +322,11 @@ def test_a_wrong_token_is_refused_by_the_header(app):
 
 
 def test_an_interrupted_upload_leaves_no_memory(app):
-    server, parts = psutil.Process(app.process.pid), urlsplit(app.url)
+    server = psutil.Process(app.process.pid)
     before = server.memory_info().rss
-    head = f"POST {parts.path}calibrate HTTP/1.1\r\nHost: {parts.netloc}\r\nOrigin: http://{parts.netloc}\r\n"
     for _ in range(3):
-        with socket.create_connection((parts.hostname, parts.port), timeout=30) as connection:
-            connection.sendall(f"{head}Content-Length: 95000000\r\n\r\n".encode() + bytes(40_000_000))
+        with begin_upload(app, f"{urlsplit(app.url).path}calibrate") as connection:
+            connection.sendall(bytes(40_000_000))
             wait_until(lambda: server.memory_info().rss - before > 30_000_000)
         wait_until(lambda: server.memory_info().rss - before < 10_000_000)
 
