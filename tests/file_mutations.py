@@ -433,7 +433,7 @@ def assert_units_of_header(data: bytes) -> None:
 
     Only plain tables are compared: separated by commas, without quotes and comments, and all cells numbers.
     """
-    rows = list(csv.reader(data.decode().removeprefix("\ufeff").splitlines()))
+    rows = list(csv.reader(data.decode(errors="replace").removeprefix("\ufeff").splitlines()))
     if any(sign in data for sign in b'"#;\t'):
         return
     rows = [row for row in rows if any(map(str.strip, row))]

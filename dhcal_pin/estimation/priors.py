@@ -47,8 +47,8 @@ EXPECTATION_COUNT = 0.5
 # Largest estimated standard deviation as a multiple of the expected one. One error that the data hardly
 # determine would otherwise widen the priors of its group without limit, and grow with them.
 MAX_WIDENING = 10.0
-# Smallest positive number.
-_SMALLEST = np.finfo(float).tiny
+# Sums of squares below this one count as it, so that ratios of them are finite.
+_SMALLEST = 1e-100
 
 
 def prior_weights(errors: ErrorModel, priors: Priors) -> Array:

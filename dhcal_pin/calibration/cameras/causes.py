@@ -41,6 +41,7 @@ from ...measurements.camera import CameraCorners, change_images, select_images
 from ...measurements.images.camera_parameters import POINTS_SET, POSE_NAMES
 from ...measurements.images.camera_start import first_values
 from ..reweighting import Fit, reweight
+from .lens_priors import lens_prior_groups
 from .mistakes import held_entries
 
 # Causes, and parameter sets of those of the arm. Those with fewer unknowns come first.
@@ -102,7 +103,7 @@ def apply_causes(hand_eye: HandEyeData, causes: Causes, item: CameraCorners) -> 
 
 
 def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
-    """Return images with the rig of some causes and their own joint values."""
+    """Return images with the rig of some causes, default priors and their own joint values."""
     item = with_sizes(causes.sizes, item) if causes.sizes else item
     cameras, boards = item.rig.cameras, item.rig.boards
     if causes.has_lens:
@@ -117,7 +118,7 @@ def _with_rig(causes: Causes, item: CameraCorners) -> CameraCorners:
         rig = replace(rig, cameras=cameras, boards=boards)
     if causes.has_exchanged_links:
         rig = rig.with_exchanged_links()
-    return item if rig is item.rig else item.with_rig(rig)
+    return item.with_rig(rig)
 
 
 def with_sizes(sizes: Mapping[str, float], item: CameraCorners) -> CameraCorners:
@@ -136,11 +137,11 @@ def with_sizes(sizes: Mapping[str, float], item: CameraCorners) -> CameraCorners
 
 
 def fit_causes(hand_eye: HandEyeData, causes: Causes, start: Mapping[str, float] | None) -> Fit:
-    """Fit the model of some causes; noise and the sizes of the arm's errors are estimated."""
+    """Fit the model of some causes; noise and the sizes of errors of arm and lens are estimated."""
     fit = _first_fit(hand_eye, causes, start)
     errors = fit.problem.errors
     has_default = np.ones(len(errors.parameters), bool)
-    groups = group_default_priors(errors, fit.problem.weights, has_default)
+    groups = group_default_priors(errors, fit.problem.weights, has_default) + lens_prior_groups(fit.problem)
     return reweight(fit, (KEPT,), groups, _MAX_ITERATIONS, None)
 
 

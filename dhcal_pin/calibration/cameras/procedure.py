@@ -37,7 +37,7 @@ from .image_checks import find_unrelated_images, seen_ranges_warning
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
-from .mistakes import RigMistakes
+from .mistakes import RigMistakes, stated_poses
 from .sets import DEFAULT_SETS, has_images
 from .stages import fitted_error
 
@@ -123,7 +123,8 @@ def calibrate_images(
     max_error = fitting.arm_type.max_error
     is_stuck = not (fit.solution.converged or fit.solution.iterations)
     unrelated = find_unrelated_images(fit, holdout, chain, max_error)
-    if is_stuck and fitted_error(fit).pixels > max_error and not unrelated:
+    is_stuck = is_stuck and fitted_error(fit).pixels > max_error
+    if is_stuck and not unrelated and stated_poses(select_images(fit.data)):
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
             "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards, and "

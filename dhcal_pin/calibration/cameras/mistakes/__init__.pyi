@@ -5,3 +5,4 @@ from .rig import correct_rig as correct_rig
 from .stated_poses import PoseDifference as PoseDifference
 from .stated_poses import held_entries as held_entries
 from .stated_poses import pose_differences as pose_differences
+from .stated_poses import stated_poses as stated_poses

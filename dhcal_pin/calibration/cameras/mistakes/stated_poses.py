@@ -98,7 +98,7 @@ def free_wrong_poses(
 ) -> tuple[tuple[Measurement, ...], tuple[PoseDifference, ...]]:
     """Remove stated poses of some sets that contradict the images from all measurements."""
     both, images = (*data, *holdout), select_images(data)
-    entries = [entry for entry in _stated_poses(images) if entry.partition("_")[0] in sets]
+    entries = [entry for entry in stated_poses(images) if entry.partition("_")[0] in sets]
     if not entries:
         return both, ()
     try:
@@ -116,14 +116,14 @@ def free_wrong_poses(
 
 def held_entries(data: Sequence[Measurement], known: Mapping[str, float]) -> list[str]:
     """List the cameras and boards whose stated poses are held."""
-    return [entry for entry in _stated_poses(select_images(data)) if f"{entry}.x" in known]
+    return [entry for entry in stated_poses(select_images(data)) if f"{entry}.x" in known]
 
 
 def pose_differences(
     images: Sequence[CameraCorners], values: Mapping[str, float], entries: Sequence[str]
 ) -> tuple[PoseDifference, ...]:
     """Compare the stated poses of cameras and boards with those of parameter values by name."""
-    stated = _stated_poses(images)
+    stated = stated_poses(images)
     return tuple(
         PoseDifference(entry, stated[entry], se3.transform(se3.exp3(vector[3:]), vector[:3]))
         for entry in entries
@@ -131,7 +131,7 @@ def pose_differences(
     )
 
 
-def _stated_poses(images: Sequence[CameraCorners]) -> dict[str, Array]:
+def stated_poses(images: Sequence[CameraCorners]) -> dict[str, Array]:
     """Return the stated poses of cameras and boards, by the beginnings of the names of their parameters."""
     return {
         f"{kind}_{entry.name}": entry.pose
