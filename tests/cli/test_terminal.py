@@ -44,17 +44,16 @@ def test_paths(run, robot_folder, wrong):
     assert_harmless(run("calibrate", robot, data, "-o", "o.urdf", "--method", HOSTILE)[2])
 
 
-@pytest.mark.usefixtures("unsuspected_once")
 def test_labels_of_points(run, robot_folder):
-    rng = np.random.default_rng(0)
-    rows = [
-        f"{','.join(map(str, rng.uniform(-80, 80, 3)))},{label}"
-        for label in (f"{HOSTILE}a", f"{HOSTILE}b")
-        for _ in range(12)
-    ]
-    header = HEADER.split(",x[mm]")[0]
+    header, rows = HEADER.split(",x[mm]")[0], [f"{10 * i},20,30,{HOSTILE}{i % 2}" for i in range(8)]
     Path("touch.csv").write_text("\n".join([f"{header},point", *rows]), encoding="utf-8")
-    err = stderr_of(run("calibrate", "arm.urdf", "touch.csv", "-o", "o.urdf", "--force"))
+    Path("lengths.csv").write_text(
+        f"point_a,point_b,distance[mm]\n{HOSTILE}0,{HOSTILE}2,90\n", encoding="utf-8"
+    )
+    status, _, err = run("calibrate", "arm.urdf", "touch.csv", "lengths.csv", "-o", "o.urdf")
+    assert status == 2
+    assert r"\x1b[2J\x07\u202e\x9b31m2" in err
+    assert r"choose from \x1b[2J\x07\u202e\x9b31m0, \x1b" in err
     assert_harmless(err)
 
 
