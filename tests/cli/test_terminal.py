@@ -8,7 +8,6 @@ import sys
 import unicodedata
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import HEADER, positions_csv, stderr_of
 from robots import URDF
