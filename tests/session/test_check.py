@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from robots import nominal_arm
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 from dhcal_pin import se3
 from dhcal_pin.estimation.parameters import select_parameters
@@ -317,6 +317,17 @@ def test_samples_are_named_by_line_or_by_number():
     assert of == {f"in line {i} of a.csv" for i in (2, 5, 6)} | {"1", "2", "3", "4"}
 
 
+def test_likelihoods_without_a_change_are_those_of_each_noise():
+    model = model_of(positions(sigma=None), uncertainty=uncertainty_of(1e-3, (1e-4, 1e-4)))
+    residual = np.random.default_rng(0).normal(size=21)
+    found = model.null_likelihoods(model.scaled_sets(residual[:, None]))[:, 0]
+    for value, variances in zip(found, model.variances, strict=True):
+        covariance = (model.axes * variances) @ model.axes.T
+        expected = multivariate_normal(cov=covariance).logpdf(residual) + 10.5 * np.log(2 * np.pi)
+        assert value == pytest.approx(expected)
+    assert model.likely_noise == np.argmax(model.null_likelihoods(model.scaled_sets(model.rows[:, -1:])))
+
+
 @pytest.mark.parametrize("sigma", [NOISE, None])
 def test_shares_are_those_of_all_hypotheses(sigma):
     values = positions().values + NOISE * np.random.default_rng(2).normal(size=(7, 3))
@@ -333,6 +344,57 @@ def test_shares_are_those_of_all_hypotheses(sigma):
     first = next(each for each in hypotheses if each.of == ARM.joint_names[0])
     assert first.imitators == ("base",)
     assert next(each for each in hypotheses if each.kind == "base").imitators == ()
+
+
+def test_what_a_fit_leaves_is_that_of_least_squares():
+    values = positions().values + 1e-4 * np.random.default_rng(2).normal(size=(7, 3))
+    model = model_of(positions().replace(values=values))
+    joints = [block for block in model.blocks if block.kind == "joint"][1:3]
+    fit = model.explained(joints, np.zeros(model.layout.n_columns))
+    a = model.rows[:, [block.columns[0] for block in joints]]
+    left = model.rows[:, -1] - a @ np.linalg.lstsq(a, model.rows[:, -1])[0]
+    assert fit.chi_square == pytest.approx(left @ left, rel=1e-4)
+    assert fit.p_value == pytest.approx(chi2.sf(left @ left / 1.5**2, 21 - 2), rel=1e-2)
+    assert fit.rms == pytest.approx(NOISE * np.sqrt(left @ left / 7), rel=1e-4)
+    square = np.sum(model.rows[:, -1] ** 2)
+    assert model.unchanged_p_value() == pytest.approx(chi2.sf(square / 1.5**2, 21))
+
+
+def test_samples_are_blamed_only_if_the_others_agree():
+    model: Any = model_of(positions())
+    n_blocks, asked = len(model.blocks), []
+    weights = np.full(n_blocks + 7, -20.0)
+    weights[[0, n_blocks, n_blocks + 4, n_blocks + 5]] = -1.0, 0.0, -0.5, -6.0
+    for agreeing, left in (({0, 4}, []), ({4}, [0]), (set(), [0, 4])):
+        asked.clear()
+        model._agrees_without = lambda i, agreeing=agreeing: [asked.append(i), i in agreeing][1]
+        found = model._without_right_samples(weights)
+        expected = weights.copy()
+        expected[[n_blocks + i for i in left]] = -np.inf
+        np.testing.assert_array_equal(found, expected)
+        # The likely ones are asked about once each, the most likely one first.
+        assert asked == [0, 4]
+
+
+@pytest.mark.parametrize("kind", [Position, Pose])
+def test_a_wrong_sample_is_the_most_likely_change(kind):
+    values = positions().values + 0.02 * np.eye(7)[:, [3]]
+    data: Any = positions().replace(values=values)
+    if kind is Pose:
+        poses = POSES.copy()
+        poses[3, :3, :3] = poses[3, :3, :3] @ se3.exp6(np.array([0, 0, 0, 0.02, 0.01, 0]))[:3, :3]
+        data = Pose(Q, poses, NOISE, ANGLE_NOISE)
+    model: Any = model_of(data)
+    hypotheses, total, limit = model.judged()
+    assert total > limit
+    assert (hypotheses[0].kind, hypotheses[0].of) == ("sample", "4")
+    assert hypotheses[0].share > 0.9
+    # The right samples are excluded where something changed only.
+    for other, is_asked in ((model, True), (model_of(positions()), False)):
+        calls = []
+        other._without_right_samples = lambda weights, calls=calls: [calls.append(1), weights][1]
+        other.judged()
+        assert bool(calls) == is_asked
 
 
 @pytest.mark.parametrize("sample", [2, 3])
@@ -426,8 +488,11 @@ def test_what_two_changes_cancel_is_left_out(angle, rank):
         np.testing.assert_allclose(inverse @ columns, np.eye(2), atol=1e-9)
     # What is left is still explained.
     np.testing.assert_allclose(columns @ inverse @ columns, columns, atol=0.01)
-    single, count = check._separable_inverse([np.hstack([first, 2 * first])])
-    assert (single.shape, count) == ((2, 4), 1)
+    # Multiples of a column count once, whatever their size.
+    row = np.random.default_rng(0).normal(size=(4, 1))
+    for size in (1e-6, 1.0, 1e6):
+        single, count = check._separable_inverse([size * row @ np.array([[1.0, np.pi]])])
+        assert (single.shape, count) == ((2, 4), 1)
 
 
 @pytest.mark.parametrize(("freedom", "chi_square"), [(1, 9.0), (12, 40.0), (0, 40.0), (-1, 3.0)])

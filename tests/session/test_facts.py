@@ -7,7 +7,7 @@ import pytest
 from robots import nominal_arm
 
 from dhcal_pin import se3
-from dhcal_pin.measurements import PointContact, Position
+from dhcal_pin.measurements import PointContact, PointDistance, Position
 from dhcal_pin.robot import Chain, parse_urdf
 from dhcal_pin.robot.error_families import growing_links
 from dhcal_pin.robot.transmission import Payload
@@ -40,7 +40,7 @@ SIZES = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 ORIGIN = np.array([0.3, -0.2, 0.1])
 TOUCHED = np.array([[0.4, 0.1, 0.0], [-0.2, 0.5, 0.3], [0.1, -0.3, 0.2]])
 TURN = np.array([1e-6, 0.0, 0.0, 2e-3, -1e-3, 2e-3])
-MOVE = np.array([3e-3, -2e-3, 1e-3, 4e-4, 2e-4, -3e-4])
+MOVE = np.array([3e-3, -2e-3, 1e-3, 2e-3, 1e-3, -1.5e-3])
 BLOCKS = {
     "base": Block("base", "", np.arange(6), SIZES, origin=ORIGIN),
     "tool": Block("tool", "", np.arange(6), SIZES, origin=ORIGIN),
@@ -248,6 +248,14 @@ def test_histories_are_the_changes_from_the_end_with_their_uncertainty():
     np.testing.assert_allclose(first.values, 2e-3 * is_before + 1e-3 * share)
     np.testing.assert_allclose(first.std, np.sqrt((1e-4 * is_before) ** 2 + (3e-4 * share) ** 2))
     np.testing.assert_allclose(second.values, 2e-3 * (np.arange(11) < 6))
+
+
+def test_histories_begin_with_the_first_sample_of_the_robot():
+    """Distances have no time, and precede the touches."""
+    data = (*files_of(9, kind=PointContact), PointDistance(2, [("p1", "p2"), ("p1", "p3")], [1.0, 1.0]))
+    (found,) = histories(Session(order_samples(data, ()), rail(), True, causes=(joint_step(0, 6),)))
+    np.testing.assert_array_equal(found.numbers, range(9))
+    np.testing.assert_allclose(found.values, 2e-3 * (np.arange(9) < 4))
 
 
 def test_the_history_of_a_frame_has_the_uncertainty_along_its_motion():
