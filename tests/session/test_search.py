@@ -18,6 +18,7 @@ from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.search import (
     HUBER_LIMIT,
     OUTLIER_WEIGHT,
+    WIDTHS,
     _bounded_cost,
     _cell_products,
     _cost,
@@ -246,6 +247,113 @@ def test_the_effect_of_a_cause_is_what_other_unknowns_leave_of_it():
         a, b = weighted(fit, own)
         left = (b - a @ np.linalg.lstsq(a, b)[0])[:360]
         assert search._effect(fit, cause) == pytest.approx(np.sqrt(left @ left / 360 / share), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", [Step, Drift, FreeDrift])
+@pytest.mark.parametrize("n_outliers", [0, 3])
+def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers):
+    search = search_of(Changes("base", 3e-4, n_outliers=n_outliers))
+    fit, shapes = search.first_fit, search._shapes(kind, ())
+    blocks = [block for block in search.layout.blocks if block.kind in ("base", "tool")]
+    found = list(search._scores(fit, blocks, shapes, search._products(fit)))
+    assert [cause.block for cause in found] == blocks
+    j = (fit.columns / fit.noise[..., None]).reshape(360, -1)
+    residual = (fit.residual * fit.weights[:, None]).ravel()
+    for cause in found:
+        gains = {}
+        for shape in shapes:
+            sized = replace(cause, shape=shape)
+            columns = sized.columns_of(fit.rows, search.numbers, search.times) / fit.noise[..., None]
+            a = columns.reshape(360, -1)
+            covariance = fit.test_root @ fit.test_root.T
+            m = a.T @ a - a.T @ j @ covariance @ j.T @ a
+            v = a.T @ residual - a.T @ j @ covariance @ fit.score
+            for width in WIDTHS:
+                prior = np.diag((width * cause.sizes) ** -2.0)
+                estimate = np.linalg.solve(m + prior, v)
+                log_det = np.linalg.slogdet(np.eye(len(m)) + np.linalg.solve(prior, m))[1]
+                gains[0.5 * (v @ estimate - log_det)] = shape, estimate
+        best = max(gains)
+        shape, estimate = gains[best]
+        assert cause.shape == shape
+        expected = best - np.log(len(shapes)) - np.log(len(search.layout.blocks))
+        assert cause.log_evidence == pytest.approx(expected, abs=1e-3 * abs(best) + 1e-3)
+        np.testing.assert_allclose(cause.values, estimate, atol=1e-3 * np.abs(estimate).max())
+
+
+def test_the_best_cause_is_that_of_greatest_evidence():
+    search = search_of(Changes("tool", 2e-3))
+    found = list(search._candidates(search.first_fit))
+    best = search.best_cause(search.first_fit)
+    assert best is not None
+    assert best.log_evidence == max(cause.log_evidence for cause in found)
+    assert (best.block.kind, best.shape) == ("tool", Step(30))
+    # Each block with each of its functions of time once.
+    pairs = [(id(cause.block), type(cause.shape)) for cause in found]
+    assert sorted(map(str, pairs)) == sorted(
+        str((id(block), kind)) for block in search.layout.blocks for kind in search._kinds(block)
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "begun", "shape"),
+    [
+        (Changes("base", 2e-3), Drift(0.0, 59.0), Step(30)),
+        (Changes("base", 2e-3, at=None), FreeDrift(0.0, 59.0), Drift(0.0, 59.0)),
+        (Changes("base", 2e-3, at=None), Drift(0.0, 59.0), None),
+        (Changes("base", 2e-3, at=None, periods=1.5), FreeDrift(0.0, 59.0), None),
+    ],
+)
+def test_a_drift_becomes_what_fits_best(changes, begun, shape):
+    search = search_of(changes)
+    search.causes = [cause_of(search, "tool", Step(20)), cause_of(search, "base", begun)]
+    fit = search.iterate(search._fit())
+    assert search._change_drifts(fit) == (shape is not None)
+    assert [cause.shape for cause in search.causes] == [Step(20), shape or begun]
+    # What another function of time explained is no longer part of the robot.
+    assert (not search.changes.base.drifts) == isinstance(shape, Step)
+
+
+def test_a_lag_is_found_from_which_a_search_begins():
+    """The joint values are 0.3 rows too early; another cause is left out."""
+    simulation = Simulation("ur10", 100, 3, is_path=True)
+    search = searched(simulation, (simulation.measure(Pose, Changes(lag=0.3)),))
+    search.move_lag()
+    found = search.changes.lag_at(search.numbers, search.times)
+    np.testing.assert_allclose(found[-1], 0.3, atol=0.02)
+    assert {cause.block.kind for cause in search.causes} == {"lag"}
+    own = list(search.causes)
+    search._add(cause_of(search, "tool", Step(50)))
+    alone = search.with_lag_alone()
+    assert alone is not None
+    assert [cause.block.kind for cause in alone.causes] == ["lag"] * len(own)
+    assert len(search.causes) == len(own) + 1
+    np.testing.assert_allclose(alone.changes.lag_at(search.numbers, search.times)[-1], 0.3, atol=0.02)
+
+
+@pytest.mark.parametrize("is_of_configuration", [True, False])
+def test_errors_that_follow_a_joint_are_no_change_over_time(is_of_configuration):
+    """A joint is above zero in 18 of 60 consecutive samples, or the base moves at the first of them."""
+    simulation = Simulation("ur10", 60, 3)
+    is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
+    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    data = simulation.measure(Pose)
+    poses = data.poses.copy()
+    poses[is_high if is_of_configuration else np.arange(60) >= 36, 0, 3] += 2e-3
+    search = searched(simulation, (Pose(data.q, poses),))
+    search.causes = [cause_of(search, "base", Step(36))]
+    search.iterate(search._fit())
+    assert search._follows_configuration(0) == is_of_configuration
+
+
+@pytest.mark.parametrize(("n_low", "is_supported"), [(0, True), (7, True), (8, False), (30, False)])
+def test_a_step_is_no_cause_if_a_quarter_of_its_shorter_side_are_outliers(n_low, is_supported):
+    search = search_of(Changes("base", 3e-3))
+    search.causes = [cause_of(search, "base", Step(30))]
+    fit = search.iterate(search._fit())
+    weights = np.where(np.arange(60) >= 60 - n_low, 0.4, 1.0)
+    judged = search._judge(search.rows, replace(fit, weights=weights), 0)
+    assert (judged.log_evidence > -np.inf) == is_supported
 
 
 @pytest.mark.parametrize("kind", ["base", "joint"])
