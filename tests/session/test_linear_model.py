@@ -148,29 +148,30 @@ def test_samples_between_two_numbers(first, end, counts):
 
 @pytest.mark.parametrize("n_outliers", [0, 3])
 def test_changes_are_refined_to_the_true_ones(n_outliers):
-    """A step of the base and one of a joint, of which the search found nothing but their places."""
+    """Steps of the base and of a joint, whose sizes are unknown, and of a joint that did not change."""
     simulation = Simulation("ur10", 60, 3, errors=(1e-4, 1e-4))
     data = simulation.measure(Pose, Changes("base", 1e-3, joint=(2, 2e-3), n_outliers=n_outliers))
     data = Pose(data.q, data.poses, NOISE, 1e-4)
     problem, timeline = problem_of([data], simulation=simulation), order_samples([data], ())
     layout = Layout.of(problem)
     blocks = [block for block in layout.blocks if block.kind in ("base", "joint")]
-    base, joint = blocks[0], next(block for block in blocks if block.index == 2)
+    base, joint, still = blocks[0], *(next(b for b in blocks if b.index == i) for i in (2, 4))
     causes = tuple(
         Cause(block, Step(30), np.zeros(len(block.columns)), np.eye(len(block.columns)))
-        for block in (joint, base)
+        for block in (joint, base, still)
     )
     session = Session(timeline, problem.errors.chain, True, RobotChanges(), causes)
     refined = refine_changes(session, problem, np.zeros(len(problem.weights)))
-    of_joint, of_base = refined.causes
+    of_joint, of_base, of_still = refined.causes
     std = np.sqrt(of_joint.covariance[0, 0])
     assert of_joint.values[0] == pytest.approx(2e-3, abs=4 * std)
     assert std < 1e-4
+    assert of_still.values[0] == pytest.approx(0, abs=4 * np.sqrt(of_still.covariance[0, 0]))
     assert of_base.covariance.shape == (6, 6)
-    size, of_size = refined.events[1].size, refined.events[1].std
-    assert (refined.events[1].kind, size) == ("base", pytest.approx(1e-3, abs=4 * of_size))
-    assert of_size < 1e-4
-    ((number, shape, value),) = refined.changes.zeros
+    event = refined.events[1]
+    assert (event.kind, event.size) == ("base", pytest.approx(1e-3, abs=4 * event.std))
+    assert event.std < 1e-4
+    (number, shape, value), _ = refined.changes.zeros
     assert (number, shape, value[0]) == (2, Step(30), pytest.approx(of_joint.values[0]))
     # The uncertainty is that of the normal equations with the noise of the residuals.
     if not n_outliers:
@@ -179,6 +180,6 @@ def test_changes_are_refined_to_the_true_ones(n_outliers):
         a = np.concatenate([rows[..., layout.model], *columns], -1).reshape(360, -1)
         prior = np.concatenate([problem.weights, *(1 / each.sizes for each in causes)])
         covariance = np.linalg.inv(a.T @ a + np.diag(prior**2))
-        expected = np.sqrt(np.diag(covariance))[-7:]
-        found = np.sqrt([*np.diag(of_joint.covariance), *np.diag(of_base.covariance)])
+        expected = np.sqrt(np.diag(covariance))[-8:]
+        found = np.sqrt(np.concatenate([np.diag(each.covariance) for each in refined.causes]))
         np.testing.assert_allclose(found, expected, rtol=0.3)
