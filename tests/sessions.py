@@ -6,6 +6,7 @@ change, joint values are late, or lengths are too long.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from robots import ARMS, nominal_arm, robot_file
 from scipy.interpolate import CubicSpline
 
 from dhcal_pin.calibration import Result
+from dhcal_pin.estimation.initialization import make_problem
+from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements import (
     Measurement,
     MultiTargetPosition,
@@ -27,6 +30,8 @@ from dhcal_pin.measurements import (
 from dhcal_pin.robot import Chain
 from dhcal_pin.se3 import nearest_rotation
 from dhcal_pin.session import Session
+from dhcal_pin.session.search import _Search
+from dhcal_pin.session.timeline import order_samples
 
 # Names of the arms whose sessions are simulated.
 NAMES = ("ur10", "ur5", "panda", "xarm7")
@@ -314,3 +319,29 @@ def session_of(fit: Result) -> Session:
     """Return what was found in a calibration."""
     assert fit.session is not None
     return fit.session
+
+
+def search_of(
+    changes: Changes, n_cells: int = 60, is_ordered: bool = True, prior_factor: float = 1.0
+) -> _Search:
+    """Return the search of a session of 60 poses."""
+    simulation = Simulation("ur10", 60, 3)
+    data = simulation.measure(Pose, changes)
+    return searched(simulation, (data,), n_cells=n_cells, is_ordered=is_ordered, prior_factor=prior_factor)
+
+
+def searched(
+    simulation: Simulation,
+    data: Sequence[Measurement],
+    *,
+    holdout: Sequence[Measurement] = (),
+    n_cells: int = 60,
+    is_ordered: bool = True,
+    prior_factor: float = 1.0,
+) -> _Search:
+    """Return the search of measurements of an arm from its true base and tool."""
+    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
+    errors = select_parameters(chain, "minimal,base,tool")
+    problem = make_problem(errors, tuple(data), 1 / (prior_factor * errors.priors), {})
+    start, timeline = np.zeros(len(problem.weights)), order_samples(data, holdout)
+    return _Search(problem, start, timeline, is_ordered, 200, n_cells)

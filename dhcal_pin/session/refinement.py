@@ -41,7 +41,7 @@ def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
         information = flat.T @ flat + np.diag(prior**2)
         pull = prior**2 * np.append(x, np.zeros(len(prior) - len(x)))
         step = solve_information(information, flat.T @ right - pull)
-        x, steps = x + step[: len(x)], np.split(step[len(x) :], (ends[1:] - len(x))[:-1])
+        x, steps = x + step[: len(x)], np.split(step[len(x) :], ends[1:-1] - len(x))
         causes = tuple(
             replace(cause, values=cause.values + change) for cause, change in zip(causes, steps, strict=True)
         )

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from robots import ARMS, DATA, MAPS, missing, nominal_arm, robot_file
 from scipy.stats import multivariate_normal
-from sessions import NAMES, Changes, Simulation, session_of, write_csv
+from sessions import NAMES, Changes, Simulation, search_of, session_of, write_csv
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, se3
@@ -30,7 +30,7 @@ from dhcal_pin.session.linear_model import Layout, inverse, whitened_rows
 from dhcal_pin.session.refinement import refine_changes
 from dhcal_pin.session.robot_changes import JointPaths, Motion, RobotChanges
 from dhcal_pin.session.scale import ANGLE_FACTORS, LENGTH_FACTORS, _responses, find_scale
-from dhcal_pin.session.search import FINE_CONSTANTS, TIME_CONSTANTS, _Search, find_session
+from dhcal_pin.session.search import FINE_CONSTANTS, TIME_CONSTANTS, find_session
 from dhcal_pin.session.timeline import _file_numbers, order_samples
 
 DEGREE = np.deg2rad(1.0)
@@ -112,17 +112,6 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
         for column, change in zip(block.columns, changes, strict=True):
             # The rows are the derivative of the model, the residual is measured minus modelled.
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
-
-
-def search_of(changes, n_cells=60, is_ordered=True, prior_factor=1.0):
-    """Return the search of a session of 60 poses."""
-    simulation = Simulation("ur10", 60, 3)
-    data = simulation.measure(Pose, changes)
-    chain = simulation.chain.with_base_and_tool(simulation.base.homogeneous, simulation.tool.homogeneous)
-    errors = select_parameters(chain, "minimal,base,tool")
-    problem = make_problem(errors, (data,), 1 / (prior_factor * errors.priors), {})
-    start, timeline = np.zeros(len(errors.parameters)), order_samples((data,), ())
-    return _Search(problem, start, timeline, is_ordered, 60, n_cells)
 
 
 def log_evidence_of(search, cause, noise, applied, others=()):

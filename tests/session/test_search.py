@@ -1,0 +1,655 @@
+"""Parts of the search for what happened during a session, against linear algebra and known changes."""
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from sessions import NOISE, Changes, Simulation, search_of, searched
+
+from dhcal_pin import se3
+from dhcal_pin.measurements import PointContact, PointDistance, Pose, Position
+from dhcal_pin.session import search as search_module
+from dhcal_pin.session.causes import Block, Cause, Constant, Drift, FreeDrift, Step
+from dhcal_pin.session.linear_model import covariance_root, inverse, measures_positions, solve_information
+from dhcal_pin.session.robot_changes import Motion, RobotChanges
+from dhcal_pin.session.search import (
+    HUBER_LIMIT,
+    OUTLIER_WEIGHT,
+    WIDTHS,
+    _bounded_cost,
+    _cell_products,
+    _cost,
+    _evidence_of,
+    _information,
+    _is_part_of_model,
+    _predicted_gain,
+    can_have_session,
+    has_enough_rows,
+)
+from dhcal_pin.session.timeline import order_samples
+
+
+def cause_of(search, kind, shape, values: Any = 0.0, *, index=0):
+    """Return a cause of the first block of a kind, or of another one of them."""
+    block = [each for each in search.layout.blocks if each.kind == kind][index]
+    count = len(block.columns) * shape.values(search.numbers[:1], search.times[:1]).shape[1]
+    values = np.broadcast_to(values, count).astype(float)
+    return Cause(block, shape, values, np.zeros((count, count)))
+
+
+def weighted(fit, extra):
+    """Return columns and target of a fit in units of noise, with rows of the priors below, and a column."""
+    root = 1 / fit.noise
+    rows = (fit.columns * root[..., None]).reshape(-1, len(fit.prior))
+    return np.vstack([rows, np.diag(fit.prior)]), np.append((extra * root).ravel(), np.zeros(len(fit.prior)))
+
+
+def files_of(*parts):
+    """Return measurements with names of files."""
+    return tuple(
+        item.replace(source=f"{i}.csv", rows=np.arange(2, 2 + len(item.rows))) for i, item in enumerate(parts)
+    )
+
+
+def test_rows_of_one_unit_have_one_noise_if_it_is_stated_alike():
+    simulation = Simulation("ur10", 40, 3)
+    poses = simulation.measure(Pose)
+    q, points = poses.q, poses.positions()
+    data = files_of(
+        Position(q[:10], points[:10], NOISE), poses.take(np.s_[10:30]), Position(q[30:], points[30:], NOISE)
+    )
+    search = searched(simulation, data)
+    np.testing.assert_array_equal(search.groups[:10], np.tile([0, 0, 0, -1, -1, -1], (10, 1)))
+    np.testing.assert_array_equal(search.groups[10:30], np.tile([1, 1, 1, 2, 2, 2], (20, 1)))
+    np.testing.assert_array_equal(search.groups[30:], search.groups[:10])
+    for label, members in enumerate(search.members):
+        np.testing.assert_array_equal(members, np.flatnonzero(search.groups.ravel() == label))
+    # Each of them is estimated, and is that of the rows.
+    noise = search.first_fit.noise
+    for label in range(3):
+        assert np.ptp(noise[search.groups == label]) < 1e-12
+    size = noise[0, 0] * NOISE, noise[10, 0] * poses.sigma[0, 0]
+    assert size == pytest.approx((NOISE, NOISE), rel=0.5)
+    assert search.log_noise(search.first_fit) == pytest.approx(np.mean(np.log(noise[search.groups >= 0])))
+
+
+def touching(count=30):
+    """Return a simulation and touches of three points with distances, which have no time and need not fit."""
+    simulation = Simulation("ur10", count, 3)
+    contacts = PointContact(simulation.q, ["p1", "p2", "p3"] * (count // 3))
+    distances = PointDistance(6, [("p1", "p2"), ("p1", "p3"), ("p2", "p3")], [1.0, 1.0, 1.0])
+    return simulation, contacts, distances
+
+
+def test_distances_have_no_step_and_precede_all_cells():
+    simulation, contacts, distances = touching()
+    search = searched(simulation, (contacts.initialized(simulation.chain), distances), n_cells=7)
+    assert search.begin == 3
+    assert (search.edges[0], search.edges[-1], len(search.edges)) == (3, 33, 8)
+    np.testing.assert_array_equal(search.numbers, range(33))
+    steps = [shape.number for shape in search._shapes(Step, ()) if isinstance(shape, Step)]
+    assert steps == search.edges[1:-1].tolist()
+    fine = searched(simulation, (contacts.initialized(simulation.chain), distances), n_cells=99)
+    assert len(fine.edges) == 31
+    steps = [shape.number for shape in fine._shapes(Step, (20,)) if isinstance(shape, Step)]
+    assert steps == [*range(6, 18), *range(23, 31)]
+    # They are no samples of either side, and no outliers.
+    assert search._concerned(cause_of(search, "base", Step(3 + 6))) == pytest.approx(0.2)
+    weights = np.where(np.arange(33) < 9, 0.4, 1.0)
+    fit = replace(search.first_fit, weights=weights)
+    for shape, share in (
+        (Step(13), 0.6),
+        (Step(23), 0.0),
+        (Step(18), 0.0),
+        (Step(17), 6 / 14),
+        (Drift(3.0, 32.0), 0.2),
+    ):
+        assert search._outlier_share(fit, cause_of(search, "base", shape)) == pytest.approx(share)
+    edge = replace(fit, weights=np.full(33, OUTLIER_WEIGHT))
+    assert search._outlier_share(edge, cause_of(search, "base", Step(13))) == 0
+
+
+def test_only_an_order_shows_lags_and_drifts(monkeypatch):
+    simulation = Simulation("ur10", 60, 3, is_path=True)
+    data = simulation.measure(Pose)
+    search = searched(simulation, (data,))
+    assert search.paths is not None
+    lag, links = (cause_of(search, kind, Constant()).block for kind in ("lag", "links"))
+    assert search._kinds(lag) == [Constant]
+    assert search._kinds(links) == [Drift, FreeDrift]
+    search.causes = [cause_of(search, "lag", Constant())]
+    assert search._kinds(lag) == [Step, Drift]
+    search.rejected = {(lag, Step), (links, Drift)}
+    assert (search._kinds(lag), search._kinds(links)) == ([Drift], [FreeDrift])
+    unordered = searched(simulation, files_of(data.take(np.s_[:20]), data.take(np.s_[20:])), is_ordered=False)
+    assert unordered.paths is None
+    kinds = {b.kind: unordered._kinds(b) for b in unordered.layout.blocks}
+    assert (kinds["lag"], kinds["base"], kinds["links"], kinds["scale"]) == ([], [Step], [], [Constant])
+    assert unordered._shapes(Step, ()) == [Step(20)]
+    monkeypatch.setattr(search_module, "MAX_PATH_SAMPLES", 59)
+    assert searched(simulation, (data,)).paths is None
+    monkeypatch.setattr(search_module, "MAX_PATH_SAMPLES", 60)
+    assert searched(simulation, (data,)).paths is not None
+
+
+def test_functions_of_time_begin_and_end_with_the_samples():
+    search = search_of(Changes())
+    assert search._shapes(Constant, ()) == [Constant()]
+    assert search._shapes(FreeDrift, ()) == [FreeDrift(0.0, 59.0)]
+    steps = [shape.number for shape in search._shapes(Step, (10, 30)) if isinstance(shape, Step)]
+    assert steps == [*range(3, 8), *range(13, 28), *range(33, 58)]
+    search.causes = [
+        cause_of(search, kind, Step(n)) for kind, n in (("base", 10), ("tool", 20), ("base", 30))
+    ]
+    assert search._taken_steps(search.causes[0].block) == (10, 30)
+
+
+def test_configurations_of_repeated_rows_count_once():
+    """A scale and a lag need two rows of different configurations for each unknown."""
+    simulation = Simulation("ur10", 60, 3)
+    data = simulation.measure(Pose)
+    n_unknowns = len(searched(simulation, (data,)).layout.weights)
+    for count in (2 * n_unknowns // 6 - 1, 2 * n_unknowns // 6 + 1):
+        part = data.take(np.repeat(np.arange(count), 2))
+        assert searched(simulation, (part,)).has_different_rows == (6 * count >= 2 * n_unknowns)
+
+
+@pytest.mark.parametrize("n_outliers", [0, 4])
+def test_a_fit_is_the_solution_of_its_weighted_equations(n_outliers):
+    search = search_of(Changes("base", 1e-4, n_outliers=n_outliers))
+    causes = [cause_of(search, "base", Step(30))]
+    fit = search.solve(search.rows, causes)
+    left = search.rows[..., -1] - fit.columns @ fit.step
+    np.testing.assert_allclose(fit.residual * fit.noise, left, atol=1e-9)
+    # Weights bound the influence of samples.
+    size = np.sqrt(np.mean(fit.residual**2, 1))
+    expected = np.minimum(1.0, HUBER_LIMIT / size)
+    np.testing.assert_allclose(fit.weights, expected, atol=0.05)
+    assert np.sum(fit.weights < OUTLIER_WEIGHT) == n_outliers
+    # Solved with these weights by another method.
+    root = np.sqrt(fit.weights)[:, None] / fit.noise
+    a = np.vstack([(fit.columns * root[..., None]).reshape(360, -1), np.diag(fit.prior)])
+    b = np.append((search.rows[..., -1] * root).ravel(), np.zeros(len(fit.prior)))
+    expected = np.linalg.lstsq(a, b)[0]
+    std = np.sqrt(np.diag(np.linalg.inv(a.T @ a)))
+    assert np.abs((fit.step - expected) / std).max() < 0.1
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), std, rtol=1e-4)
+    # Bounded residuals have unit variance, for as many rows as unknowns leave.
+    bounded = fit.residual * fit.weights[:, None]
+    freedom = 360 - np.sum((a[:360] @ np.linalg.inv(a.T @ a)) * a[:360])
+    assert np.sum(bounded**2) == pytest.approx(freedom, rel=0.05)
+    # The score is the derivative by all unknowns.
+    score = np.tensordot(bounded / fit.noise, fit.columns, 2) - fit.prior**2 * fit.step
+    np.testing.assert_allclose(fit.score, score, atol=1e-6 * np.abs(score).max() + 1e-9)
+
+
+def test_a_fit_moves_from_the_present_values_with_their_priors():
+    """Unknowns that the samples do not show go back to zero."""
+    search = search_of(Changes())
+    rows = np.zeros_like(search.rows)
+    rows[..., -1] = np.random.default_rng(0).normal(size=rows.shape[:2])
+    search.x = np.arange(1.0, 1 + len(search.x))
+    fit = search.solve(rows, [cause_of(search, "base", Step(30), 0.5)])
+    np.testing.assert_allclose(fit.step, -np.append(search.x, np.full(6, 0.5)), rtol=1e-6)
+    assert fit.prior[-6:] == pytest.approx(1 / search.layout.blocks[0].sizes)
+
+
+def test_a_step_of_a_fit_moves_unknowns_and_causes():
+    search = search_of(Changes())
+    search.causes = [cause_of(search, "joint", Step(30), 1e-4, index=2), cause_of(search, "base", Step(20))]
+    fit = search.solve(search.rows, search.causes)
+    p, x = len(search.x), search.x
+    step = np.append(1e-4 * np.arange(1.0, p + 1), [5e-4, *(1e-4 * np.arange(6))])
+    base = search._base()
+    search._advance(replace(fit, step=step))
+    np.testing.assert_allclose(search.x, x + step[:p])
+    np.testing.assert_allclose(search.causes[0].values, [6e-4])
+    np.testing.assert_allclose(search.causes[1].values, step[p + 1 :])
+    np.testing.assert_array_equal(search.causes[0].covariance, fit.covariance[p : p + 1, p : p + 1])
+    np.testing.assert_array_equal(search.causes[1].covariance, fit.covariance[p + 1 :, p + 1 :])
+    ((joint, shape, size),) = search.changes.zeros
+    assert (joint, shape, size) == (2, Step(30), pytest.approx([5e-4]))
+    expected = base @ se3.exp6(-step[p + 1 :]) @ se3.inverse(base)
+    np.testing.assert_allclose(search.changes.base.poses[0], expected, atol=1e-12)
+    # Without the causes of other parts, their changes remain.
+    search._drop_others()
+    assert search.changes.base.steps == (20,)
+    alone = search._changes_of(search.causes[:1])
+    assert (alone.base.is_identity, len(alone.zeros)) == (True, 1)
+    del search.causes[0]
+    search._drop_others()
+    assert search.changes.zeros == ()
+
+
+def test_rows_without_a_cause_are_those_of_a_robot_that_did_not_change():
+    search = search_of(Changes("base", 2e-3))
+    search.causes = [cause_of(search, "joint", Step(20), index=1), cause_of(search, "base", Step(30))]
+    search.iterate(search._fit())
+    rows = search.linearize()
+    # In first order, the change of the residuals is that of the columns.
+    undone, without = search._undone(rows, search.causes[1]), search._linearized_without(1)
+    change = (undone - rows)[..., -1]
+    np.testing.assert_allclose((without - rows)[..., -1], change, atol=0.02 * np.abs(change).max())
+    assert np.abs(change[:30]).max() > 1
+    np.testing.assert_array_equal(undone[..., :-1], rows[..., :-1])
+    np.testing.assert_allclose(without[30:, :, -1], rows[30:, :, -1], atol=1e-9)
+
+
+def test_the_effect_of_a_cause_is_what_other_unknowns_leave_of_it():
+    search = search_of(Changes())
+    fit = search.first_fit
+    for shape, share in ((Step(15), 0.25), (Step(50), 1 / 6), (Drift(0.0, 59.0), 1.0)):
+        cause = cause_of(search, "base", shape, 1e-4)
+        own = cause.columns_of(search.rows, search.numbers, search.times) @ cause.values
+        a, b = weighted(fit, own)
+        left = (b - a @ np.linalg.lstsq(a, b)[0])[:360]
+        assert search._effect(fit, cause) == pytest.approx(np.sqrt(left @ left / 360 / share), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", [Step, Drift, FreeDrift])
+@pytest.mark.parametrize("n_outliers", [0, 3])
+def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers):
+    search = search_of(Changes("base", 3e-4, n_outliers=n_outliers))
+    fit, shapes = search.first_fit, search._shapes(kind, ())
+    blocks = [block for block in search.layout.blocks if block.kind in ("base", "tool")]
+    found = list(search._scores(fit, blocks, shapes, search._products(fit)))
+    assert [cause.block for cause in found] == blocks
+    j = (fit.columns / fit.noise[..., None]).reshape(360, -1)
+    residual = (fit.residual * fit.weights[:, None]).ravel()
+    for cause in found:
+        gains = {}
+        for shape in shapes:
+            sized = replace(cause, shape=shape)
+            columns = sized.columns_of(fit.rows, search.numbers, search.times) / fit.noise[..., None]
+            a = columns.reshape(360, -1)
+            covariance = fit.test_root @ fit.test_root.T
+            m = a.T @ a - a.T @ j @ covariance @ j.T @ a
+            v = a.T @ residual - a.T @ j @ covariance @ fit.score
+            for width in WIDTHS:
+                prior = np.diag((width * cause.sizes) ** -2.0)
+                estimate = np.linalg.solve(m + prior, v)
+                log_det = np.linalg.slogdet(np.eye(len(m)) + np.linalg.solve(prior, m))[1]
+                gains[0.5 * (v @ estimate - log_det)] = shape, estimate
+        best = max(gains)
+        shape, estimate = gains[best]
+        assert cause.shape == shape
+        expected = best - np.log(len(shapes)) - np.log(len(search.layout.blocks))
+        assert cause.log_evidence == pytest.approx(expected, abs=1e-3 * abs(best) + 1e-3)
+        np.testing.assert_allclose(cause.values, estimate, atol=1e-3 * np.abs(estimate).max())
+
+
+def test_the_best_cause_is_that_of_greatest_evidence():
+    search = search_of(Changes("tool", 2e-3))
+    found = list(search._candidates(search.first_fit))
+    best = search.best_cause(search.first_fit)
+    assert best is not None
+    assert best.log_evidence == max(cause.log_evidence for cause in found)
+    assert (best.block.kind, best.shape) == ("tool", Step(30))
+    # Each block with each of its functions of time once.
+    pairs = [(id(cause.block), type(cause.shape)) for cause in found]
+    assert sorted(map(str, pairs)) == sorted(
+        str((id(block), kind)) for block in search.layout.blocks for kind in search._kinds(block)
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "begun", "shape"),
+    [
+        (Changes("base", 2e-3), Drift(0.0, 59.0), Step(30)),
+        (Changes("base", 2e-3, at=None), FreeDrift(0.0, 59.0), Drift(0.0, 59.0)),
+        (Changes("base", 2e-3, at=None), Drift(0.0, 59.0), None),
+        (Changes("base", 2e-3, at=None, periods=1.5), FreeDrift(0.0, 59.0), None),
+    ],
+)
+def test_a_drift_becomes_what_fits_best(changes, begun, shape):
+    search = search_of(changes)
+    search.causes = [cause_of(search, "tool", Step(20)), cause_of(search, "base", begun)]
+    fit = search.iterate(search._fit())
+    assert search._change_drifts(fit) == (shape is not None)
+    assert [cause.shape for cause in search.causes] == [Step(20), shape or begun]
+    # What another function of time explained is no longer part of the robot.
+    assert (not search.changes.base.drifts) == isinstance(shape, Step)
+
+
+def test_a_lag_is_found_from_which_a_search_begins():
+    """The joint values are 0.3 rows too early; another cause is left out."""
+    simulation = Simulation("ur10", 100, 3, is_path=True)
+    search = searched(simulation, (simulation.measure(Pose, Changes(lag=0.3)),))
+    search.move_lag()
+    found = search.changes.lag_at(search.numbers, search.times)
+    np.testing.assert_allclose(found[-1], 0.3, atol=0.02)
+    assert {cause.block.kind for cause in search.causes} == {"lag"}
+    own = list(search.causes)
+    search._add(cause_of(search, "tool", Step(50)))
+    alone = search.with_lag_alone()
+    assert alone is not None
+    assert [cause.block.kind for cause in alone.causes] == ["lag"] * len(own)
+    assert len(search.causes) == len(own) + 1
+    np.testing.assert_allclose(alone.changes.lag_at(search.numbers, search.times)[-1], 0.3, atol=0.02)
+
+
+@pytest.mark.parametrize("is_of_configuration", [True, False])
+def test_errors_that_follow_a_joint_are_no_change_over_time(is_of_configuration):
+    """A joint is above zero in 18 of 60 consecutive samples, or the base moves at the first of them."""
+    simulation = Simulation("ur10", 60, 3)
+    is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
+    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    data = simulation.measure(Pose)
+    poses = data.poses.copy()
+    poses[is_high if is_of_configuration else np.arange(60) >= 36, 0, 3] += 2e-3
+    search = searched(simulation, (Pose(data.q, poses),))
+    search.causes = [cause_of(search, "base", Step(36))]
+    search.iterate(search._fit())
+    assert search._follows_configuration(0) == is_of_configuration
+
+
+@pytest.mark.parametrize(("n_low", "is_supported"), [(0, True), (7, True), (8, False), (30, False)])
+def test_a_step_is_no_cause_if_a_quarter_of_its_shorter_side_are_outliers(n_low, is_supported):
+    search = search_of(Changes("base", 3e-3))
+    search.causes = [cause_of(search, "base", Step(30))]
+    fit = search.iterate(search._fit())
+    weights = np.where(np.arange(60) >= 60 - n_low, 0.4, 1.0)
+    judged = search._judge(search.rows, replace(fit, weights=weights), 0)
+    assert (judged.log_evidence > -np.inf) == is_supported
+
+
+@pytest.mark.parametrize("kind", ["base", "joint"])
+def test_a_step_moves_to_its_place_with_its_change(kind):
+    changes = Changes("base", 2e-3) if kind == "base" else Changes(joint=(1, 2e-3))
+    search = search_of(changes)
+    search.causes = [
+        cause_of(search, "tool", Drift(0.0, 59.0)),
+        cause_of(search, kind, Step(24), index=0 if kind == "base" else 1),
+    ]
+    fit = search.iterate(search._fit())
+    assert search._move_steps(fit)
+    assert search.causes[1].shape == Step(30)
+    if kind == "base":
+        assert search.changes.base.steps == (30,)
+    else:
+        assert search.changes.zeros[0][:2] == (1, Step(30))
+    fit = search.iterate(search._fit())
+    assert not search._move_steps(fit)
+
+
+def test_a_payload_is_a_constant_beside_its_steps():
+    search = search_of(Changes())
+    own = Block("payload", "", search.layout.payload, np.full(6, 1e-3))
+    search.layout = replace(search.layout, blocks=(*search.layout.blocks, own))
+    for number in (20, 40):
+        search._add(Cause(own, Step(number), np.ones(6), np.zeros((6, 6))))
+    assert [cause.shape for cause in search.causes] == [Constant(), Step(20), Step(40)]
+    assert [_is_part_of_model(cause) for cause in search.causes] == [True, False, False]
+    assert not any(cause.values.any() for cause in search.causes)
+    assert not _is_part_of_model(cause_of(search, "lag", Constant()))
+    assert search._kinds(own) == [Step]
+    search._remove(1)
+    assert [cause.shape for cause in search.causes] == [Constant(), search.causes[1].shape]
+    search._remove(1)
+    assert search.causes == []
+    search._add(cause_of(search, "tool", Step(20), 1.0))
+    assert [cause.block.kind for cause in search.causes] == ["tool"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "is_negligible"),
+    [
+        ("lag", 0.009, True),
+        ("lag", -0.009, True),
+        ("lag", 0.011, False),
+        ("lag", -0.011, False),
+        ("base", 0.0, False),
+    ],
+)
+def test_a_lag_of_a_hundredth_of_a_row_is_none(kind, value, is_negligible):
+    search = search_of(Changes())
+    assert search._is_negligible_lag(cause_of(search, kind, Constant(), value)) == is_negligible
+
+
+def test_a_cause_is_judged_by_its_effect_and_by_left_out_blocks():
+    search = search_of(Changes("base", 2e-3))
+    for kind, is_right in (("base", True), ("tool", False)):
+        search.causes, search.changes = [cause_of(search, kind, Step(30))], RobotChanges()
+        fit = search.iterate(search._fit())
+        judged = search._judge(search.rows, fit, 0)
+        assert judged.shape == Step(30)
+        assert (judged.log_evidence > 100) == is_right
+
+
+@pytest.mark.parametrize("changes", [Changes("base", 2e-3), Changes("tool", 0.03, 0.01, n_outliers=2)])
+def test_causes_are_found_confirmed_and_placed(changes):
+    search = search_of(changes)
+    search.run()
+    (cause,) = search.causes
+    assert (cause.block.kind, cause.shape) == (changes.of, Step(30))
+    size = np.linalg.norm(
+        search.changes.base.poses[0, :3, 3] if changes.of == "base" else search.changes.tool.poses[0, :3, 3]
+    )
+    assert cause.log_evidence > 100
+    assert size == pytest.approx(changes.length, rel=0.1) or changes.angle
+    assert search.with_lag_alone() is None
+    assert search.stated(cause) is cause
+
+
+def test_steps_are_placed_among_held_out_samples():
+    """The change is at sample 30 of 60, and every third sample from 28 on was held out."""
+    simulation = Simulation("ur10", 60, 3)
+    whole = simulation.measure(Pose, Changes("base", 2e-3)).replace(source="a.csv")
+    is_out = np.isin(np.arange(60), [28, 29, 30, 31, 40])
+    search = searched(simulation, (whole.take(~is_out),), holdout=(whole.take(is_out),))
+    search.run()
+    assert [cause.shape for cause in search.causes] == [Step(32)]
+    search.place_steps()
+    assert [cause.shape for cause in search.causes] == [Step(30)]
+    assert search.changes.base.steps == (30,)
+    corrected = search.corrected_timeline()
+    assert corrected.n_fitted == 1
+    motions = [vars(item.conditions())["base_motion"][:, :3, 3] for item in corrected.data]
+    found = [np.linalg.norm(each, axis=1) > 1e-9 for each in motions]
+    np.testing.assert_array_equal(found[0], np.flatnonzero(~is_out) < 30)
+    np.testing.assert_array_equal(found[1], np.flatnonzero(is_out) < 30)
+
+
+def test_a_search_begins_with_known_motions_of_frames():
+    search = search_of(Changes("base", 5e-3))
+    rng = np.random.default_rng(0)
+    poses = [np.array([*se3.exp6(0.1 * rng.normal(size=(2, 6))), np.eye(4)]) for _ in range(2)]
+    changes = RobotChanges(Motion((20, 40), poses[0]), Motion((20, 40), poses[1]))
+    search.move_frames(changes)
+    assert [(c.block.kind, c.shape) for c in search.causes] == [
+        (kind, Step(number)) for kind in ("base", "tool") for number in (20, 40)
+    ]
+    assert search.changes is changes
+    # The values are those of the motions to the next part, in their own frames.
+    own = search._base()
+    for (before, after), cause in zip(pairwise(poses[1]), search.causes[2:], strict=True):
+        np.testing.assert_allclose(cause.values, se3.log6(after) - se3.log6(before), atol=1e-12)
+    before, after = (se3.log6(se3.inverse(own) @ pose @ own) for pose in poses[0][:2])
+    np.testing.assert_allclose(search.causes[0].values, after - before, atol=1e-12)
+
+
+def test_a_touched_base_is_stated_by_its_points():
+    simulation, contacts, distances = touching()
+    search = searched(simulation, (contacts.initialized(simulation.chain), distances))
+    found = search.stated(cause_of(search, "base", Step(20))).block.touched
+    assert found is not None
+    values = search.layout.problem.instruments(search.layout.errors_at(search.x))
+    points = np.array([[values[f"point_{name}.{axis}"] for axis in "xyz"] for name in ("p1", "p2", "p3")])
+    np.testing.assert_allclose(se3.transform_points(search._base(), found), points, atol=1e-12)
+    assert search.stated(cause_of(search, "tool", Step(20))).block.touched is None
+
+
+def test_two_robots_are_told_from_one():
+    search = search_of(Changes(has_second_robot=True, at=0.4))
+    event = search.other_robot()
+    assert event is not None
+    assert (event.kind, event.before.line, event.after.line) == ("robot", 24, 25)
+    assert event.size > 3 * event.std > 0
+    # The name is that of a parameter of the arm.
+    errors = search.layout.problem.errors
+    parameter = {p.name: is_arm for p, is_arm in zip(errors.parameters, errors.is_of_arm, strict=True)}
+    assert parameter[event.of]
+    assert search_of(Changes("base", 2e-3)).other_robot() is None
+
+
+def test_the_second_robot_is_judged_by_the_shorter_side():
+    search = search_of(Changes())
+    fit = search.first_fit
+    is_after = (search.numbers >= 40)[:, None]
+    better = replace(fit, residual=fit.residual * np.where(is_after, 0.5, 3.0))
+    found = search._gain_of_side(fit, better, 40, 30)
+    assert found == pytest.approx(np.log(2) + 0.5 * np.log(1 - 30 / 120))
+    before = replace(fit, residual=fit.residual * np.where(search.numbers < 20, 0.5, 3.0)[:, None])
+    assert search._gain_of_side(fit, before, 20, 30) == pytest.approx(found)
+    # Few rows for each unknown fit any robot.
+    assert search._gain_of_side(fit, better, 40, 48) > -np.inf
+    assert search._gain_of_side(fit, better, 40, 49) == -np.inf
+
+
+def test_costs_are_those_of_least_squares():
+    rng = np.random.default_rng(0)
+    rows, prior = rng.normal(size=(30, 5)), np.array([0.5, 1.0, 2.0, 0.1])
+    for used in (np.arange(4), np.array([0, 2])):
+        a, b = np.vstack([rows[:, used], np.diag(prior[used])]), np.append(rows[:, -1], np.zeros(len(used)))
+        x = -np.linalg.lstsq(a, b)[0]
+        other = rng.normal(size=(7, 5))
+        for out in (rows, other):
+            left = out[:, -1] + out[:, used] @ x
+            assert _cost(rows.T @ rows, out.T @ out, prior, used) == pytest.approx(left @ left)
+
+
+@pytest.mark.parametrize(
+    ("begin", "length", "count"), [(0, 5.0, 8), (4, 12.0, 3), (0, 100.0, 2), (0, 0.1, 40)]
+)
+def test_gains_are_predicted_for_blocks_that_are_left_out(begin, length, count):
+    """Every block is predicted by a fit of the others; samples without a time belong to all fits."""
+    rng = np.random.default_rng(0)
+    n = 40 + begin
+    stacks = rng.normal(size=(n, 2, 4)), rng.normal(size=(n, 2, 6))
+    prior = rng.uniform(0.5, 1.0, 5)
+    inside, predicted = _predicted_gain(stacks, prior, begin, length)
+    expected = np.zeros((2, 2))
+    for i, stack in enumerate(stacks):
+        p = stack.shape[2] - 1
+
+        def left(kept, out, p=p):
+            a = np.vstack([kept.reshape(-1, p + 1)[:, :p], np.diag(prior[:p])])
+            b = np.append(kept.reshape(-1, p + 1)[:, p], np.zeros(p))
+            flat = out.reshape(-1, p + 1)
+            return np.sum((flat[:, p] - flat[:, :p] @ np.linalg.lstsq(a, b)[0]) ** 2)
+
+        expected[i, 0] = left(stack, stack)
+        edges = np.unique(np.linspace(0, 40, count + 1).astype(int)) + begin
+        expected[i, 1] = sum(left(np.delete(stack, np.s_[a:b], 0), stack[a:b]) for a, b in pairwise(edges))
+    assert (inside, predicted) == pytest.approx(tuple(expected[0] - expected[1]))
+
+
+@pytest.mark.parametrize("edges", [[0, 4, 8, 12], [2, 5, 12], [0, 12]])
+def test_products_of_cells(edges):
+    rows = np.random.default_rng(0).normal(size=(12, 2, 5))
+    for some in (np.s_[:], np.s_[1:4]):
+        found = _cell_products(rows, np.array(edges), some)
+        expected = [np.einsum("nki,nkj->ij", rows[a:b][..., some], rows[a:b]) for a, b in pairwise(edges)]
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_costs_of_samples_grow_linearly_beyond_the_limit():
+    residual = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [10.0, -10.0]])
+    np.testing.assert_allclose(_bounded_cost(residual), 2 * np.array([1.0, 4.0, 8.0, 36.0]))
+
+
+def test_products_of_weighted_columns():
+    columns, root = (
+        np.random.default_rng(0).normal(size=(6, 2, 3)),
+        np.random.default_rng(1).uniform(size=(6, 2)),
+    )
+    expected = np.einsum("nki,nk,nkj->ij", columns, root**2, columns)
+    np.testing.assert_allclose(_information(columns, root), expected)
+
+
+def test_evidence_of_a_block_is_the_greatest_one():
+    search = search_of(Changes())
+    base, tool = (cause_of(search, kind, Step(20)) for kind in ("base", "tool"))
+    causes = [
+        replace(base, log_evidence=3.0),
+        replace(base, log_evidence=5.0),
+        replace(tool, log_evidence=9.0),
+    ]
+    assert _evidence_of(base.block, causes) == 5.0
+    assert _evidence_of(base.block, [tool]) == -np.inf
+
+
+def test_sessions_need_samples_of_the_robot():
+    q = np.zeros((4, 6))
+    contacts, distances = PointContact(q, ["a", "b"] * 2), PointDistance(6, [("a", "b")], [1.0])
+    positions = Position(q, np.zeros((4, 3)))
+    assert can_have_session([positions])
+    assert can_have_session([positions, distances])
+    assert can_have_session([contacts])
+    assert not can_have_session([distances])
+    assert not can_have_session([])
+    assert measures_positions([positions])
+    assert not measures_positions([positions, contacts])
+
+
+def test_a_search_needs_more_rows_than_unknowns():
+    simulation = Simulation("ur10", 40, 3)
+    data = simulation.measure(Pose)
+    problem = searched(simulation, (data,)).layout.problem
+    count = len(problem.weights)
+    for n in (3, 6, 7, 8, 9, 12):
+        timeline = order_samples((data.take(np.s_[:n]),), ())
+        assert has_enough_rows(problem, timeline) == (6 * n >= 1.5 * count)
+
+
+# -------------------------------------------------------------------------------------- linear algebra
+def test_information_without_a_direction_has_inverses_of_the_others():
+    rows = np.random.default_rng(0).normal(size=(20, 4)) * [1.0, 1e3, 1e-3, 0.0]
+    information = rows.T @ rows
+    right = np.array([1.0, 2.0, 3.0, 0.0])
+    expected = np.linalg.inv(information[:3, :3])
+    np.testing.assert_allclose(inverse(information)[:3, :3], expected, rtol=1e-6)
+    np.testing.assert_allclose(solve_information(information, right)[:3], expected @ right[:3], rtol=1e-6)
+    assert solve_information(information, right)[3] == 0
+
+
+def test_roots_of_covariances_keep_priors():
+    rows, prior = np.random.default_rng(0).normal(size=(20, 4)), np.array([0.0, 1.0, 3.0, 10.0])
+    root = covariance_root(rows, prior)
+    np.testing.assert_allclose(root @ root.T, np.linalg.inv(rows.T @ rows + np.diag(prior**2)), atol=1e-12)
+    # Only a prior determines the last one.
+    rows[:, 3] = 0
+    root = covariance_root(rows, prior)
+    assert (root @ root.T)[3, 3] == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_causes_have_the_sizes_that_move_the_tool_by_a_metre(kind):
+    """The arm has a length, about which turns move the tool."""
+    simulation = Simulation("ur10", 30, 3)
+    layout = searched(simulation, (simulation.measure(kind),)).layout
+    chain = layout.problem.errors.chain
+    length = np.linalg.norm(chain.link_vectors, axis=1).sum()
+    sizes = {(b.kind, b.of, len(b.columns)): b for b in layout.blocks}
+    base, tool = sizes["base", "", 6], sizes["tool", "", 6]
+    np.testing.assert_allclose(base.sizes, [1, 1, 1, *[1 / length] * 3])
+    turns = [1 / length] * 3 if kind is Pose else [1e-12] * 3
+    np.testing.assert_allclose(tool.sizes, [1, 1, 1, *turns])
+    for j, name in enumerate(chain.joint_names):
+        block = sizes["joint", name, 1]
+        assert (block.index, block.sizes[0]) == (j, pytest.approx(1 / length))
+        assert block.columns[0] == layout.joints[j]
+    for i, axis in enumerate("xyz"):
+        block = sizes["scale", axis, 1]
+        assert (block.columns[0], block.index, block.is_constant) == (layout.scale + 1 + i, i + 1, True)
+    assert sizes["lag", "", 1].columns[0] == layout.lag == layout.n_columns - 2
+    grows = [block for (kind, *_), block in sizes.items() if kind == "links"]
+    assert len(grows) == 2
+    assert all(block.sizes == pytest.approx(1 / length) for block in grows)
+    used = np.concatenate([layout.model, layout.joints, layout.links, layout.payload])
+    assert len(set(used.tolist())) == len(used)
+    # Turns of a tool that only priors determine are held, beside all others.
+    held = layout.weights > 1e11
+    assert held.sum() == (0 if kind is Pose else 3)
