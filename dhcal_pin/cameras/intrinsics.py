@@ -107,7 +107,7 @@ def _search(views: Sequence[tuple[Array, Array]], camera: Camera) -> tuple[float
     if not 2 <= best < len(sums) - 2:
         return None
     n_rows = sum(2 * len(points) for points, _ in views)
-    variance = sums[best] / max(n_rows - 6 * len(views), 1)
+    variance = sums[best] / (n_rows - 6 * len(views))
     if min(sums[best - 2], sums[best + 2]) - sums[best] < _MIN_INCREASE * variance:
         return None
     focal, least, ratio = float(_FOCAL_LENGTHS[best]), float(sums[best]), 2**0.5
@@ -187,10 +187,10 @@ def _without_centre(homographies: Sequence[Array]) -> tuple[float, float, float,
     """Solve for one focal length with the centre in the middle of the image; None if it is not positive."""
     rows = _rows(homographies)
     # ω = diag(1, 1, f²)/f².
-    square = -float(rows[:, 4] @ (rows[:, 0] + rows[:, 1])) / float(rows[:, 4] @ rows[:, 4])
-    if not (np.isfinite(square) and square > 0):
+    product = -rows[:, 4] @ (rows[:, 0] + rows[:, 1])
+    if not product > 0:
         return None
-    focal = float(np.sqrt(square))
+    focal = float(np.sqrt(product / (rows[:, 4] @ rows[:, 4])))
     return focal, focal, 0.0, 0.0
 
 
