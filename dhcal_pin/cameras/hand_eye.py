@@ -60,12 +60,12 @@ def solve_hand_eye(link_poses: Array, board_poses: Array, where: str) -> tuple[A
 def _solve_rotations(a: Array, p: Array) -> tuple[Array, Array]:
     """Solve for the rotations (..., 3, 3) of camera and board; a and p are (..., i, 3, 3)."""
     # With column-major vectors, vec(R_A·R_B·R_Pᵀ) = (R_P ⊗ R_A)·vec(R_B).
-    kronecker = np.einsum("...iab,...icd->...acbd", p, a).reshape(*a.shape[:-3], 9, 9) / a.shape[-3]
+    kronecker = np.einsum("...iab,...icd->...acbd", p, a).reshape(*a.shape[:-3], 9, 9)
     u, _, vt = np.linalg.svd(kronecker)
     rotation_c, rotation_b = (
         vector.reshape(*a.shape[:-3], 3, 3).swapaxes(-1, -2) for vector in (u[..., 0], vt[..., 0, :])
     )
-    sign = np.where(np.linalg.det(rotation_b) < 0, -1.0, 1.0)[..., None, None]
+    sign = np.sign(np.linalg.det(rotation_b))[..., None, None]
     return se3.nearest_rotation(sign * rotation_c), se3.nearest_rotation(sign * rotation_b)
 
 

@@ -21,11 +21,15 @@ from dhcal_pin.cameras.intrinsics import (
     intrinsics_candidates,
 )
 from dhcal_pin.cameras.pose_from_points import (
+    _first_poses,
+    _flat_poses,
     _jacobian,
     _line_distances,
     _mirror,
     _mirror_plane,
     _orthographic_pose,
+    _projection_poses,
+    _refine,
     _residuals,
     _transfer_distances,
     agreeing_points,
@@ -650,3 +654,64 @@ def test_mean_of_the_poses_that_agree():
     wrong = se3.transform(se3.exp3([[2.0, 0, 0], [0, -2, 0], [1, 1, 1.5]]), np.zeros((3, 3)))
     found = mean_pose(np.stack([wrong, right], 1))
     np.testing.assert_allclose(found, se3.transform(se3.exp3([0, 0, 0.2]), [2, 5, 8]), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_closed_forms_of_exact_images_are_exact(seed):
+    rng = np.random.default_rng(seed)
+    pose, body = random_pose(rng), rng.uniform(-0.1, 0.1, (6, 3))
+    first, mirrored = _flat_poses(CHECKERBOARD[:, :2], image_of(CHECKERBOARD, pose))
+    np.testing.assert_allclose(first, pose, atol=1e-9)
+    np.testing.assert_allclose(mirrored, _mirror_plane(pose)[0], atol=1e-8)
+    (found,) = _projection_poses(body, image_of(body, pose))
+    np.testing.assert_allclose(found, pose, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("points", "count"),
+    [
+        (CHECKERBOARD[[0, 6, 28]], 0),
+        (CHECKERBOARD[[0, 6, 28, 34]], 2),
+        (CHECKERBOARD[:7], 0),
+        (CHECKERBOARD[[*range(7), 20]], 0),
+        (np.ones((6, 3)), 0),
+        (np.vstack([np.zeros(3), 0.1 * np.eye(3)]), 3),
+        (np.vstack([np.zeros(3), 0.1 * np.eye(3), [[0.1, 0.1, 0.05]]]), 3),
+        (np.vstack([np.zeros(3), 0.1 * np.eye(3), [[0.1, 0.1, 0.05], [0.05, 0.1, 0.1]]]), 4),
+    ],
+)
+def test_number_of_closed_forms(points, count):
+    """Two of a plane, one of an orthographic image, and one of a projection matrix for six points."""
+    pose = se3.transform(se3.exp3([0.4, 0.3, 0.1]), [0.02, 0.01, 0.6])
+    assert len(_first_poses(points, image_of(points, pose))) == count
+
+
+def test_views_of_few_points_are_refined_with_those_of_many():
+    """The copies that fill up a view do not count, in its pose and in its distance."""
+    rng = np.random.default_rng(8)
+    start = np.array([random_pose(rng) for _ in range(3)])
+    views = []
+    for pose, count in zip(start, (35, 4, 9), strict=True):
+        points = rng.permutation(CHECKERBOARD)[:count]
+        views.append(
+            (points, image_of(points, pose @ se3.exp6(np.full(6, 0.02))) + 1e-3 * rng.normal(size=(count, 2)))
+        )
+    poses, distances = _refine(start, views)
+    for pose, distance, view, first in zip(poses, distances, views, start, strict=True):
+        (alone,), (alone_distance,) = _refine(first[None], [view])
+        np.testing.assert_allclose(pose, alone, atol=1e-9)
+        assert distance == pytest.approx(alone_distance)
+        errors = image_of(view[0], pose) - view[1]
+        assert distance == pytest.approx(np.sqrt(np.mean(np.sum(errors**2, 1))))
+        # No small motion explains the image better.
+        slopes = _jacobian(se3.transform_points(pose, view[0]))
+        assert np.abs(np.einsum("mi,mij->j", errors, slopes)).max() < 1e-3 * np.abs(errors).sum()
+
+
+@pytest.mark.parametrize("depth", [0.03, 0.08])
+def test_exact_points_near_a_plane_agree_as_far_as_a_map_of_the_plane_describes_them(depth):
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        points = rng.uniform(-0.1, 0.1, (24, 3)) * [1, 1, depth]
+        pose = se3.transform(se3.exp3(rng.uniform(-0.6, 0.6, 3)), [0, 0, rng.uniform(0.25, 0.5)])
+        assert agreeing_points(points, image_of(points, pose)).all()

@@ -646,3 +646,37 @@ def test_unknown_conditions_have_no_effect():
     arm = nominal_arm("ur10")
     terms = Transmission.zero(arm.loads).terms(Conditions(np.ones((2, 6))))
     np.testing.assert_array_equal(terms[2:], 0.0)
+
+
+def test_a_follower_stands_at_its_multiple_and_offset():
+    """It turns by 0.1 - 2·q. A mass at 0.2 m from it is 0.3·cos q + 0.2·cos(0.1 - q) high."""
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    inertial = f'<inertial><origin xyz="0 0 .2"/><mass value="2"/>{inertia}</inertial>'
+    text = MIMIC.replace('<link name="b"/>', f'<link name="b">{inertial}</link>')
+    loads = Chain.from_urdf(parse_urdf(text.encode(), "mimic.urdf")).loads
+    q = np.array([[0.3, -0.7, 1.1]])
+    assert loads.n_joints == 1
+    np.testing.assert_allclose(loads.configurations(q), np.transpose([q[0], 0.1 - 2 * q[0]]), atol=1e-15)
+    wanted = 2 * GRAVITY * (0.2 * np.sin(0.1 - q) - 0.3 * np.sin(q))
+    np.testing.assert_allclose(loads.torques(q), wanted, atol=1e-12)
+
+
+def test_families_are_tried_in_the_order_of_their_stages():
+    """Physical causes first, then families that could imitate others, then curves of growing order."""
+    stages: dict[int, set[str]] = {}
+    for name, family in FAMILIES.items():
+        stages.setdefault(family.rule.stage, set()).add(name)
+    wanted = [
+        {"harmonics", "compliance", "backlash", "thermal"}, {"gain", "coupling"}, {"curves"}, {"fine-curves"}
+    ]  # fmt: skip
+    assert [names for _, names in sorted(stages.items())] == wanted
+    universal = {name for name, family in FAMILIES.items() if family.rule.is_universal}
+    assert universal == {"harmonics", "compliance"}
+    # Universal families need no improvement; all others have to improve the error by a part of it.
+    needed = {name: family.rule.min_improvement for name, family in FAMILIES.items()}
+    assert {name for name, improvement in needed.items() if improvement == 0.0} == universal
+    assert max(needed.values()) < 1.0
+    assert {name: family.condition for name, family in FAMILIES.items() if family.condition} == {
+        "backlash": "approach",
+        "thermal": "temperature",
+    }
