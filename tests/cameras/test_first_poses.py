@@ -634,17 +634,17 @@ def test_rotations_about_a_second_axis_are_stated(turn, is_enough):
 
 
 def test_angles_to_the_predicted_rotations():
-    """The board in the camera is C⁻¹·A·B; candidates turn on from there by 0, 0.2 and 3 rad."""
+    """The board in the camera is C⁻¹·A·B; candidates turn on from there."""
     rng = np.random.default_rng(2)
     camera, board, links = (
         se3.exp3(rng.normal(size=3)),
         se3.exp3(rng.normal(size=3)),
-        se3.exp3(rng.normal(size=(4, 3))),
+        se3.exp3(rng.normal(size=(50, 3))),
     )
-    turned = se3.exp3(np.outer([0, 0.2, 3.0], [0.6, 0, 0.8]))
+    turned = se3.exp3(np.outer([0, 0.2, np.pi], [0.6, 0, 0.8]))
     candidates = (camera.T @ links @ board)[:, None] @ turned
     found = _angles(links, candidates, camera, board)
-    np.testing.assert_allclose(found, np.tile([0, 0.2, 3.0], (4, 1)), atol=1e-7)
+    np.testing.assert_allclose(found, np.tile([0, 0.2, np.pi], (50, 1)), atol=1e-6)
 
 
 def test_mean_of_the_poses_that_agree():
@@ -667,6 +667,9 @@ def test_closed_forms_of_exact_images_are_exact(seed):
     np.testing.assert_allclose(found, pose, atol=1e-8)
 
 
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+
+
 @pytest.mark.parametrize(
     ("points", "count"),
     [
@@ -675,6 +678,9 @@ def test_closed_forms_of_exact_images_are_exact(seed):
         (CHECKERBOARD[:7], 0),
         (CHECKERBOARD[[*range(7), 20]], 0),
         (np.ones((6, 3)), 0),
+        # As thick as half a thousandth of the length, and as three thousandths.
+        (np.vstack([[[0, 0, 2.5e-4], [0.5, 0, -2.5e-4]], 0.5 * CORNERS]), 2),
+        (np.vstack([[[0, 0, 1.5e-3], [0.5, 0, -1.5e-3]], 0.5 * CORNERS]), 4),
         (np.vstack([np.zeros(3), 0.1 * np.eye(3)]), 3),
         (np.vstack([np.zeros(3), 0.1 * np.eye(3), [[0.1, 0.1, 0.05]]]), 3),
         (np.vstack([np.zeros(3), 0.1 * np.eye(3), [[0.1, 0.1, 0.05], [0.05, 0.1, 0.1]]]), 4),

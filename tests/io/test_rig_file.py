@@ -157,6 +157,21 @@ def test_numbers_of_squares_and_tags(tmp_path, table, old, smallest, largest):
             board_of(tmp_path, table.replace(old, f"{key} = {count}"))
 
 
+@pytest.mark.parametrize(
+    ("length", "is_possible"), [(1e-3, True), (1e5, True), (0.0, False), (100_001, False)]
+)
+def test_lengths_of_squares_and_places_of_points(tmp_path, length, is_possible):
+    """Points may be at the origin and on both sides of it."""
+    squares = CHECKERS.replace("square_mm = 25", f"square_mm = {length}")
+    points = POINTS.replace("[2, 0, 0]", f"[0, {-length}, 0]")
+    for table, is_allowed in ((squares, is_possible), (points, is_possible or not length)):
+        if is_allowed:
+            assert np.abs(board_of(tmp_path, table).points).max() >= 1e-3 * length
+        else:
+            with pytest.raises(DhcalError, match="expected"):
+                board_of(tmp_path, table)
+
+
 @pytest.mark.parametrize("key", ["width", "height"])
 def test_sizes_of_images(tmp_path, key):
     for size, is_possible in ((1, True), (100_000, True), (0, False), (100_001, False)):
@@ -297,3 +312,11 @@ def test_the_only_entry_needs_no_name():
     ]:
         with pytest.raises(DhcalError, match=message):
             only_entry(entries, name, "camera", "rig.toml")
+
+
+@pytest.mark.parametrize(("model", "count"), [("pinhole", 5), ("fisheye", 4)])
+def test_a_lens_without_stated_distortion_has_none(tmp_path, model, count):
+    table = f'{CAMERA_TABLE}model = "{model}"\nintrinsics = "free"\n'
+    camera = read_rig(write(tmp_path / "r.toml", table + UNKNOWN + CHECKERS)).cameras["wrist"]
+    np.testing.assert_array_equal(camera.values, [640, 641, 639.5, 359.5, *[0.0] * count])
+    assert (camera.lens.name, camera.intrinsics) == (model, "free")

@@ -680,3 +680,15 @@ def test_families_are_tried_in_the_order_of_their_stages():
         "backlash": "approach",
         "thermal": "temperature",
     }
+
+
+def test_terms_that_were_used_last_are_kept(monkeypatch):
+    monkeypatch.setattr("dhcal_pin.robot.transmission._MAX_CACHED_TERMS", 2)
+    transmission = Transmission.zero(nominal_arm("ur10").loads)
+    first, second, third = (Conditions(np.full((2, 6), value)) for value in (0.1, 0.2, 0.3))
+    kept = [transmission.terms(each) for each in (first, second)]
+    assert transmission.terms(first) is kept[0]
+    newest = transmission.terms(third)
+    assert transmission.terms(first) is kept[0]
+    assert transmission.terms(third) is newest
+    assert transmission.terms(second) is not kept[1]
