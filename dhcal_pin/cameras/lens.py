@@ -131,12 +131,11 @@ def _distort_fisheye(plane: Array, coefficients: Array) -> tuple[Array, Array, A
     """Apply the distortion of the fisheye model with k1, k2, k3, k4."""
     r = np.maximum(np.sqrt(np.einsum("im,im->m", plane, plane)), _MIN_RADIUS)
     theta = np.arctan(r)
-    powers = theta ** np.arange(3, 10, 2)[:, None]
+    exponents = np.array([[3], [5], [7], [9]])
+    powers = theta**exponents
     angle = theta + coefficients @ powers
     # Derivative of the distorted angle by r.
-    rate = (1 + coefficients @ (np.arange(3, 10, 2)[:, None] * theta ** np.arange(2, 9, 2)[:, None])) / (
-        1 + r * r
-    )
+    rate = (1 + coefficients @ (exponents * theta ** (exponents - 1))) / (1 + r * r)
     scale = angle / r
     # Derivative of scale·plane: scale·I + (rate - scale)·n·nᵀ with the direction n of the point.
     direction = plane / r

@@ -326,7 +326,6 @@ def test_focal_length_with_the_centre_in_the_middle():
     turns = se3.exp3(rng.uniform(-0.6, 0.6, (4, 3)))
     views = [np.diag([1.3, 1.3, 1]) @ np.column_stack([r[:, 0], r[:, 1], [0.1, 0.2, 2.0]]) for r in turns]
     values = _without_centre(views)
-    assert values is not None
     np.testing.assert_allclose(values, [1.3, 1.3, 0, 0], atol=1e-9)
 
 
@@ -463,9 +462,15 @@ def homographies(focal_lengths, centre, count=4):
 def test_homographies_determine_both_focal_lengths_and_the_centre():
     lens = (1.3, 1.1, 0.05, -0.08)
     found = _with_centre(homographies(lens[:2], lens[2:], 3))
-    assert found is not None
     np.testing.assert_allclose(found, lens, atol=1e-9)
-    assert _without_centre([np.eye(3)] * 3) is None
+
+
+def test_frontal_and_contradicting_views_have_no_plausible_lens():
+    """Frontal views do not determine ω; with those of a hyperbolic ω, the square of f is negative."""
+    frontal = [np.diag([1.0, 1.0, depth]) for depth in (1, 2, 3)]
+    hyperbolic = [np.array([[1, 0, 0], [0, 1 + k * k, 0], [0, k, 1]]) for k in (0.1, 0.2, 0.3)]
+    for found in (_with_centre(frontal), _without_centre(frontal), _without_centre(hyperbolic)):
+        assert not _is_plausible(found, 1.0, 0.75)
 
 
 @pytest.mark.parametrize(

@@ -372,3 +372,13 @@ def test_a_lens_is_fitted_to_some_of_many_images_that_have_a_pose(monkeypatch, i
     calls.clear()
     fit_camera(views[1:], camera)
     assert calls == [(61, intrinsics == "prior")]
+
+
+def test_views_that_count_as_one_determine_a_lens_as_one_does():
+    """The standard deviations are those of all views times the root of their number."""
+    _, views = images(np.random.default_rng(8), "pinhole", count=6)
+    values, std = stated_lens("pinhole", "free")
+    fits = [
+        fit_lens(views, LENSES["pinhole"], values, std, repeats_errors=repeats) for repeats in (False, True)
+    ]
+    np.testing.assert_allclose(fits[1].std[:4] / fits[0].std[:4], np.sqrt(6), rtol=0.05)
