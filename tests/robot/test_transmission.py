@@ -467,22 +467,25 @@ PENDULUM = """<robot name="r"><link name="base"/>
   <link name="arm"><inertial><origin xyz="0 0 0.4"/><mass value="3"/>
     <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link>
   <joint name="swing" type="TYPE"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
-    <limit lower="-7" upper="7" effort="1" velocity="1"/></joint></robot>"""
+    <limit lower="-7" upper="7" effort="1" velocity="1"/></joint>
+  <link name="tip"/><joint name="end" type="fixed"><parent link="arm"/><child link="tip"/>
+    <origin xyz="0 0 0.5"/></joint></robot>"""
 
 
 @pytest.mark.parametrize("joint_type", ["revolute", "continuous"])
 def test_torques_of_a_pendulum(joint_type):
     """The energy of a mass m at the height l·cos q has the slope -m·g·l·sin q."""
     bare = Chain.from_urdf(parse_urdf(PENDULUM.replace("TYPE", joint_type).encode(), "p.urdf"))
-    carrying = bare.with_payload(Payload(2.0, (0.0, 0.0, 0.7)))
+    carrying = bare.with_payload(Payload(2.0, (0.0, 0.0, 0.2)))
     angles = np.array([[0.0, 0.5, -1.2, 3.0]])
     unit = -GRAVITY * np.sin(angles)
     payload = np.array([2.0, 0.0, 5.0, 1.0])
     for _ in range(2):
         np.testing.assert_allclose(bare.loads.torques(angles), 3 * 0.4 * unit, atol=1e-12)
         np.testing.assert_allclose(carrying.loads.torques(angles), (1.2 + 1.4) * unit, atol=1e-12)
-        # Without a payload in the model, masses are at the tip, here on the axis of the joint.
-        np.testing.assert_allclose(bare.loads.torques(angles, payload), 1.2 * unit, atol=1e-12)
+        # Without a payload in the model, masses are at the tip.
+        found = bare.loads.torques(angles, payload)
+        np.testing.assert_allclose(found, (1.2 + 0.5 * payload) * unit, atol=1e-12)
         found = carrying.loads.torques(angles, payload)
         np.testing.assert_allclose(found, (1.2 + 0.7 * payload) * unit, atol=1e-12)
         np.testing.assert_allclose(carrying.loads.torques_per_kilogram(angles), 0.7 * unit, atol=1e-12)
