@@ -60,12 +60,12 @@ def solve_hand_eye(link_poses: Array, board_poses: Array, where: str) -> tuple[A
 def _solve_rotations(a: Array, p: Array) -> tuple[Array, Array]:
     """Solve for the rotations (..., 3, 3) of camera and board; a and p are (..., i, 3, 3)."""
     # With column-major vectors, vec(R_A·R_B·R_Pᵀ) = (R_P ⊗ R_A)·vec(R_B).
-    kronecker = np.einsum("...iab,...icd->...acbd", p, a).reshape(*a.shape[:-3], 9, 9) / a.shape[-3]
+    kronecker = np.einsum("...iab,...icd->...acbd", p, a).reshape(*a.shape[:-3], 9, 9)
     u, _, vt = np.linalg.svd(kronecker)
     rotation_c, rotation_b = (
         vector.reshape(*a.shape[:-3], 3, 3).swapaxes(-1, -2) for vector in (u[..., 0], vt[..., 0, :])
     )
-    sign = np.where(np.linalg.det(rotation_b) < 0, -1.0, 1.0)[..., None, None]
+    sign = np.sign(np.linalg.det(rotation_b))[..., None, None]
     return se3.nearest_rotation(sign * rotation_c), se3.nearest_rotation(sign * rotation_b)
 
 
@@ -94,8 +94,12 @@ def choose_poses(link_poses: Array, candidates: Array) -> Array:
 def _angles(a: Array, p: Array, rotation_c: Array, rotation_b: Array) -> Array:
     """Return the angles (..., i, k) of rotations p (i, k, 3, 3) to those that camera and board predict."""
     predicted = rotation_c.swapaxes(-1, -2)[..., None, :, :] @ a @ rotation_b[..., None, :, :]
-    cosine = 0.5 * (np.einsum("...iab,ikab->...ik", predicted, p) - 1)
-    return np.arccos(np.clip(cosine, -1, 1))
+    return _angles_of_traces(np.einsum("...iab,ikab->...ik", predicted, p))
+
+
+def _angles_of_traces(traces: Array) -> Array:
+    """Return the angles of rotations with these traces."""
+    return np.arccos(np.clip(0.5 * (traces - 1), -1, 1))
 
 
 def _require_two_axes(rotations: Array, where: str) -> None:
@@ -115,8 +119,8 @@ def _require_two_axes(rotations: Array, where: str) -> None:
 def mean_pose(candidates: Array) -> Array:
     """Compute the mean of the poses of several images that agree best."""
     rotations = candidates[..., :3, :3]
-    cosine = 0.5 * (np.einsum("jlab,ikab->jlik", rotations, rotations) - 1)
-    angles = np.arccos(np.clip(cosine, -1, 1)).reshape(-1, *candidates.shape[:2])
+    angles = _angles_of_traces(np.einsum("jlab,ikab->jlik", rotations, rotations))
+    angles = angles.reshape(-1, *candidates.shape[:2])
     central = angles[np.argmin(np.sum(np.minimum(angles.min(2), _MAX_ANGLE), 1))]
     poses = candidates[np.arange(len(candidates)), np.argmin(central, 1)]
     return se3.transform(se3.nearest_rotation(poses[:, :3, :3].sum(0)), np.median(poses[:, :3, 3], 0))

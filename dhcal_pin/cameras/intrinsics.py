@@ -107,7 +107,7 @@ def _search(views: Sequence[tuple[Array, Array]], camera: Camera) -> tuple[float
     if not 2 <= best < len(sums) - 2:
         return None
     n_rows = sum(2 * len(points) for points, _ in views)
-    variance = sums[best] / max(n_rows - 6 * len(views), 1)
+    variance = sums[best] / (n_rows - 6 * len(views))
     if min(sums[best - 2], sums[best + 2]) - sums[best] < _MIN_INCREASE * variance:
         return None
     focal, least, ratio = float(_FOCAL_LENGTHS[best]), float(sums[best]), 2**0.5
@@ -136,7 +136,7 @@ def _from_homographies(
     scaled = [shift @ direct_linear_transform(points, pixels) for points, pixels in flat]
     for estimate in (_with_centre, _without_centre):
         values = estimate(scaled)
-        if values is not None and _is_plausible(values, width / size, height / size):
+        if _is_plausible(values, width / size, height / size):
             fx, fy, cx, cy = values
             return size * fx, size * fy, size * cx + (width - 1) / 2, size * cy + (height - 1) / 2
     return None
@@ -171,26 +171,21 @@ def _rows(homographies: Sequence[Array]) -> Array:
     return np.array(rows)
 
 
-def _with_centre(homographies: Sequence[Array]) -> tuple[float, float, float, float] | None:
-    """Solve for fx, fy, cx, cy; None if ω is not positive."""
+def _with_centre(homographies: Sequence[Array]) -> tuple[float, float, float, float]:
+    """Solve for fx, fy, cx, cy; focal lengths that are not numbers if ω is not positive."""
     w11, w22, w13, w23, w33 = np.linalg.svd(_rows(homographies))[2][-1]
-    if w11 == 0 or w22 == 0:
-        return None
-    cx, cy = -w13 / w11, -w23 / w22
-    scale = w33 - w13**2 / w11 - w23**2 / w22
-    if not (scale / w11 > 0 and scale / w22 > 0):
-        return None
-    return float(np.sqrt(scale / w11)), float(np.sqrt(scale / w22)), float(cx), float(cy)
+    with np.errstate(all="ignore"):
+        cx, cy = -w13 / w11, -w23 / w22
+        scale = w33 + w13 * cx + w23 * cy
+        return float(np.sqrt(scale / w11)), float(np.sqrt(scale / w22)), float(cx), float(cy)
 
 
-def _without_centre(homographies: Sequence[Array]) -> tuple[float, float, float, float] | None:
-    """Solve for one focal length with the centre in the middle of the image; None if it is not positive."""
+def _without_centre(homographies: Sequence[Array]) -> tuple[float, float, float, float]:
+    """Solve for one focal length with the centre in the middle of the image; not a number without one."""
     rows = _rows(homographies)
     # ω = diag(1, 1, f²)/f².
-    square = -float(rows[:, 4] @ (rows[:, 0] + rows[:, 1])) / float(rows[:, 4] @ rows[:, 4])
-    if not (np.isfinite(square) and square > 0):
-        return None
-    focal = float(np.sqrt(square))
+    with np.errstate(all="ignore"):
+        focal = float(np.sqrt(-(rows[:, 4] @ (rows[:, 0] + rows[:, 1])) / (rows[:, 4] @ rows[:, 4])))
     return focal, focal, 0.0, 0.0
 
 

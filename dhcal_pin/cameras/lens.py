@@ -37,8 +37,9 @@ Distortion = Callable[[Array, Array], tuple[Array, Array, Array]]
 MIN_DEPTH = 1e-6
 # Names of the values of every lens before those of the distortion.
 FOCAL_AND_CENTRE = ("fx", "fy", "cx", "cy")
-# Tangent of the angle below which the fisheye model uses its limit on the axis.
-_NEAR_AXIS = 1e-8
+# Smallest distance from the axis in the fisheye model, in image coordinates X/Z, Y/Z: nearer points are
+# scaled as those at this distance.
+_MIN_RADIUS = 1e-8
 # Largest number of iterations of the inversion of a distortion.
 _N_INVERSIONS = 20
 # Largest step that ends it, in image coordinates X/Z, Y/Z.
@@ -128,19 +129,16 @@ def _distort_brown(plane: Array, coefficients: Array) -> tuple[Array, Array, Arr
 
 def _distort_fisheye(plane: Array, coefficients: Array) -> tuple[Array, Array, Array]:
     """Apply the distortion of the fisheye model with k1, k2, k3, k4."""
-    r = np.sqrt(np.einsum("im,im->m", plane, plane))
-    is_near = r < _NEAR_AXIS
-    safe = np.where(is_near, 1.0, r)
+    r = np.maximum(np.sqrt(np.einsum("im,im->m", plane, plane)), _MIN_RADIUS)
     theta = np.arctan(r)
-    powers = theta ** np.arange(3, 10, 2)[:, None]
+    exponents = np.array([[3], [5], [7], [9]])
+    powers = theta**exponents
     angle = theta + coefficients @ powers
     # Derivative of the distorted angle by r.
-    rate = (1 + coefficients @ (np.arange(3, 10, 2)[:, None] * theta ** np.arange(2, 9, 2)[:, None])) / (
-        1 + r * r
-    )
-    scale = np.where(is_near, 1.0, angle / safe)
+    rate = (1 + coefficients @ (exponents * theta ** (exponents - 1))) / (1 + r * r)
+    scale = angle / r
     # Derivative of scale·plane: scale·I + (rate - scale)·n·nᵀ with the direction n of the point.
-    direction = np.where(is_near, 0.0, plane / safe)
+    direction = plane / r
     by_plane = scale * np.eye(2)[:, :, None] + (rate - scale) * direction[:, None] * direction[None]
     return scale * plane, by_plane, direction[:, None] * powers[None]
 

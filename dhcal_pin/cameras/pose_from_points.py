@@ -25,6 +25,7 @@ import numpy as np
 
 from .. import se3
 from .._typing import Array
+from .lens import MIN_DEPTH
 
 # Ratio of the smallest to the largest extent below which points count as flat, and as nearly flat: the
 # homography of the nearest plane then describes their image to about this part of its size.
@@ -38,8 +39,6 @@ _N_STEPS, _DAMPING, _MIN_DAMPING = 30, 1e-3, 1e-12
 _N_SUBSETS, _GOOD_RATIO, _OUTLIER_RATIO = 60, 0.01, 5.0
 # Relative change of the cost that ends the refinement.
 _COST_RTOL = 1e-4
-# Smallest depth of a point in front of the camera [m].
-_MIN_DEPTH = 1e-6
 
 
 def normalizing_transform(points: Array) -> Array:
@@ -237,7 +236,7 @@ def _projection_poses(points: Array, image: Array) -> list[Array]:
 def _residuals(poses: Array, points: Array, image: Array) -> tuple[Array, Array]:
     """Return residuals (c, m, 2) and points in the camera frame (c, m, 3) of poses (c, 4, 4)."""
     local = points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
-    depth = np.maximum(local[..., 2:], _MIN_DEPTH)
+    depth = np.maximum(local[..., 2:], MIN_DEPTH)
     return image - local[..., :2] / depth, local
 
 
@@ -282,7 +281,7 @@ def _refine(poses: Array, views: Sequence[tuple[Array, Array]]) -> tuple[Array, 
 
 def _jacobian(local: Array) -> Array:
     """Return the derivatives (..., m, 2, 6) of points (..., m, 3) by twists [v, ω] in camera axes."""
-    depth = np.maximum(local[..., 2], _MIN_DEPTH)
+    depth = np.maximum(local[..., 2], MIN_DEPTH)
     by_point = np.zeros((*local.shape[:-1], 2, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
     by_point[..., 2] = -local[..., :2] / depth[..., None] ** 2

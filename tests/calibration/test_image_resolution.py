@@ -13,7 +13,13 @@ from slow_cases import some_slow
 import dhcal_pin as dh
 from dhcal_pin.calibration.verdict import _largest_image_error
 from dhcal_pin.cameras import Camera
-from dhcal_pin.cameras.resolution import FACTORS, find_resolution, is_far
+from dhcal_pin.cameras.resolution import (
+    FACTORS,
+    Resolution,
+    describe_resolution,
+    find_resolution,
+    is_far,
+)
 from dhcal_pin.measurements import CameraCorners
 
 pytestmark = pytest.mark.usefixtures("own_loss", "uneventful", "ordered_axes")
@@ -88,6 +94,87 @@ def test_a_usual_lens_is_neither_another_resolution_nor_far(focal, shift, is_exp
     assert find_resolution(camera, found, np.zeros((0, 2))) is None
     assert is_far(camera, found) == is_expected
     assert not is_far(replace(camera, intrinsics="free"), found)
+
+
+@pytest.mark.parametrize("factor", [1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4])
+def test_factors_between_usual_resolutions_are_known(factor):
+    camera = Camera("c", "tip", 1280, 960, STATED)
+    found = find_resolution(camera, np.concatenate([factor * STATED[:4], STATED[4:]]), np.zeros((1, 2)))
+    assert found is not None
+    assert found.factor == pytest.approx(factor)
+
+
+@pytest.mark.parametrize(
+    ("index", "ratio", "is_found"),
+    [
+        *((i, r, True) for i in range(4) for r in (0.91, 1.09)),
+        *((i, r, False) for i in range(4) for r in (0.86, 1.14)),
+    ],
+)
+def test_each_value_of_another_resolution_differs_by_up_to_a_tenth(index, ratio, is_found):
+    camera, found = Camera("c", "tip", 1280, 960, STATED), 2 * STATED
+    found[index] *= ratio
+    assert (find_resolution(camera, found, np.zeros((0, 2))) is not None) == is_found
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_a_lens_that_is_not_known_or_not_possible_has_no_resolution(place):
+    camera = Camera("c", "tip", 1280, 960, STATED)
+    for value in (0.0, -1.0):
+        found = 2 * STATED
+        found[place] = value
+        assert find_resolution(camera, found, np.zeros((0, 2))) is None
+        assert find_resolution(replace(camera, values=found), 2 * STATED, np.zeros((0, 2))) is None
+        # Opposite signs on both sides are no factor.
+        assert find_resolution(replace(camera, values=found), 2 * found, np.zeros((0, 2))) is None
+    unknown = np.where(np.arange(9) < 4, np.nan, 0.0)
+    assert find_resolution(replace(camera, values=unknown), 2 * STATED, np.zeros((0, 2))) is None
+
+
+@pytest.mark.parametrize(
+    ("factor", "corner", "is_of_lens"),
+    [
+        # Within the stated size of larger images: those of the lens. Otherwise the images are larger.
+        (2, (1279, 959), True),
+        (2, (1280, 500), False),
+        (2, (500, 960), False),
+        (2, (2559, 1919), False),
+        (2, (2560, 500), None),
+        (2, (500, 1920), None),
+        # Within the smaller images: the images are smaller. Otherwise the lens is of smaller ones.
+        (0.5, (639, 479), False),
+        (0.5, (640, 100), True),
+        (0.5, (100, 480), True),
+        (0.5, (1280, 100), None),
+    ],
+)
+def test_corners_tell_another_resolution_of_the_images_from_that_of_the_lens(factor, corner, is_of_lens):
+    camera = Camera("c", "tip", 1280, 960, STATED)
+    found = find_resolution(camera, factor * STATED, np.array([[10.0, 10.0], corner], float))
+    assert found == (None if is_of_lens is None else (factor, is_of_lens))
+
+
+def test_resolutions_are_described_with_their_remedy():
+    camera = Camera("c", "tip", 1280, 960, STATED)
+    images, lens = Resolution(1.5, False), Resolution(1.5, True)
+    assert describe_resolution(camera, images) == "the images are 1920 x 1440 px, not 1280 x 960 px"
+    assert (
+        describe_resolution(camera, lens)
+        == "fx, fy, cx and cy are those of images of 853 x 640 px, not of 1280 x 960 px"
+    )
+    assert images.remedy == "Correct width, height, fx, fy, cx and cy of the camera."
+    assert lens.remedy == "Correct fx, fy, cx and cy of the camera."
+
+
+@pytest.mark.parametrize(("change", "is_expected"), [(250.0, False), (251.0, True), (-251.0, True)])
+@pytest.mark.parametrize("index", range(4))
+def test_a_change_above_five_standard_deviations_of_the_prior_is_far(index, change, is_expected):
+    camera, found = Camera("c", "tip", 1280, 960, STATED), STATED.copy()
+    found[index] += change
+    assert is_far(camera, found) == is_expected
+    # Coefficients of the distortion do not count.
+    assert not is_far(camera, STATED + 1e3 * (np.arange(9) >= 4))
+    assert not is_far(replace(camera, intrinsics="fixed"), found)
 
 
 @pytest.mark.usefixtures("untried")

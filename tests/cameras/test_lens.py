@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dhcal_pin.cameras import LENSES
+from dhcal_pin.cameras import lens as lens_module
 
 cv2 = pytest.importorskip("cv2")
 
@@ -60,3 +61,40 @@ def test_points_on_the_axis_have_finite_derivatives(lens):
     found = lens.project(np.array([[0.0], [0.0], [1.0]]), VALUES[lens.name])
     assert all(np.isfinite(part).all() for part in found)
     np.testing.assert_allclose(found[1][:, :2, 0], np.diag(VALUES[lens.name][:2]), rtol=1e-12)
+
+
+@LENS
+def test_each_value_has_a_name(lens):
+    assert lens.names[:4] == ("fx", "fy", "cx", "cy")
+    assert len(lens.names) == len(VALUES[lens.name])
+
+
+@LENS
+def test_points_behind_the_camera_are_as_if_just_before_it(lens):
+    """Their depth has no effect any more; that of points at the smallest depth has."""
+    values = VALUES[lens.name]
+    behind, near = (np.array([[2e-7, -1e-7], [1e-7, 3e-7], [z, z]]) for z in (-0.5, 1e-6))
+    pixels, by_points, _ = lens.project(behind, values)
+    np.testing.assert_array_equal(pixels, lens.project(near, values)[0])
+    np.testing.assert_array_equal(by_points[:, 2], 0.0)
+    np.testing.assert_array_equal(by_points[:, :2], lens.project(near, values)[1][:, :2])
+    assert np.all(lens.project(near, values)[1][:, 2] != 0.0)
+
+
+@LENS
+def test_many_pixels_are_normalized_as_few(lens, monkeypatch):
+    values = VALUES[lens.name]
+    pixels = lens.project(points(3), values)[0]
+    together = lens.normalize(pixels, values)
+    for size in (39, 7):
+        monkeypatch.setattr(lens_module, "_BLOCK", size)
+        np.testing.assert_allclose(lens.normalize(pixels, values), together, atol=1e-12)
+
+
+def test_pixels_that_no_point_has_are_those_without_distortion():
+    """With k1 = -0.5 no distorted radius is above 0.55, and that of 0.2 is 0.2·(1 - 0.02)."""
+    values = np.array([500.0, 400, 320, 240, -0.5, 0, 0, 0, 0])
+    pixels = np.array([[320 + 500 * 0.9, 320 + 500 * 0.196], [240 + 400 * 0.8, 240]])
+    np.testing.assert_allclose(
+        LENSES["pinhole"].normalize(pixels, values), [[0.9, 0.2], [0.8, 0]], atol=1e-12
+    )

@@ -1,12 +1,15 @@
 """Lens and poses of boards from the images of a camera alone, against the truth and OpenCV."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from slow_cases import some_slow
 
 from dhcal_pin import se3
 from dhcal_pin.cameras import LENSES, Board, Camera, lens_fit, pose_from_points
-from dhcal_pin.cameras.lens_fit import _LensProblem, fit_camera, fit_lens, fit_unknown_lens
+from dhcal_pin.cameras.lens_fit import _lens_widths, _LensProblem, fit_camera, fit_lens, fit_unknown_lens
 from dhcal_pin.cameras.pose_from_points import estimate_pose, estimate_poses
 from dhcal_pin.exceptions import NotObservableError
 
@@ -222,3 +225,160 @@ def test_many_images_have_the_lens_of_some_and_a_pose_each(monkeypatch):
     assert angles(fit.poses[:70] + fit.poses[71:], poses).max() < 0.05
     # Some hundred for the search of the focal length, 60 for each of two first lenses, and all views.
     assert len(calls) < 600
+
+
+# --- the steps ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "is_known", "wanted"),
+    [
+        ("fixed", True, (0.0, 0.0)),
+        ("prior", True, (50.0, 0.3)),
+        # Images alone determine a lens badly, even if the calibration frees it.
+        ("free", True, (50.0, 0.3)),
+        ("prior", False, (1e5, 0.3)),
+    ],
+)
+@pytest.mark.parametrize("model", LENSES)
+def test_first_widths_of_a_lens(model, intrinsics, is_known, wanted):
+    values = TRUE[model] if is_known else np.nan * TRUE[model]
+    camera = Camera("c", "world", 1280, 960, values, LENSES[model], intrinsics)
+    np.testing.assert_array_equal(_lens_widths(camera), np.repeat(wanted, [4, len(values) - 4]))
+
+
+def test_a_held_lens_has_no_cost_and_no_widths():
+    _, views = images(np.random.default_rng(6), "pinhole", count=2)
+    fit = fit_lens(views, LENSES["pinhole"], TRUE["pinhole"], np.zeros(9))
+    np.testing.assert_array_equal(fit.values, TRUE["pinhole"])
+    np.testing.assert_array_equal(fit.std, 0)
+    assert np.isnan(fit.cost)
+    assert all(rms < 1e-3 for found in fit.poses for _, rms in found[:1])
+
+
+def small_problem(n_repeats=1):
+    """Return a problem of three views and five free values, values of the lens, poses and rows."""
+    poses, views = images(np.random.default_rng(7), "pinhole", count=3)
+    views = [
+        (points[:count], pixels[:count]) for (points, pixels), count in zip(views, (35, 20, 27), strict=True)
+    ]
+    values, std = stated_lens("pinhole", "stated")
+    std[[3, 6, 7, 8]] = 0.0
+    problem = _LensProblem(views, LENSES["pinhole"], values, std, n_repeats)
+    values = values + 0.1 * std
+    known = [(pose, 0.0) for pose in poses]
+    return problem, values, known, problem._rows(values, known)
+
+
+def test_rows_are_derivatives_and_errors_of_each_view():
+    """The poses turn and move in the axes of the camera."""
+    problem, values, known, rows = small_problem()
+    free = np.flatnonzero(problem.std)
+    for (points, pixels), (pose, _), part in zip(problem.views, known, rows, strict=True):
+
+        def pixels_of(step, points=points, pose=pose):
+            moved = values.copy()
+            moved[free] += step[:5]
+            local = se3.transform_points(se3.exp6(step[5:]) @ pose, points)
+            return LENSES["pinhole"].project(local.T, moved)[0].T.ravel()
+
+        np.testing.assert_allclose(part[:, -1], pixels.ravel() - pixels_of(np.zeros(11)), atol=1e-9)
+        for i, step in enumerate(1e-6 * np.eye(11)):
+            slope = (pixels_of(step) - pixels_of(-step)) / 2e-6
+            np.testing.assert_allclose(part[:, i], slope, atol=1e-5 * max(1, np.abs(slope).max()))
+
+
+@pytest.mark.parametrize("n_repeats", [1, 3])
+def test_a_step_solves_the_least_squares_problem_in_lens_and_poses(n_repeats):
+    """By all columns at once; the values of the rig are rows of their own."""
+    problem, values, _, rows = small_problem(n_repeats)
+    free = problem.std > 0
+    errors = np.concatenate([part[:, -1] for part in rows])
+    variance = n_repeats * np.mean(errors**2)
+    assert problem._variance(rows) == pytest.approx(variance)
+    offsets = 0.1 * np.ones(5)
+    wanted_cost = len(errors) / n_repeats * np.log(variance) + offsets @ offsets
+    assert problem._cost(rows, values) == pytest.approx(wanted_cost)
+    matrix = np.zeros((len(errors) + 5, 5 + 18))
+    matrix[: len(errors), :5] = np.concatenate([part[:, :5] for part in rows])
+    matrix[: len(errors), 5:] = block_diag(*(part[:, 5:-1] for part in rows))
+    matrix[: len(errors)] /= np.sqrt(variance)
+    matrix[len(errors) :, :5] = np.diag(1 / problem.std[free])
+    right = np.concatenate([errors / np.sqrt(variance), -offsets])
+    step = problem._step(rows, values, 0.0)
+    np.testing.assert_array_equal(step[~free], 0)
+    np.testing.assert_allclose(step[free], np.linalg.lstsq(matrix, right, rcond=None)[0][:5], rtol=1e-3)
+    normal, _, scale = problem._normal_equations(rows, values)
+    wanted = np.linalg.inv(matrix.T @ matrix)[:5, :5]
+    np.testing.assert_allclose(np.linalg.inv(normal) / np.outer(scale, scale), wanted, rtol=1e-3)
+    # Much damping makes the steps small, along the gradient of the scaled values.
+    assert np.linalg.norm(problem._step(rows, values, 1e3) * free) < 0.01 * np.linalg.norm(step)
+
+
+def test_exact_images_have_a_smallest_variance():
+    problem, *_ = small_problem(2)
+    assert problem._variance([np.zeros((8, 12))] * 3) == pytest.approx(2 * 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("relative_std", "is_determined"), [((0.09, 0.09), True), ((0.11, 0.09), False), ((0.09, 0.11), False)]
+)
+def test_without_closed_forms_the_best_start_has_to_determine_the_focal_lengths(
+    monkeypatch, relative_std, is_determined
+):
+    """The starts are multiples of the larger side, with the centre in the middle."""
+    starts = []
+
+    def fit(views, lens, values, std, *, repeats_errors):
+        starts.append(values)
+        cost = abs(values[0] - 1800)
+        return lens_fit.LensFit(values, [], cost, np.pad(relative_std * values[:2], (0, 7)))
+
+    monkeypatch.setattr(lens_fit, "fit_lens", fit)
+    monkeypatch.setattr(lens_fit, "intrinsics_candidates", lambda *_: [])
+    camera, std = without_focal_lengths("pinhole")
+    for one in (camera, replace(camera, width=960, height=1280)):
+        starts.clear()
+        if is_determined:
+            found = fit_unknown_lens([], one, std, repeats_errors=False)
+            np.testing.assert_allclose(found.values[:2], 1.4 * 1280)
+        else:
+            with pytest.raises(NotObservableError, match="do not determine its focal length"):
+                fit_unknown_lens([], one, std, repeats_errors=False)
+        wanted = [
+            [1280 * each, 1280 * each, *one.image_centre, *np.zeros(5)] for each in lens_fit._FOCAL_LENGTHS
+        ]
+        np.testing.assert_allclose(starts, wanted)
+    # A closed form determines the focal lengths itself.
+    monkeypatch.setattr(lens_fit, "intrinsics_candidates", lambda *_: [(900.0, 910.0, 600.0, 500.0)])
+    found = fit_unknown_lens([], camera, std, repeats_errors=False)
+    np.testing.assert_array_equal(found.values, [900, 910, 600, 500, 0, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(("intrinsics", "n_fitted"), [("prior", 60), ("fixed", 62)])
+def test_a_lens_is_fitted_to_some_of_many_images_that_have_a_pose(monkeypatch, intrinsics, n_fitted):
+    calls = []
+
+    def fit(views, lens, values, std, *, repeats_errors=False):
+        calls.append((len(views), bool(std.any())))
+        return lens_fit.LensFit(values, [[]] * len(views), 0.0, std)
+
+    monkeypatch.setattr(lens_fit, "fit_lens", fit)
+    camera = Camera("c", "world", 1280, 960, TRUE["pinhole"], intrinsics=intrinsics)
+    views = [(CHECKERBOARD, CHECKERBOARD[:, :2])] * 61 + [(CHECKERBOARD[:3], CHECKERBOARD[:3, :2])]
+    assert len(fit_camera(views, camera).poses) == 62
+    assert calls[0] == (n_fitted, intrinsics == "prior")
+    assert calls[1:] == ([(62, False)] if intrinsics == "prior" else [])
+    calls.clear()
+    fit_camera(views[1:], camera)
+    assert calls == [(61, intrinsics == "prior")]
+
+
+def test_views_that_count_as_one_determine_a_lens_as_one_does():
+    """The standard deviations are those of all views times the root of their number."""
+    _, views = images(np.random.default_rng(8), "pinhole", count=6)
+    values, std = stated_lens("pinhole", "free")
+    fits = [
+        fit_lens(views, LENSES["pinhole"], values, std, repeats_errors=repeats) for repeats in (False, True)
+    ]
+    np.testing.assert_allclose(fits[1].std[:4] / fits[0].std[:4], np.sqrt(6), rtol=0.05)

@@ -12,9 +12,15 @@ from robots import URDF
 
 import dhcal_pin as dh
 from dhcal_pin import se3
-from dhcal_pin.cameras import Board, Camera, Rig
+from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.cli.main import main
-from dhcal_pin.io.camera_files import camera_files, camera_frames, opencv_text
+from dhcal_pin.io.camera_files import (
+    camera_files,
+    camera_frames,
+    camera_info_text,
+    hand_eye_text,
+    opencv_text,
+)
 from dhcal_pin.measurements import mount_rig
 from dhcal_pin.robot.urdf import read_urdf
 
@@ -145,3 +151,52 @@ def test_camera_in_urdf_and_sidecar(tmp_path, monkeypatch):
     assert sidecar["board"]["target"]["link"] == "tip"
     assert main(["validate", "o.urdf", "other.csv", "--rig", "other.rig.toml", "--json", "v.json"]) == 0
     assert yaml.safe_load(Path("v.json").read_text())["after"]["residual_rms"] < 0.2
+
+
+def test_each_camera_of_several_has_its_own_name_and_files():
+    arm, _, (frame,) = frames_on("tip")
+    assert frame.name == "eye"
+    rig = mount_rig(
+        Rig({"left": replace(CAMERA, name="left"), "right": replace(CAMERA, name="right", link="world")},
+            {"b": Board("b", "world", "checkerboard", columns=5, rows=4, square=0.04, pose=np.eye(4))}),
+        arm,
+    )  # fmt: skip
+    assert [each.name for each in camera_frames(rig, arm, "eye")] == ["eye_left", "eye_right"]
+    left, right = camera_frames(rig, arm, None)
+    assert (left.name, right.name) == ("left", "right")
+    assert (left.moves, left.parent, left.base, left.effector) == (True, "tool0", "world", "tool0")
+    assert (right.moves, right.parent, right.base, right.effector) == (False, "world", "world", "tool0")
+    endings = ["camera_info", "opencv", "handeye"]
+    assert [*camera_files(left, "out")] == [f"out.{ending}.yaml" for ending in endings]
+
+
+@pytest.mark.parametrize(("model", "name"), [("pinhole", "plumb_bob"), ("fisheye", "equidistant")])
+def test_ros_matrices_have_their_sizes(model, name):
+    values = VALUES[: 4 + len(LENSES[model].coefficients)]
+    info = yaml.safe_load(camera_info_text(replace(CAMERA, lens=LENSES[model], values=values)))
+    assert (info["camera_name"], info["distortion_model"]) == ("wrist", name)
+    data = {
+        "camera_matrix": [[640.5, 0, 639.5], [0, 641.25, 359.5], [0, 0, 1]],
+        "distortion_coefficients": [values[4:].tolist()],
+        "rectification_matrix": np.eye(3).tolist(),
+        "projection_matrix": [[640.5, 0, 639.5, 0], [0, 641.25, 359.5, 0], [0, 0, 1, 0]],
+    }
+    for key, rows in data.items():
+        matrix = info[key]
+        assert (matrix["rows"], matrix["cols"]) == (len(rows), len(rows[0]))
+        assert matrix["data"] == np.ravel(rows).tolist()
+
+
+def test_matrices_of_opencv_have_their_sizes():
+    lines = opencv_text(CAMERA).splitlines()
+    assert lines[:4] == ["%YAML:1.0", "---", "image_width: 1280", "image_height: 720"]
+    assert [line for line in lines if "rows" in line or "cols" in line] == [
+        "   rows: 3", "   cols: 3", "   rows: 1", "   cols: 5"
+    ]  # fmt: skip
+    assert "   data: [640.5, 0.0, 639.5, 0.0, 641.25, 359.5, 0.0, 0.0, 1.0]" in lines
+
+
+@pytest.mark.parametrize("std", [None, np.inf, np.nan])
+def test_a_standard_deviation_that_is_not_known_is_left_out(std):
+    _, _, (frame,) = frames_on("tip")
+    assert hand_eye_text(frame, std).startswith("parameters:\n  namespace: ")

@@ -1,6 +1,8 @@
 """Servo files: LeRobot's calibration against its formula, TOML, corrected zeros, and errors."""
 
 import json
+import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from servo_arms import RANGES, lerobot_degrees, lerobot_text
 from dhcal_pin.cli.servo_zeros import describe_moves
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import read_servos
+from dhcal_pin.io.servo_file import Servo, ServoFile
 
 
 def written(tmp_path, name, text):
@@ -161,3 +164,140 @@ def test_errors_name_file_motor_and_what_is_expected(tmp_path, name, text, words
     message = str(caught.value)
     assert all(word in message for word in words), message
     assert "\n" not in message
+
+
+def test_a_motor_has_the_usual_values_unless_others_are_stated(tmp_path):
+    servos = read_servos(written(tmp_path, "arm.toml", "[motor.pan]\n"))
+    assert servos.servos == (Servo("pan", "pan", 2048.0, 4096.0, 4096, 1, None),)
+    assert servos.make == "feetech"
+    assert servos.servos[0].homing_offset == 0
+    assert servos.of_column("lift") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("id = 255", 256),
+        ("id = 0", -1),
+        ("resolution = 2", 1),
+        ("resolution = 16777216", 16777217),
+        ("counts_per_turn = 1", 0.9),
+        ("counts_per_turn = 16777216", 16777217),
+        ("zero = 2147483648", 2147483649),
+        ("zero = -2147483648", -2147483649),
+        ("sign = -1", "true"),
+        ("sign = 1", 0),
+    ],
+)
+def test_limits_of_the_values_of_a_motor(tmp_path, text, number):
+    key, value = text.split(" = ")
+    (servo,) = read_servos(written(tmp_path, "arm.toml", f"[motor.a]\n{text}\n")).servos
+    assert getattr(servo, key) == float(value)
+    with pytest.raises(DhcalError, match=rf"\[motor.a\]: {key} = "):
+        read_servos(written(tmp_path, "arm.toml", f"[motor.a]\n{key} = {number}\n"))
+
+
+def test_a_column_has_the_name_of_a_joint_rather_than_of_a_motor(tmp_path):
+    text = '[motor.a]\njoint = "b"\n[motor.b]\njoint = "a"\n[motor.c]\njoint = "d"\n'
+    servos = read_servos(written(tmp_path, "arm.toml", text))
+    assert [servo_of(servos, name).name for name in ("a", "b", "c", "d")] == ["b", "a", "c", "c"]
+
+
+def test_joints_and_resolutions_are_added_to_a_calibration_of_lerobot(tmp_path):
+    (tmp_path / "sub").mkdir()
+    written(tmp_path, "sub/so101.JSON", lerobot_text())
+    text = 'lerobot = "sub/so101.JSON"\nresolution = 1024\nmake = "dynamixel"\n'
+    text += '[motor.gripper]\njoint = "jaw"\nresolution = 2048\n'
+    servos = read_servos(written(tmp_path, "arm.toml", text))
+    assert servos.make == "dynamixel"
+    pan, jaw = servo_of(servos, "shoulder_pan"), servo_of(servos, "jaw")
+    assert pan == Servo("shoulder_pan", "shoulder_pan", (741 + 3465) / 2, 1023.0, 1024, 1, 1, -250)
+    assert jaw == Servo("gripper", "jaw", (2030 + 3500) / 2, 2047.0, 2048, 1, 6, 250)
+    plain = read_servos(tmp_path / "sub" / "so101.JSON")
+    assert servo_of(plain, "gripper").counts_per_turn == 4095
+    assert plain.lerobot == plain.path == str(tmp_path / "sub" / "so101.JSON")
+
+
+@pytest.mark.parametrize(
+    ("value", "is_valid"), [("2147483647", True), ("2147483648", False), ("true", False)]
+)
+@pytest.mark.parametrize("key", ["id", "drive_mode", "homing_offset", "range_max"])
+def test_integers_of_lerobot_fit_into_a_register(tmp_path, key, value, is_valid):
+    motor = {
+        "id": 1,
+        "drive_mode": 0,
+        "homing_offset": 0,
+        "range_min": 0,
+        "range_max": 4095,
+        key: json.loads(value),
+    }
+    path = written(tmp_path, "arm.json", json.dumps({"a": motor}))
+    if is_valid:
+        assert read_servos(path).servos[0].name == "a"
+    else:
+        with pytest.raises(DhcalError, match=f"motor 'a': {key} is not an integer"):
+            read_servos(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "before", "counts", "wanted", "after"),
+    [
+        ("feetech", 100, 30, 30, 70),
+        ("feetech", 2000, -47, -47, 2047),
+        ("feetech", -2000, 47, 47, -2047),
+        # 2048 and -2048 are the same place, which the register cannot hold: one count less.
+        ("feetech", 2000, -48, -49, -2047),
+        ("feetech", -2047, 1, 0, -2047),
+        ("feetech", 2000, -49, -49, -2047),
+        ("feetech", -2000, 49, 49, 2047),
+        # What the file has stays if nothing moves.
+        ("feetech", 2100, 0, 0, 2100),
+        ("feetech", -2048, 0, 0, -2048),
+        ("dynamixel", 2000, 100, 100, 2100),
+        ("dynamixel", -2000, -48, -48, -2048),
+    ],
+)
+def test_moved_zeros_and_homing_offsets(make, before, counts, wanted, after):
+    servo = Servo("m", "j", 2000.0, 4095.0, 4096, -1, 1, before)
+    step = -2 * np.pi / 4095
+    assert servo.step == pytest.approx(step)
+    corrected, moved = ServoFile("f", (servo,), make=make).with_zeros_moved({"j": (counts + 0.4) * step})
+    assert corrected.servos[0] == replace(servo, zero=2000.0 - wanted, homing_offset=after)
+    assert moved == {"j": pytest.approx(wanted * step)}
+
+
+def test_homing_offsets_that_lerobot_would_write_elsewhere_are_not_written(tmp_path):
+    motor = (
+        '{"a": {"id": 1, "drive_mode": 0, "more": {}, "homing_offset": 3, "range_min": 0, "range_max": 9}}'
+    )
+    servos = read_servos(written(tmp_path, "arm.json", motor))
+    assert servos.lerobot_content() == motor
+    moved, _ = servos.with_zeros_moved({"a": 0.5})
+    with pytest.raises(
+        DhcalError, match=r"arm\.json: homing offsets were not found; write it as LeRobot does"
+    ):
+        moved.lerobot_content()
+
+
+def test_a_joint_that_a_robot_does_not_have_is_named_with_the_remedy():
+    servo = Servo("m", "j", 0.0, 4096.0, 4096, 1, None)
+    servos = ServoFile("arm.toml", (servo,))
+    servos.require_joint(servo, ["i", "j"], "arm.urdf")
+    with pytest.raises(DhcalError) as caught:
+        servos.require_joint(servo, ["i", "k"], "arm.urdf")
+    assert str(caught.value) == (
+        "arm.toml: motor 'm' moves joint 'j', which arm.urdf does not have; write joint = NAME in [motor.m] "
+        "of a TOML servo file; the joints are i, k"
+    )
+
+
+def test_files_for_drivers_have_the_numbers_of_the_bus_if_they_are_known():
+    servos = (Servo("a", "j", 1024.6, 2048.0, 4096, -1, 7), Servo("b", "k", 2048.0, 4096.0, 4096, 1, None))
+    parameters = yaml.safe_load(ServoFile("f", servos).ros2_control_content())
+    offset = pytest.approx((1024.6 - 2048) * np.pi / 2048)
+    first = {"id": 7, "offset": offset, "gear_ratio": -0.5, "offset_counts": 1025, "resolution": 4096}
+    second = {"offset": 0.0, "gear_ratio": 1.0, "offset_counts": 2048, "resolution": 4096}
+    assert parameters == {"j": first, "k": second}
+    motors = tomllib.loads(ServoFile("f", servos).toml_content())["motor"]
+    assert (motors["a"]["id"], motors["a"]["sign"], motors["a"]["zero"]) == (7, -1, 1024.6)
+    assert "id" not in motors["b"]

@@ -23,7 +23,7 @@ from dhcal_pin.io import (
 from dhcal_pin.measurements import Noise, Position
 from dhcal_pin.measurements.base import concatenate
 from dhcal_pin.robot import Chain, Conditions
-from dhcal_pin.robot.conditions import directions_in_order
+from dhcal_pin.robot.conditions import CONDITIONS, concatenate_conditions, directions_in_order
 
 # Arms of the slow tests, and their tips.
 TIPS = {"ur10": "tool0", "panda": "panda_hand", "ur5": "tool0"}
@@ -436,3 +436,132 @@ def test_simulate_draws_the_conditions_that_the_robot_depends_on(
     assert main(["calibrate", robot, "data.csv", "--tip", "tool0", "-o", "out.urdf", "--json", "r.json"]) == 0
     assert family in json.loads((tmp_path / "r.json").read_text())["extension"]["families"]
     capsys.readouterr()
+
+
+# --- the table of conditions -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("time", "time[s]"),
+        ("approach", "approach_JOINT"),
+        ("temperature", "temperature[degC]"),
+        ("payload", "payload[kg]"),
+    ],
+)
+def test_headers_of_conditions(name, header):
+    assert CONDITIONS[name].header == header
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "wanted"),
+    [
+        ("time", [-1e9, 2.0, 2.0, 1e12], None),
+        (
+            "time",
+            [3.0, 5.0, 4.0, 1.0],
+            (2, "is earlier than the row before; expected rows in the order of time"),
+        ),
+        ("time", [np.nan, 1.0], (0, "nan is not plausible; expected a number from -inf to inf")),
+        ("approach", [-1, 0, 1], None),
+        ("approach", [1, -2, 3], (1, "-2 is not a direction; expected -1, 0 or 1")),
+        ("temperature", [-50.0, 150.0, 20.0], None),
+        ("temperature", [20, 150.1], (1, "150.1 is not plausible; expected a number from -50 to 150")),
+        ("temperature", [-50.1], (0, "-50.1 is not plausible; expected a number from -50 to 150")),
+        ("payload", [0.0, 1e5, 3.0], None),
+        ("payload", [1.0, 2.0, np.nan], (2, "nan is not plausible; expected a number from 0 to 100000")),
+    ],
+)
+def test_first_value_that_is_not_possible(name, values, wanted):
+    assert CONDITIONS[name].find_problem(np.array(values, float)) == wanted
+
+
+def test_drawn_conditions_are_possible_and_near_the_reference():
+    rng = np.random.default_rng(0)
+    found = {name: each.draw(rng, (500, 6), 31.0) for name, each in CONDITIONS.items() if each.draw}
+    assert set(found) == {"approach", "temperature"}
+    assert np.unique(found["approach"]).tolist() == [-1, 1]
+    assert found["approach"].shape == (500, 6)
+    assert found["temperature"].shape == (500,)
+    assert 21.0 <= found["temperature"].min() < 22.0
+    assert 40.0 < found["temperature"].max() <= 41.0
+
+
+def test_steps_of_conditions():
+    """Whole degrees, tens of grams and directions; a time is no condition of a model."""
+    q = np.zeros((2, 2))
+    known = {
+        "time": np.array([0.0, 1.0]),
+        "approach": np.array([[1.0, -1], [0, 1]]),
+        "temperature": np.array([20.4, 21.6]),
+        "payload": np.array([1.234, 0.004]),
+    }
+    wanted = [[1, -1, 20, 123], [0, 1, 22, 0]]
+    np.testing.assert_array_equal(Conditions(q, **known).steps, wanted)
+    assert Conditions(q, time=known["time"]).steps.shape == (2, 0)
+
+
+def all_conditions(m: int) -> Conditions:
+    """Return conditions of two joints of which everything is known."""
+    rows = np.arange(float(m))
+    poses = np.tile(np.eye(4), (m, 1, 1)) + rows[:, None, None]
+    return Conditions(
+        rows[:, None] * [1, 2],
+        rows,
+        10 * rows,
+        np.ones((m, 2)),
+        20 + rows,
+        0.1 * rows,
+        poses,
+        2 * poses,
+        rows[:, None] * [3, 4],
+        rows[:, None] * [5, 6, 7],
+    )
+
+
+def test_chosen_copied_and_joined_conditions_are_equal():
+    conditions = all_conditions(5)
+    names = {"order", "time", "approach", "temperature", "payload", "base_motion", "tool_motion", "zeros"}
+    assert conditions.names == names | {"growth"}
+    parts = [conditions[:2], conditions[np.array([2, 3, 4])]]
+    joined = concatenate_conditions(parts)
+    assert joined is not None
+    assert joined.equals(conditions)
+    copy = conditions.copy()
+    assert copy.equals(conditions)
+    copy.q[0, 0] += 1.0
+    assert not copy.equals(conditions)
+    assert not conditions.equals(conditions[:4])
+    assert not conditions.equals(Conditions(conditions.q))
+    assert not Conditions(conditions.q).equals(conditions)
+    assert concatenate_conditions([*parts, None]) is None
+    some = concatenate_conditions([Conditions(conditions.q, temperature=conditions.temperature), conditions])
+    assert some is not None
+    assert some.names == {"temperature"}
+    assert conditions.of_arm.names == names - {"base_motion", "tool_motion"} | {"growth"}
+    assert conditions.of_joints.names == {"approach", "temperature", "payload"}
+
+
+def test_conditions_at_other_positions():
+    """All samples of each configuration; from the second one on, the arm comes from another direction."""
+    conditions = all_conditions(3)
+    q = np.arange(18.0).reshape(9, 2)
+    moved = conditions.at(q)
+    np.testing.assert_array_equal(moved.q, q)
+    np.testing.assert_array_equal(moved.temperature, [20, 21, 22] * 3)
+    np.testing.assert_array_equal(moved.approach, [[1, 1]] * 3 + [[0, 0]] * 6)
+    np.testing.assert_array_equal(conditions.approach, 1.0)
+    same = conditions.at(q[:3])
+    np.testing.assert_array_equal(same.approach, 1.0)
+    np.testing.assert_array_equal(same.q, q[:3])
+    assert Conditions(conditions.q, temperature=conditions.temperature).at(q).approach is None
+    assert len(Conditions(np.empty((0, 2))).at(np.empty((0, 2))).q) == 0
+
+
+def test_motions_below_the_noise_of_an_encoder_are_none():
+    """A joint that has not moved yet has no direction; others keep theirs."""
+    q = np.array([[0.0, 0, 0], [0.5e-4, -2e-4, 0.3], [0.0, -2e-4, 0.29999], [0.2, -3.5e-4, 0.1]])
+    wanted = [[0, 0, 0], [0, -1, 1], [0, -1, 1], [1, -1, -1]]
+    np.testing.assert_array_equal(directions_in_order(q), wanted)
+    np.testing.assert_array_equal(directions_in_order(q[:1]), [[0, 0, 0]])

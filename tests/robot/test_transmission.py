@@ -18,9 +18,11 @@ from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_robot, write_urdf
 from dhcal_pin.measurements import Noise, Pose
 from dhcal_pin.robot import FAMILIES, Chain, Conditions, Payload, parse_urdf
+from dhcal_pin.robot.error_families import JOINT_TERMS, growing_links
 from dhcal_pin.robot.transmission import (
     MAX_CURVE_ORDER,
     Transmission,
+    coefficient_indices,
     fill_harmonics,
     harmonic_orders,
     n_coefficients,
@@ -456,3 +458,240 @@ def test_terms_are_those_of_the_given_conditions():
     transmission.terms(conditions := Conditions(q))
     q[:, 4] += 0.1
     np.testing.assert_array_equal(transmission.terms(conditions), transmission._terms(conditions))
+
+
+# --- the parts of a transmission --------------------------------------------------------------------
+
+GRAVITY = 9.81
+PENDULUM = """<robot name="r"><link name="base"/>
+  <link name="arm"><inertial><origin xyz="0 0 0.4"/><mass value="3"/>
+    <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link>
+  <joint name="swing" type="TYPE"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+    <limit lower="-7" upper="7" effort="1" velocity="1"/></joint>
+  <link name="tip"/><joint name="end" type="fixed"><parent link="arm"/><child link="tip"/>
+    <origin xyz="0 0 0.5"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("joint_type", ["revolute", "continuous"])
+def test_torques_of_a_pendulum(joint_type):
+    """The energy of a mass m at the height l·cos q has the slope -m·g·l·sin q."""
+    bare = Chain.from_urdf(parse_urdf(PENDULUM.replace("TYPE", joint_type).encode(), "p.urdf"))
+    carrying = bare.with_payload(Payload(2.0, (0.0, 0.0, 0.2)))
+    angles = np.array([[0.0, 0.5, -1.2, 3.0]])
+    unit = -GRAVITY * np.sin(angles)
+    payload = np.array([2.0, 0.0, 5.0, 1.0])
+    for _ in range(2):
+        np.testing.assert_allclose(bare.loads.torques(angles), 3 * 0.4 * unit, atol=1e-12)
+        np.testing.assert_allclose(carrying.loads.torques(angles), (1.2 + 1.4) * unit, atol=1e-12)
+        # Without a payload in the model, masses are at the tip.
+        found = bare.loads.torques(angles, payload)
+        np.testing.assert_allclose(found, (1.2 + 0.5 * payload) * unit, atol=1e-12)
+        found = carrying.loads.torques(angles, payload)
+        np.testing.assert_allclose(found, (1.2 + 0.7 * payload) * unit, atol=1e-12)
+        np.testing.assert_allclose(carrying.loads.torques_per_kilogram(angles), 0.7 * unit, atol=1e-12)
+    assert Payload(1.0).centre == (0.0, 0.0, 0.0)
+
+
+def test_few_torques_are_kept(monkeypatch):
+    monkeypatch.setattr("dhcal_pin.robot.transmission.MAX_CACHED_TORQUES", 2)
+    loads = Chain.from_urdf(parse_urdf(PENDULUM.replace("TYPE", "revolute").encode(), "p.urdf")).loads
+    first, second, third = np.arange(12.0).reshape(3, 1, 4)
+    kept = loads.torques(first)
+    loads.torques(second)
+    assert loads.torques(first.copy()) is kept
+    wanted = loads.torques(third)
+    assert loads.torques(first) is not kept
+    assert loads.torques(third) is wanted
+
+
+def test_each_coefficient_moves_its_joint_or_link_by_its_term():
+    """Of all families and orders: a joint by term and joint of the term, a link by a term of the sample."""
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(0)
+    conditions = random_conditions(arm, 3, rng)
+    n, entries = arm.n_joints, np.arange(n_coefficients(6, 6))
+    zero = Transmission.zero(arm.loads).evaluating(entries)
+    terms = zero.terms(conditions)
+    assert len(terms) == 1 + 2 * MAX_CURVE_ORDER + 2 + 1
+    for entry, motion, term, joint in zip(entries, *zero.locate(entries), strict=True):
+        moved = zero.with_coefficients_added(np.array([entry]), np.array([2.0]))
+        assert not moved.is_zero
+        wanted, grown = np.zeros((n, 3)), np.zeros((7, 3))
+        (wanted if motion < n else grown)[motion - n * (motion >= n)] = 2 * terms[term, joint]
+        np.testing.assert_array_equal(moved.errors(terms), wanted)
+        np.testing.assert_array_equal(moved.growth(terms), grown)
+    assert zero.is_zero
+    assert not zero.errors(terms).any()
+    # The places and terms of some coefficients, by their meaning.
+    parts = coefficient_indices(6, 6)
+    terms_of = {
+        parts.linear[2, 4]: (2, 0, 4),
+        parts.linear[5, 5]: (5, 0, 5),
+        parts.harmonics[0, 0, 0]: (0, 1, 0),
+        parts.harmonics[6, 1, 3]: (3, 14, 3),
+        parts.harmonics[63, 1, 5]: (5, 128, 5),
+        parts.joint_terms[0, 1]: (1, 129, 1),
+        parts.joint_terms[1, 5]: (5, 130, 5),
+        parts.link_terms[0, 0]: (6, 131, 0),
+        parts.link_terms[0, 6]: (12, 131, 0),
+    }
+    found = np.transpose(zero.locate(np.array([*terms_of])))
+    np.testing.assert_array_equal(found, [*terms_of.values()])
+    # With fewer orders, the terms after the harmonics come earlier.
+    few = np.transpose(replace(zero, min_order=2).locate(np.array([*terms_of][5:])))
+    np.testing.assert_array_equal(few[:, 1], [5, 6, 7, 7])
+
+
+def test_terms_are_those_of_the_formula():
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(1)
+    conditions = random_conditions(arm, 4, rng)
+    assert conditions.approach is not None
+    assert conditions.temperature is not None
+    q = conditions.q.T
+    terms = replace(Transmission.zero(arm.loads), min_order=2).terms(conditions)
+    torques = arm.loads.torques(q, conditions.payload)
+    rise = np.tile(conditions.temperature - arm.reference_temperature, (6, 1))
+    wanted = [
+        q,
+        np.sin(q),
+        np.cos(q),
+        np.sin(2 * q),
+        np.cos(2 * q),
+        torques,
+        -conditions.approach.T / 2,
+        rise,
+    ]
+    np.testing.assert_allclose(terms, wanted, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("order", "min_order", "wanted"), [(0, 0, 0), (1, 0, 1), (5, 2, 5), (5, 9, 9), (0, 3, 3)]
+)
+def test_order_is_the_highest_one_in_use(order, min_order, wanted):
+    transmission = replace(Transmission.zero(nominal_arm("ur10").loads), min_order=min_order)
+    parts = coefficient_indices(6, 6)
+    if order:
+        transmission.harmonics[order - 1, order % 2, 4] = 1e-3
+    assert transmission.order == wanted
+    same = transmission.evaluating(parts.harmonics[:wanted].ravel()) if wanted else transmission
+    assert same is transmission
+    assert transmission.evaluating(parts.harmonics[wanted, 1, :1]).order == wanted + 1
+    assert transmission.evaluating(parts.joint_terms.ravel()) is transmission
+    assert transmission.evaluating(np.zeros(0, int)) is transmission
+
+
+def test_compliance_is_the_joint_term_of_gravity():
+    transmission, parts = Transmission.zero(nominal_arm("ur10").loads), coefficient_indices(6, 6)
+    assert not transmission.has_compliance
+    row = [*JOINT_TERMS].index("compliance")
+    soft = transmission.with_coefficients_added(parts.joint_terms[row], 1e-4 * np.arange(6))
+    np.testing.assert_array_equal(soft.compliance, 1e-4 * np.arange(6))
+    assert soft.has_compliance
+    other = transmission.with_coefficients_added(parts.joint_terms[1 - row], 1e-4 * np.arange(6))
+    assert not other.has_compliance
+
+
+def test_families_list_their_coefficients_with_name_unit_and_formula():
+    arm = Chain.from_dh(replace(random_table(np.random.default_rng(0), size=3), prismatic=np.arange(3) == 1))
+    parts = coefficient_indices(3, 3)
+    found = {
+        name: [each[1:] for each in family.coefficients(arm, parts)] for name, family in FAMILIES.items()
+    }
+    assert found["gain"] == [(i, "gain", "1", f"q[{i}]") for i in range(3)]
+    assert found["harmonics"][:4] == [
+        (0, "sin1", "rad", "sin(1 * q[0])"),
+        (0, "cos1", "rad", "cos(1 * q[0])"),
+        (0, "sin2", "rad", "sin(2 * q[0])"),
+        (0, "cos2", "rad", "cos(2 * q[0])"),
+    ]
+    assert [each[0] for each in found["harmonics"]] == [0, 0, 0, 0, 2, 2, 2, 2]
+    for name, first, last in (("curves", 3, 32), ("fine-curves", 33, 64)):
+        assert found[name][0] == (0, f"sin{first}", "rad", f"sin({first} * q[0])")
+        assert found[name][-1] == (2, f"cos{last}", "rad", f"cos({last} * q[2])")
+        assert FAMILIES[name].is_curve
+    assert found["coupling"] == [
+        (0, "j2", "rad/m", "q[1]"),
+        (0, "j3", "rad/rad", "q[2]"),
+        (2, "j1", "rad/rad", "q[0]"),
+        (2, "j2", "rad/m", "q[1]"),
+    ]
+    assert found["compliance"] == [(i, "compliance", "rad/Nm", f"torque[{i}]") for i in (0, 2)]
+    assert found["backlash"] == [(i, "backlash", "rad", f"-0.5 * approach[{i}]") for i in (0, 2)]
+    formula = "temperature - reference_temperature"
+    assert found["thermal"] == [(i, "thermal", "1/K", formula) for i in range(4)]
+    assert [name for name, family in FAMILIES.items() if family.is_curve] == ["curves", "fine-curves"]
+    # Each coefficient is at the place of its part.
+    for name, wanted in (
+        ("gain", np.diag(parts.linear)),
+        ("coupling", parts.linear[[0, 0, 2, 2], [1, 2, 0, 1]]),
+        ("harmonics", parts.harmonics[:2, :, [0, 2]].transpose(2, 0, 1).ravel()),
+        ("backlash", parts.joint_terms[[*JOINT_TERMS].index("backlash"), [0, 2]]),
+        ("thermal", parts.link_terms[0]),
+    ):
+        assert [each.entry for each in FAMILIES[name].coefficients(arm, parts)] == wanted.tolist()
+
+
+@pytest.mark.parametrize(("mass", "is_loaded"), [(0.02, False), (0.04, True)])
+def test_a_joint_is_compliant_under_a_tenth_of_a_newton_metre(mass, is_loaded):
+    """A mass at 0.4 m from the axis: 0.078 and 0.157 Nm."""
+    text = PENDULUM.replace("TYPE", "revolute").replace('mass value="3"', f'mass value="{mass}"')
+    arm = Chain.from_urdf(parse_urdf(text.encode(), "p.urdf"))
+    term = FAMILIES["compliance"].joint_term
+    assert term is not None
+    np.testing.assert_array_equal(term.has_effect(arm.loads), [is_loaded])
+
+
+def test_links_longer_than_a_millimetre_grow():
+    vectors = np.array([[0, 0, 0], [0.8e-3, 0, 0], [0.8e-3, 0, -0.8e-3], [0, -0.3, 0]])
+    np.testing.assert_array_equal(growing_links(vectors), [False, False, True, True])
+
+
+def test_unknown_conditions_have_no_effect():
+    arm = nominal_arm("ur10")
+    terms = Transmission.zero(arm.loads).terms(Conditions(np.ones((2, 6))))
+    np.testing.assert_array_equal(terms[2:], 0.0)
+
+
+def test_a_follower_stands_at_its_multiple_and_offset():
+    """It turns by 0.1 - 2·q. A mass at 0.2 m from it is 0.3·cos q + 0.2·cos(0.1 - q) high."""
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    inertial = f'<inertial><origin xyz="0 0 .2"/><mass value="2"/>{inertia}</inertial>'
+    text = MIMIC.replace('<link name="b"/>', f'<link name="b">{inertial}</link>')
+    loads = Chain.from_urdf(parse_urdf(text.encode(), "mimic.urdf")).loads
+    q = np.array([[0.3, -0.7, 1.1]])
+    assert loads.n_joints == 1
+    np.testing.assert_allclose(loads.configurations(q), np.transpose([q[0], 0.1 - 2 * q[0]]), atol=1e-15)
+    wanted = 2 * GRAVITY * (0.2 * np.sin(0.1 - q) - 0.3 * np.sin(q))
+    np.testing.assert_allclose(loads.torques(q), wanted, atol=1e-12)
+
+
+def test_families_are_tried_in_the_order_of_their_stages():
+    """Physical causes first, then families that could imitate others, then curves of growing order."""
+    stages: dict[int, set[str]] = {}
+    for name, family in FAMILIES.items():
+        stages.setdefault(family.rule.stage, set()).add(name)
+    wanted = [
+        {"harmonics", "compliance", "backlash", "thermal"}, {"gain", "coupling"}, {"curves"}, {"fine-curves"}
+    ]  # fmt: skip
+    assert [names for _, names in sorted(stages.items())] == wanted
+    universal = {name for name, family in FAMILIES.items() if family.rule.is_universal}
+    assert universal == {"harmonics", "compliance"}
+    # Universal families need no improvement; all others have to improve the error by a part of it.
+    needed = {name: family.rule.min_improvement for name, family in FAMILIES.items()}
+    assert {name for name, improvement in needed.items() if improvement == 0.0} == universal
+    assert max(needed.values()) < 1.0
+    assert {name: family.condition for name, family in FAMILIES.items() if family.condition} == {
+        "backlash": "approach",
+        "thermal": "temperature",
+    }
+
+
+def test_terms_that_were_used_last_are_kept(monkeypatch):
+    monkeypatch.setattr("dhcal_pin.robot.transmission._MAX_CACHED_TERMS", 2)
+    transmission = Transmission.zero(nominal_arm("ur10").loads)
+    first, second, third = (Conditions(np.full((2, 6), value)) for value in (0.1, 0.2, 0.3))
+    kept = [transmission.terms(each) for each in (first, second)]
+    assert transmission.terms(first) is kept[0]
+    newest = transmission.terms(third)
+    assert transmission.terms(first) is kept[0]
+    assert transmission.terms(third) is newest
+    assert transmission.terms(second) is not kept[1]
