@@ -1,6 +1,7 @@
 """Gate of images: whether the arm is estimated, at which temperature, and what the stages say."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,16 +9,18 @@ import pytest
 from camera_setups import ARMS, placement_fit, simulate, wrong_arm
 
 from dhcal_pin import select_parameters
-from dhcal_pin.calibration.cameras import gate
+from dhcal_pin.calibration.cameras import gate, jitter, joint_errors
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
 from dhcal_pin.calibration.cameras.gate import (
     Gate,
+    GatedFit,
     apply_gate,
     cluster_folds,
     judge_stages,
     judge_target_points,
     without_arm,
 )
+from dhcal_pin.calibration.cameras.jitter import Jitter, estimate_jitter
 from dhcal_pin.calibration.cameras.stages import (
     ImageError,
     Stage,
@@ -25,6 +28,7 @@ from dhcal_pin.calibration.cameras.stages import (
     held_out_error,
 )
 from dhcal_pin.calibration.cameras.target_points import TargetPoints, judged_boards
+from dhcal_pin.calibration.model_selection import FamilyTrial
 from dhcal_pin.calibration.partition import k_fold
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import Board
@@ -45,6 +49,11 @@ def right() -> Fit:
 def wrong() -> Fit:
     """Twelve images of an arm that is wrong by 3 mm."""
     return placement_fit(3e-3, 12, 0)
+
+
+@pytest.fixture(scope="module")
+def displaced(wrong) -> GatedFit:
+    return apply_gate(wrong, (), 40, INDUSTRIAL)
 
 
 KEPT = "The nominal arm is kept, as the images do not show that the arm is wrong:"
@@ -90,8 +99,8 @@ def test_noise_explains_images_of_a_right_arm(right):
     assert gated.gate.n_configurations == 12
 
 
-def test_images_of_a_wrong_arm_open_the_gate(wrong):
-    gated = apply_gate(wrong, (), 40, INDUSTRIAL)
+def test_images_of_a_wrong_arm_open_the_gate(displaced):
+    gated = displaced
     assert gated.gate.is_open
     assert not gated.gate.is_right
     assert len(gated.fit.problem.errors.parameters) == 36
@@ -267,7 +276,7 @@ def test_stages_free_the_lens_before_the_corners_and_the_arm(has_free_points):
     )
 
 
-def test_a_trial_of_corners_states_why_they_are_estimated_or_held(wrong):
+def test_a_trial_of_corners_states_why_they_are_estimated_or_held(wrong, displaced):
     judged = TargetPoints(wrong, 0.89, 0.5)
     assert judged.is_kept
     assert judged.sentence == (
@@ -278,8 +287,7 @@ def test_a_trial_of_corners_states_why_they_are_estimated_or_held(wrong):
         assert not held.is_kept
         assert held.sentence.startswith("The corners are kept as stated: ")
         assert held.sentence.endswith(", not both below 90 %.")
-    gated: Any = apply_gate(wrong, (), 40, INDUSTRIAL)
-    (stage,) = [each for each in judge_stages(wrong, gated, judged, 40) if each.name == "target points"]
+    (stage,) = [each for each in judge_stages(wrong, displaced, judged, 40) if each.name == "target points"]
     assert stage.reason == judged.sentence
 
 
@@ -337,3 +345,168 @@ def test_the_document_of_a_stage_has_its_errors():
         "by_image": None,
         "by_region": {"residual_rms_px": 2.0, "board_rms_m": 2e-4, "corners": 9},
     }  # fmt: skip
+
+
+TRIALS = tuple(FamilyTrial(name, 1.0, 0.5, 20.0, 1.0, True) for name in ("compliance", "gain"))
+
+
+@pytest.mark.parametrize(
+    ("families", "changes"),
+    [
+        (["harmonics"], {}),
+        ([], {}),
+        (["compliance"], {"displaced": None}),
+        (["compliance"], {"is_right": True}),
+        (["compliance"], {"n_configurations": joint_errors.MIN_CONFIGURATIONS - 1}),
+        (["compliance"], {"has_others": True}),
+    ],
+)
+def test_joint_errors_need_images_that_share_displacements(monkeypatch, displaced, families, changes):
+    monkeypatch.setattr(joint_errors, "select_families", lambda *_: pytest.fail("families are tried"))
+    gated = replace(displaced, gate=replace(displaced.gate, n_configurations=joint_errors.MIN_CONFIGURATIONS))
+    if "displaced" in changes:
+        gated = replace(gated, displaced=None)
+    elif "has_others" in changes:
+        fit = displaced.displaced
+        assert fit is not None
+        data = *fit.problem.data, Pose(np.zeros((1, 6)), np.eye(4)[None])
+        gated = replace(gated, displaced=replace(fit, problem=replace(fit.problem, data=data)))
+    else:
+        gated = replace(gated, gate=replace(gated.gate, **changes))
+    same, extension = joint_errors.add_joint_errors(gated, families, 40)
+    assert same is gated
+    assert extension.trials == ()
+    assert extension.temperature == gated.gate.temperature
+    assert extension.n_configurations == gated.gate.n_configurations
+
+
+@pytest.mark.parametrize(
+    ("was_open", "before", "after", "nominal", "temperature", "is_added"),
+    [
+        (True, 2.0, 2.0, 9.0, 1.6, True),
+        (True, 2.0, 2.01, 9.0, 1.6, False),
+        # A closed gate opens if the images determine the arm with the joint errors.
+        (False, 2.0, 1.0, 4.1, 1.6, True),
+        (False, 2.0, 1.0, 4.0, 1.6, False),
+        (False, 2.0, 1.0, 2.1, 1.0, True),
+        (False, 2.0, 1.0, 2.0, 1.0, False),
+        (False, 2.0, 2.1, 9.0, 1.6, False),
+        (False, 2.0, 1.0, None, 1.6, False),
+    ],
+)
+def test_joint_errors_are_added_if_they_predict_left_out_regions(
+    monkeypatch, displaced, was_open, before, after, nominal, temperature, is_added
+):
+    n = joint_errors.MIN_CONFIGURATIONS
+    gate_before = replace(displaced.gate, n_configurations=n, ratio=0.1 if was_open else 0.9)
+    gated = replace(displaced, gate=gate_before)
+    fit = displaced.displaced
+    assert fit is not None
+    opened, without = replace(fit, stage="opened"), replace(fit, stage="without")
+    errors = {gated.with_arm.stage: before, "opened": after, "without": nominal}
+    patches: dict[str, Any] = {
+        "select_families": lambda *_: (TRIALS, SimpleNamespace(widths=()), 0.7, ["compliance", "gain"]),
+        "with_selected": lambda start, *_: (start.problem, start.solution.x, None),
+        "prior_weights": lambda problem, *_: problem.weights,
+        "minimize": lambda *_, **__: fit.solution,
+        "open_fit": lambda *_: (opened, temperature),
+        "without_arm": lambda *_: without,
+        "held_out_error": lambda each, _: errors[each.stage] and ImageError(errors[each.stage], 1.0, 9),
+        "_with_explained": lambda opened, temperature, *_: (opened, temperature + 1),
+    }
+    for name, function in patches.items():
+        monkeypatch.setattr(joint_errors, name, function)
+    found, extension = joint_errors.add_joint_errors(gated, ["compliance", "harmonics", "gain"], 40)
+    assert len(extension.trials) == 2
+    assert set(extension.families) == ({"compliance", "gain"} if is_added else set())
+    assert extension.n_configurations == n
+    if not is_added:
+        assert found is gated
+        assert extension.temperature == gate_before.temperature
+        assert np.isnan(extension.region_ratio)
+        return
+    assert found.fit is opened
+    assert found.with_arm is (gated.with_arm if was_open else opened)
+    assert found.gate.is_open
+    assert found.gate.temperature == extension.temperature == temperature + 1
+    assert extension.random_ratio == 0.7
+    assert extension.region_ratio == pytest.approx(after / before)
+
+
+@pytest.mark.parametrize("is_same", [True, False])
+def test_samples_that_joint_errors_explain_are_no_outliers(monkeypatch, displaced, is_same):
+    fit = displaced.displaced
+    assert fit is not None
+    fit = fit.solved_with_weights((np.where(np.arange(len(fit.weights[0])) < 9, 0.5, 1.0),), 1)
+    new = fit.weights if is_same else (np.ones(len(fit.weights[0])),)
+    judged = []
+
+    def reweighted(given: Fit, *_: Any) -> Fit:
+        judged.append(given)
+        return replace(given, weights=new)
+
+    monkeypatch.setattr(joint_errors, "reweight", reweighted)
+    monkeypatch.setattr(joint_errors, "open_fit", lambda each, *_: (each, 7.0))
+    found, temperature = joint_errors._with_explained(fit, 3.0, displaced.gate, 1)
+    assert (found is fit) == is_same
+    assert temperature == (3.0 if is_same else 7.0)
+    np.testing.assert_array_equal(found.weights[0], new[0])
+    # The measurements that are judged have no weights.
+    assert displaced.displaced is not None
+    np.testing.assert_allclose(judged[0].data[0].sigma, displaced.displaced.problem.data[0].sigma)  # type: ignore[union-attr]
+
+
+def test_displacements_and_noise_of_images_are_estimated():
+    """Each image is displaced at random by 1 mm and 2 mrad; one image has a board behind the camera."""
+    chain, rng = ARMS["ur10"](), np.random.default_rng(2)
+    setup = simulate(chain, chain, rng, is_on_wrist=True, n_images=60, sigma=0.2)
+    exact = setup.exact
+    problem = make_problem(select_parameters(chain, "base"), (exact,), np.ones(6), {})
+    x = np.concatenate([np.zeros(6), problem.instrument_start({})])
+    frames = chain.forward_kinematics(exact.conditions())
+    derivative = exact.displacement_derivative(frames, problem.instrument_values_of(exact, x))
+    displacements = rng.normal(size=(60, 6)) * ([1e-3] * 3 + [2e-3] * 3)
+    moved = np.einsum("mij,mj->mi", derivative, displacements[exact.image])
+    images = exact.replace(values=exact.values + moved + 0.2 * rng.standard_normal(moved.shape))
+    every = np.ones(len(images.rows))
+    found = estimate_jitter(problem, x, [images], [every], 0.0)
+    assert found.is_significant
+    assert [found.position, found.rotation] == pytest.approx([1e-3, 2e-3], rel=0.15)
+    assert found.noise == pytest.approx(0.2, rel=0.05)
+    behind = images.replace(values=images.values + 1e6 * (images.image == 3)[:, None])
+    assert estimate_jitter(problem, x, [behind], [every], 0.0).position == pytest.approx(1e-3, rel=0.15)
+    # Outliers do not count, and images without any corner have no displacement.
+    weights = np.where(images.image % 2, 0.5, 0.51)
+    half = estimate_jitter(problem, x, [images.replace(values=images.values + (weights == 0.5)[:, None])],
+                           [weights], 0.0)  # fmt: skip
+    assert half.noise == pytest.approx(0.2, rel=0.05)
+    assert estimate_jitter(problem, x, [images], [0 * every], 0.0) == Jitter(1.0, 1e-3, 1e-3, 1e-3)
+    # A fit that determines half of the displacements has absorbed half of their squares.
+    absorbed = estimate_jitter(problem, x, [images], [every], 180.0)
+    assert absorbed.position == pytest.approx(np.sqrt(2) * found.position, rel=0.2)
+    still = exact.replace(values=exact.values + 0.2 * rng.standard_normal(moved.shape))
+    assert not estimate_jitter(problem, x, [still], [every], 0.0).is_significant
+
+
+def test_noise_is_no_less_than_a_tenth_of_a_pixel():
+    rng = np.random.default_rng(0)
+    derivative = rng.normal(size=(20, 6))
+    assert jitter._scatter([(1e-3 * rng.normal(size=20), derivative)]) == 0.1
+    # Twenty rows less six that a displacement explains.
+    residual = np.linalg.svd(derivative)[0][:, 6:].sum(1)
+    assert jitter._scatter([(residual, derivative)]) == pytest.approx(1.0)
+
+
+def test_joints_of_a_low_cost_arm_displace_the_tool():
+    chain = ARMS["ur10"]()
+    q = np.random.default_rng(1).uniform(-1, 1, (1, 6))
+    frames = chain.forward_kinematics(Pose(q, np.eye(4)[None]).conditions())
+    assert jitter._joint_motions(chain, frames).shape == (1, 6, 0)
+    servo = replace(chain, parameters=LOW_COST)
+    found = jitter._joint_motions(servo, frames)[0]
+    tool = chain.poses(q)[0]
+    for joint in range(6):
+        moved = chain.poses(q + 1e-6 * np.eye(6)[joint])[0]
+        turn = moved[:3, :3] @ tool[:3, :3].T
+        twist = np.array([*(moved - tool)[:3, 3], turn[2, 1], turn[0, 2], turn[1, 0]]) / 1e-6
+        np.testing.assert_allclose(found[:, joint], twist, atol=1e-5)

@@ -179,10 +179,10 @@ def test_a_size_is_wrong_beyond_doubt_if_correction_and_evidence_are_large(state
     found = BoardSize({"a": 1.1}, {"a": 0.03}, stated, 0.31, log_ratio)
     assert found.is_decisive == is_decisive
     assert found.sentence == (
-        f"The size of the boards {'is probably' if is_decisive else 'may be'} wrong: with 110 % of the stated "
-        "size (squares of 33 mm, not 30 mm), the corrections of the lengths of the arm fall from 1.2 to 0.31 "
-        "times what manufacturing errors would be. Measure the boards over the whole length, and correct the "
-        "size in the rig file."
+        f"The size of the boards {'is probably' if is_decisive else 'may be'} wrong: with 110 % of the "
+        "stated size (squares of 33 mm, not 30 mm), the corrections of the lengths of the arm fall from "
+        "1.2 to 0.31 times what manufacturing errors would be. Measure the boards over the whole length, "
+        "and correct the size in the rig file."
     )
 
 
@@ -232,14 +232,14 @@ def test_exchanges_of_axes_say_where_and_how_they_were_found():
     errors = ImageError(12.0, 1e-2, 9), ImageError(0.5, 1e-3, 9)
     found = Exchange("c", "fx and fy", *errors, 12)
     assert found.sentence == (
-        "camera 'c': fx and fy are exchanged in the rig file: with fixed intrinsics the images differ by 12 px "
-        "as stated, and by 0.5 px if they are exchanged. The exchanged values are used; correct them."
+        "camera 'c': fx and fy are exchanged in the rig file: with fixed intrinsics the images differ by "
+        "12 px as stated, and by 0.5 px if they are exchanged. The exchanged values are used; correct them."
     )
     assert "u and v are exchanged in the measurements: with" in replace(found, what="u and v").sentence
     size = Exchange("c", "width and height", None, None)
     assert size.sentence == (
-        "camera 'c': width and height are exchanged in the rig file: corners lie outside its images, and inside "
-        "if they are exchanged. Correct them."
+        "camera 'c': width and height are exchanged in the rig file: corners lie outside its images, and "
+        "inside if they are exchanged. Correct them."
     )
     (stage,) = axis_stages([found, size])
     assert (stage.name, stage.is_kept, stage.n_unknowns, stage.fitted) == ("axis order", True, 12, errors[0])
@@ -337,8 +337,8 @@ def test_stated_poses_that_differ_are_described():
     assert inverse.is_inverse
     assert inverse.text == "the stated pose of camera 'wrist' is inverse, of its link in the camera"
     assert inverse.sentence == (
-        f"{inverse.text}; the pose in the images is used. State the pose of the camera in its link (xyz_m and "
-        "rotvec_rad in the rig file)."
+        f"{inverse.text}; the pose in the images is used. State the pose of the camera in its link (xyz_m "
+        "and rotvec_rad in the rig file)."
     )
     turned = PoseDifference("board_b", stated, stated @ pose([0.0, 0.5, 0.0], [0.03, 0.0, -0.04]))
     assert not turned.is_inverse
