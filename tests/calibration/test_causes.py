@@ -10,7 +10,7 @@ from camera_setups import ARMS
 from hand_eye_setups import SIGMA, faulty_setup
 from scipy.spatial.transform import Rotation
 
-from dhcal_pin import select_parameters
+from dhcal_pin import se3, select_parameters
 from dhcal_pin.calibration.cameras import causes as models
 from dhcal_pin.calibration.cameras import diagnosis
 from dhcal_pin.calibration.cameras.causes import (
@@ -31,6 +31,7 @@ from dhcal_pin.calibration.cameras.diagnosis import DISPLACEMENT, HandEyeDiagnos
 from dhcal_pin.calibration.cameras.jitter import Jitter
 from dhcal_pin.calibration.cameras.stages import ImageError
 from dhcal_pin.exceptions import NotObservableError
+from dhcal_pin.formatting import format_quantity
 
 
 @pytest.fixture(scope="module")
@@ -491,3 +492,130 @@ def test_errors_behind_a_camera_are_stated_in_pixels():
         "Error of left-out images: more than 10 m at the board (50 px); noise of the corners explains "
         "0.050 mm (0.50 px)."
     )
+
+
+@pytest.mark.parametrize(("n_images", "is_searched"), [(4, False), (5, True)])
+def test_causes_of_five_configurations_are_searched(monkeypatch, hand_eye, state, n_images, is_searched):
+    monkeypatch.setattr(diagnosis._State, "of", lambda *_: state)
+    monkeypatch.setattr(diagnosis, "_find_causes", lambda *_: ((), (), (), state))
+    (images,) = hand_eye.data
+    data = images.take(images.image < n_images), images.take(images.image < 0)
+    found = diagnosis._search(state.fit, data, (images,), False)
+    assert (found is not None) == is_searched
+    problem, weights = state.fit.problem.with_data(data[:1]), (np.ones(len(data[0].rows)),)
+    fit = replace(state.fit, data=data[:1], problem=problem, weights=weights)
+    assert (diagnosis.diagnose_hand_eye(fit, 1e-3, (), False) is not None) == is_searched
+    if found is not None:
+        # Measurements without samples are left out, and held-out images have a place in the sequence.
+        (item,) = found.hand_eye.data
+        assert len(item.rows) == len(data[0].rows)
+        assert len(found.hand_eye.sequence) == 6
+
+
+def test_causes_are_searched_in_configurations_over_the_whole_range(monkeypatch, hand_eye, state):
+    monkeypatch.setattr(diagnosis._State, "of", lambda *_: state)
+    monkeypatch.setattr(diagnosis, "_find_causes", lambda *_: ((), (), (), state))
+    monkeypatch.setattr(diagnosis, "_n_examined", lambda count, n_corners: count // 2)
+    (images,) = (item.replace(has_stated_sigma=True) for item in hand_eye.data)
+    label = images.configuration_groups
+    parts = images.take(label < 2), images.take((label > 1) & (label < 5)), images.take(label == 5)
+    found = diagnosis._search(state.fit, parts, (), False)
+    assert found is not None
+    assert not any(item.has_stated_sigma for item in found.hand_eye.data)
+    used = np.unique(np.concatenate([item.q for item in found.hand_eye.data]), axis=0)
+    q = images.q[np.unique(label, return_index=True)[1]]
+    places = [int(np.flatnonzero((q == each).all(1))[0]) for each in used]
+    assert len(places) == 3
+    assert {0, 5} <= set(places)
+
+
+@pytest.mark.parametrize(("ratio", "is_long"), [(2.99, False), (3.01, True)])
+def test_an_error_by_a_step_that_is_too_long_is_that_of_the_fitted_images(
+    monkeypatch, hand_eye, state, ratio, is_long
+):
+    fitted = diagnosis.fitted_error(state.fit)
+    start = replace(state, error=error(ratio * fitted.pixels), noise=0.3, scatter=0.2)
+    monkeypatch.setattr(diagnosis._State, "of", lambda *_: start)
+    monkeypatch.setattr(diagnosis, "_find_causes", lambda *_: ((), (), (), start))
+    found = diagnosis._search(state.fit, hand_eye.data, (), True)
+    assert found is not None
+    assert found.base.error == (fitted if is_long else start.error)
+    assert found.base.noise == (0.2 if is_long else 0.3)
+    assert found.hand_eye.is_arm_tried
+
+
+def test_inverse_flange_poses_show_the_same_images_as_exchanged_links(hand_eye, state):
+    """Each pose is stated relative to the link that carries it in one of both explanations."""
+    (images,) = hand_eye.data
+    rig = images.rig
+    link = np.eye(4)
+    link[:3, 3] = 0.1, 0.0, 0.3
+    rig = replace(rig, camera_mounts=(replace(rig.camera_mounts[0], link_pose=link),))
+    item = images.replace(rig=rig, has_joint_values=False)
+    known = replace(state, fit=replace(state.fit, data=(item,)))
+    text, remedy = diagnosis._links_text(replace(hand_eye, data=(item,)), known)
+    values = state.values
+    camera, board = (
+        np.array([values[f"{entry}.{axis}"] for axis in "xyz"])
+        for entry in ("camera_camera0", "board_board0")
+    )
+
+    def length(vector: np.ndarray) -> str:
+        size = float(np.linalg.norm(vector))
+        return format_quantity(size, "m", 0.03 * size)
+
+    offset = link[:3, 3]
+    stated, exchanged = (
+        f"camera 'camera0' is {length(first)} from link {one!r}, and board 'board0' {length(second)} from "
+        f"link {other!r}"
+        for first, one, second, other in (
+            (camera, "tip", board, "world"),
+            (camera + offset, "world", board - offset, "tip"),
+        )
+    )
+    assert f"If the poses are inverse, {stated}; if the links are exchanged, {exchanged}" in text
+    assert remedy.startswith(
+        "If camera 'camera0' is on link 'tip', invert the poses, or add --mend poses:inverse"
+    )
+
+
+@pytest.mark.parametrize(
+    ("inverse", "moved", "start", "end"),
+    [
+        ([], {"camera": 0.005, "board": 0.2}, "the stated pose of board 'board0' is 200", "Or add board to"),
+        (["camera"], {"board": 9.0}, "the stated pose of camera 'camera0' is inverse", "Or add camera to"),
+        (
+            ["camera", "board"],
+            {},
+            "the stated pose of camera 'camera0' is inverse",
+            "Or add camera and board to",
+        ),
+    ],
+)
+def test_held_poses_that_are_inverse_or_differ_most_are_described(inverse, moved, start, end):
+    images = faulty_setup("ur10", "nothing", 27, is_on_wrist=True, n_images=2)[2].exact
+    values = {p.name: p.nominal for p in images.instrument_parameters}
+    poses = {"camera": images.rig.cameras[0].pose, "board": images.rig.boards[0].pose}
+    for kind, pose in poses.items():
+        assert pose is not None
+        found = np.linalg.inv(pose) if kind in inverse else pose
+        vector = [*found[:3, 3], *se3.log3(found[:3, :3])]
+        values |= dict(
+            zip([f"{kind}_{kind}0.{n}" for n in ("x", "y", "z", "rx", "ry", "rz")], vector, strict=True)
+        )
+    for kind, size in moved.items():
+        values[f"{kind}_{kind}0.x"] += size
+    hand_eye: Any = SimpleNamespace(data=(images,), known=images.stated_values)
+    state: Any = SimpleNamespace(values=values)
+    text, remedy = diagnosis._poses_text(hand_eye, state)
+    assert text.startswith(start)
+    assert text.count("is inverse") == len(inverse)
+    assert remedy.endswith(f"{end} --parameters.")
+
+
+@pytest.mark.parametrize("name", ["pairing", "stated poses", "board size"])
+def test_a_trial_has_the_text_of_its_cause(monkeypatch, name):
+    function = {"pairing": "_pairing_text", "stated poses": "_poses_text", "board size": "_size_text"}[name]
+    monkeypatch.setattr(diagnosis, function, lambda *_: ("what", "do"))
+    hand_eye: Any = SimpleNamespace()
+    assert diagnosis._trial(hand_eye, name, fake_state(2.0)) == Trial(name, error(2.0), "what", "do")

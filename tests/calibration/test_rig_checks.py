@@ -10,6 +10,7 @@ from camera_setups import ARMS, Setup, placement_fit, simulate
 
 from dhcal_pin import se3, select_parameters
 from dhcal_pin.calibration.cameras import board_size, causes
+from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL, arm_type
 from dhcal_pin.calibration.cameras.board_size import OTHER_ROBOT, BoardSize
 from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, file_sequence
 from dhcal_pin.calibration.cameras.lens_priors import (
@@ -19,7 +20,14 @@ from dhcal_pin.calibration.cameras.lens_priors import (
     with_lens_priors,
     with_stated_distortion,
 )
-from dhcal_pin.calibration.cameras.mistakes import PoseDifference, axis_order, inverse_poses, pose_differences
+from dhcal_pin.calibration.cameras.mistakes import (
+    PoseDifference,
+    RigMistakes,
+    axis_order,
+    correct_rig,
+    inverse_poses,
+    pose_differences,
+)
 from dhcal_pin.calibration.cameras.mistakes.axis_order import Exchange, axis_stages
 from dhcal_pin.calibration.cameras.sets import (
     count_corners,
@@ -325,6 +333,41 @@ def test_images_are_thinned_evenly(monkeypatch, limit, n_images):
     expected = max(10, min(40, 40 * limit // len(images.rows)))
     assert thinned.n_images == expected
     assert (thinned is images) == (limit >= len(images.rows))
+
+
+def test_exchanged_values_are_put_into_their_order(monkeypatch, setup):
+    """The order of one of the cameras is wrong, and the size of its images."""
+    camera = setup.images.rig.cameras[0]
+    images = with_camera(setup.images, values=np.r_[900.0, 950.0, camera.values[2:]], width=960, height=1280)
+    images = images.replace(values=images.values % 959 + np.array([321.0, 0.0]))
+    wrong = Exchange("camera0", "fx and fy", ImageError(9.0, 1e-3, 9), ImageError(1.0, 1e-4, 9))
+    monkeypatch.setattr(axis_order, "_best_order", lambda *_: wrong)
+    other = poses(setup.nominal)
+    (fitted, same), (held,), found = correct_rig(setup.nominal, [images, other], [images], ["camera"])
+    for item in (fitted, held):
+        np.testing.assert_array_equal(item.rig.cameras[0].values[:2], [950.0, 900.0])  # type: ignore[union-attr]
+        values = {p.name: p.nominal for p in item.instrument_parameters}
+        assert (values["camera_camera0.fx"], values["camera_camera0.fy"]) == (950.0, 900.0)
+    assert same is other
+    assert [each.what for each in found.exchanges] == ["fx and fy", "width and height"]
+    assert found.sentences == [each.sentence for each in found.exchanges]
+    assert [stage.name for stage in found.stages] == ["axis order"]
+    monkeypatch.setattr(axis_order, "_best_order", lambda *_: None)
+    unchanged, found = axis_order.exchange_axes(setup.nominal, [setup.images])
+    assert unchanged == (setup.images,)
+    assert found == ()
+
+
+def test_stated_poses_that_are_not_inverse_are_no_mistake_of_the_rig():
+    stated = pose([0.4, 0.2, 0.1], [0.05, 0.02, 0.3])
+    inverse = PoseDifference("camera_wrist", stated, se3.inverse(stated))
+    turned = PoseDifference("board_b", stated, stated @ pose([0.0, 0.5, 0.0], [0.03, 0.0, -0.04]))
+    assert RigMistakes(poses=(turned, inverse)).sentences == [inverse.sentence]
+
+
+def test_the_type_of_an_arm_follows_from_its_sets():
+    assert arm_type(["camera", LOW_COST]) is ARM_TYPES[LOW_COST]
+    assert arm_type(["placement", "offset"]) is INDUSTRIAL
 
 
 def pose(vector, position) -> np.ndarray:
