@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from camera_setups import ARMS, placement_fit, simulate, wrong_arm
 
-from dhcal_pin import select_parameters
-from dhcal_pin.calibration.cameras import gate, jitter, joint_errors
+from dhcal_pin import Chain, select_parameters
+from dhcal_pin.calibration.cameras import gate, jitter, joint_errors, target_points
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL
 from dhcal_pin.calibration.cameras.gate import (
     Gate,
@@ -35,7 +35,7 @@ from dhcal_pin.cameras import Board
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.parameters import LOW_COST
 from dhcal_pin.estimation.solver import minimize
-from dhcal_pin.measurements import KINDS, Noise, Pose
+from dhcal_pin.measurements import KINDS, CameraCorners, Noise, Pose
 from dhcal_pin.measurements.base import errors_of
 
 
@@ -235,11 +235,13 @@ def test_an_image_shows_six_components_of_its_displacement(right):
     assert gate.temperature(20, 5) == 5.0
 
 
-def lens_and_points_fit(chain, images, **changes: Any) -> Fit:
-    """Return a fit of arm, poses, lens and boards that are changed."""
-    board = replace(images.rig.boards[0], **changes)
-    item = images.with_rig(replace(images.rig, boards=(board,))).initialized(chain)
-    errors = select_parameters(chain, "placement")
+def lens_and_points_fit(chain: Chain, images: CameraCorners, **changes: Any) -> Fit:
+    """Return a fit of arm, poses, lens and every third corner of a board that is changed."""
+    board = images.rig.boards[0]
+    board = replace(board, type="points", listed_points=board.points[::3], **changes)
+    rig, chosen = replace(images.rig, boards=(board,)), images.corner % 3 == 0
+    item = CameraCorners(images.q[chosen], images.values[chosen], images.corner[chosen] // 3, rig)
+    item, errors = item.initialized(chain), select_parameters(chain, "placement")
     problem = make_problem(errors, (item,), 1 / errors.priors, {})
     x = np.concatenate([np.zeros(len(errors.priors)), problem.instrument_start({})])
     return Fit((item,), problem, minimize(problem, "lm", x, 40), (np.ones(len(item.rows)),))
@@ -253,7 +255,7 @@ def test_stages_free_the_lens_before_the_corners_and_the_arm(has_free_points):
     gated = apply_gate(fit, (), 40, INDUSTRIAL)
     frames, lens, points, arm = judge_stages(fit, gated, None, 40)
     assert [s.name for s in (frames, lens, points, arm)] == ["frames", "intrinsics", "target points", "arm"]
-    n_points = 3 * len(images.rig.boards[0].points)
+    n_points = 3 * len(fit.data[0].rig.boards[0].points)  # type: ignore[union-attr]
     counts = [stage.n_unknowns for stage in (frames, lens, points, arm)]
     assert counts == [12, 21, 21 + n_points, 21 + 36 + n_points * has_free_points]
     assert [stage.is_kept for stage in (frames, lens, points, arm)] == [True, True, has_free_points, False]
@@ -510,3 +512,24 @@ def test_joints_of_a_low_cost_arm_displace_the_tool():
         turn = moved[:3, :3] @ tool[:3, :3].T
         twist = np.array([*(moved - tool)[:3, 3], turn[2, 1], turn[0, 2], turn[1, 0]]) / 1e-6
         np.testing.assert_allclose(found[:, joint], twist, atol=1e-5)
+
+
+@pytest.mark.parametrize(("log_ratio", "temperature"), [(9.0, 1.6), (5.0, 1.0)])
+def test_images_that_share_no_displacement_with_joint_errors_count_in_full(
+    monkeypatch, displaced, log_ratio, temperature
+):
+    monkeypatch.setattr(
+        gate, "residual_jitter", lambda _: Jitter(0.3, 1e-4, 1e-4, log_likelihood_ratio=log_ratio)
+    )
+    assert displaced.displaced is not None
+    opened, found = gate.open_fit(displaced.displaced, displaced.gate, 40)
+    assert found == opened.problem.temperature == pytest.approx(temperature)
+
+
+def test_corners_are_not_tried_without_boards_or_errors(monkeypatch, right):
+    folds, images = cluster_folds(right.data), k_fold(right.data, 5)
+    assert target_points.try_target_points(right, (), folds, 40) is None
+    monkeypatch.setattr(target_points, "held_out_error", lambda *_: ImageError(0.0, 0.0, 9))
+    assert target_points.try_target_points(right, images, folds, 40) is None
+    monkeypatch.setattr(target_points, "judged_boards", lambda _: [])
+    assert target_points.try_target_points(right, images, folds, 40) is None

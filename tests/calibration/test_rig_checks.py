@@ -9,7 +9,7 @@ import pytest
 from camera_setups import ARMS, Setup, placement_fit, simulate
 
 from dhcal_pin import se3, select_parameters
-from dhcal_pin.calibration.cameras import board_size, causes
+from dhcal_pin.calibration.cameras import board_size, causes, procedure
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES, INDUSTRIAL, arm_type
 from dhcal_pin.calibration.cameras.board_size import OTHER_ROBOT, BoardSize
 from dhcal_pin.calibration.cameras.causes import Causes, HandEyeData, file_sequence
@@ -511,3 +511,40 @@ def test_a_shift_that_reduces_the_cost_is_found(monkeypatch, least, depth, n_row
     monkeypatch.setattr(causes, "_cost", lambda _, cause, __: 1 + depth * (cause.shift - least) ** 2)
     hand_eye: Any = SimpleNamespace(sequence=np.zeros((n_rows, 6)))
     assert causes.find_shift(hand_eye, Causes()) == pytest.approx(shift, abs=1e-3)
+
+
+def test_a_cause_changes_its_part_of_the_rig_alone(setup):
+    fixed = with_camera(setup.images, intrinsics="fixed")
+    for cause in (Causes(), Causes(has_lens=True), Causes(has_points=True), Causes(has_exchanged_links=True)):
+        rig = causes._with_rig(cause, fixed).rig
+        assert (rig.cameras[0].intrinsics == "prior") == cause.has_lens
+        assert rig.boards[0].has_free_points == cause.has_points
+        assert rig.camera_mounts[0].moves != cause.has_exchanged_links
+        assert rig.board_mounts[0].moves == cause.has_exchanged_links
+    free = with_camera(setup.images, intrinsics="free")
+    assert causes._with_rig(Causes(has_lens=True), free).rig.cameras[0].intrinsics == "free"
+    larger = causes._with_rig(Causes(sizes={"board0": 1.1}), fixed).rig.boards[0].points
+    np.testing.assert_allclose(larger, 1.1 * fixed.rig.boards[0].points)
+
+
+def test_families_that_images_do_not_show_are_named():
+    procedure.require_shown_families("auto", ["harmonics"])
+    procedure.require_shown_families(None, ["harmonics"])
+    procedure.require_shown_families(["gain"], ["gain"])
+    with pytest.raises(InvalidArgumentError, match=r"extend 'harmonics': only compliance, .* are selected"):
+        procedure.require_shown_families(["gain", "harmonics"], ["gain", "harmonics"])
+
+
+@pytest.mark.parametrize(
+    ("first", "families", "is_tried_again"),
+    [(None, (), False), ("size", procedure.FAMILIES, False), ("size", procedure.FAMILIES[:2], True)],
+)
+def test_another_size_is_judged_with_all_joint_errors_that_images_show(
+    monkeypatch, first, families, is_tried_again
+):
+    found = iter([first, "size with joint errors"])
+    monkeypatch.setattr(procedure, "find_board_size", lambda _: next(found))
+    monkeypatch.setattr(procedure, "add_joint_errors", lambda gated, names, _: (gated, names))
+    gated: Any = SimpleNamespace(fit=None)
+    expected = "size with joint errors" if is_tried_again else first
+    assert procedure._judge_board_size(gated, families, 40) == expected
