@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_setups import ARMS
+from camera_setups import ARMS, simulate
 from hand_eye_setups import SIGMA, faulty_setup
 from scipy.spatial.transform import Rotation
 
@@ -619,3 +619,41 @@ def test_a_trial_has_the_text_of_its_cause(monkeypatch, name):
     monkeypatch.setattr(diagnosis, function, lambda *_: ("what", "do"))
     hand_eye: Any = SimpleNamespace()
     assert diagnosis._trial(hand_eye, name, fake_state(2.0)) == Trial(name, error(2.0), "what", "do")
+
+
+def test_the_board_whose_corners_are_displaced_most_is_described():
+    """Two corners of a board show no displacement beside a rigid motion."""
+    chain, rng = ARMS["ur10"](), np.random.default_rng(1)
+    images = simulate(chain, chain, rng, is_on_wrist=False, n_images=6, sigma=0.2, n_boards=2).images
+    few = images.take((images.board == 0) | (images.corner == images.corner[images.board == 1][0]))
+    for item, name, size in ((images, "board1", 2e-3), (few, "board0", 1e-3)):
+        item = models._with_rig(Causes(has_points=True), item)
+        values = {p.name: p.nominal for p in item.instrument_parameters}
+        for number, board in enumerate(images.rig.boards):
+            for k in range(len(board.points)):
+                values[f"board_board{number}.p{k}z"] += (number + 1) * rng.choice([-1e-3, 1e-3])
+        state: Any = SimpleNamespace(fit=SimpleNamespace(data=(item,)), values=values)
+        hand_eye: Any = SimpleNamespace(data=(item,))
+        text, _ = diagnosis._corner_text(hand_eye, state)
+        assert f"the corners of board {name!r}, " in text
+        assert float(text.split(", ")[1].split(" mm")[0]) == pytest.approx(1e3 * size, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("factors", "text"),
+    [
+        ((1.1, 1.1, 1.0, 1.0), "the lens, above all fx, fy of camera 'c': 1100, 1111 px, not 1000, 1010 px"),
+        ((1.0, 1.0, 1.1, 1.0), "the lens, above all cx, cy of camera 'c': 704, 480 px, not 640, 480 px"),
+        ((0.5, 0.5, 0.5, 0.5), "the resolution: "),
+        ((-1.0, 1.0, 1.0, 1.0), "the lens"),
+    ],
+)
+def test_the_change_of_a_lens_is_described_by_its_values(hand_eye, factors, text):
+    (images,) = hand_eye.data
+    stated = np.r_[1000.0, 1010.0, 640.0, 480.0, np.zeros(5)]
+    camera = replace(images.rig.cameras[0], name="c", values=stated)
+    item = images.with_rig(replace(images.rig, cameras=(camera,)))
+    values = dict(zip([f"camera_c.{n}" for n in ("fx", "fy", "cx", "cy")], stated[:4] * factors, strict=True))
+    state: Any = SimpleNamespace(values=values)
+    found, _ = diagnosis._lens_text(replace(hand_eye, data=(item,)), state)
+    assert found == text or (text.endswith(": ") and found.startswith(text) and "(camera 'c')" in found)

@@ -548,3 +548,21 @@ def test_another_size_is_judged_with_all_joint_errors_that_images_show(
     gated: Any = SimpleNamespace(fit=None)
     expected = "size with joint errors" if is_tried_again else first
     assert procedure._judge_board_size(gated, families, 40) == expected
+
+
+@pytest.mark.parametrize(
+    ("arm_error", "size", "is_found"), [(5e-4, 1.0, False), (5e-4, 1.03, True), (3e-3, 1.0, False)]
+)
+def test_a_size_is_wrong_if_another_one_makes_the_arm_right(arm_error, size, is_found):
+    fit = placement_fit(arm_error, 12, 3, size=size)
+    found = board_size.find_board_size(fit)
+    assert (found is not None) == is_found
+    if found is not None:
+        assert list(found.sizes.values()) == [pytest.approx(1 / size, abs=3e-3)]
+        assert found.found < 0.5 * found.stated
+    # Other measurements show lengths themselves.
+    data = *fit.problem.data, poses(fit.problem.errors.chain)
+    mixed = replace(
+        fit, data=data, problem=replace(fit.problem, data=data), weights=(*fit.weights, np.ones(2))
+    )
+    assert board_size.find_board_size(mixed) is None
