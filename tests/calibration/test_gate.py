@@ -336,7 +336,7 @@ def test_errors_of_images_are_those_of_corners_that_are_no_outliers(right):
     assert found.pixels == pytest.approx(np.sqrt(np.mean(np.sum(pixels[used] ** 2, 1))))
     assert held_out_error(right, ()) is None
     nothing = fitted_error(replace(right, weights=(np.zeros(len(item.rows)),)))
-    assert (nothing.pixels, nothing.distance) == (0.0, 0.0)
+    assert (nothing.pixels, nothing.distance, nothing.n_corners) == (0.0, 0.0, 0)
 
 
 def test_the_document_of_a_stage_has_its_errors():

@@ -26,7 +26,9 @@ from dhcal_pin.measurements import CameraCorners, Pose
 from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.measurements.images import image_pose
 from dhcal_pin.measurements.mounting import mount_rig
-from dhcal_pin.session.causes import Block, Cause, Constant
+from dhcal_pin.session import Session
+from dhcal_pin.session.causes import Block, Cause, Constant, Step
+from dhcal_pin.session.timeline import order_samples
 
 pytestmark = pytest.mark.usefixtures("untried", "ordered_axes")
 
@@ -325,3 +327,42 @@ def test_a_motion_of_the_tool_is_that_of_another_tool_pose():
     np.testing.assert_allclose(image_session._carried_cause(two, tool).values, np.tile(found.values, 2))
     of_base = replace(cause, block=replace(cause.block, kind="base"))
     assert image_session._carried_cause(of_base, tool) is of_base
+
+
+@pytest.mark.parametrize("is_on_wrist", [True, False])
+def test_changes_of_poses_are_those_of_camera_and_board(is_on_wrist):
+    """Images calibrate the arm with a base and a tool of their own; constant causes are left out."""
+    nominal, _, images, _ = photograph(1, is_on_wrist, True, 0 * MOTION, count=10)
+    base, tool = (
+        se3.exp6(np.array(each)) for each in ([0.3, -0.2, 0.1, 0.2, 0.1, 0.4], [0.1, 0, 0.2, 0, 0.5, 0])
+    )
+    posed = nominal.with_base_and_tool(base, nominal.tool @ tool)
+    block = Block("base", "", np.arange(6), np.ones(6))
+    step, covariance = Step(5), np.eye(6)
+    kinds: list[tuple[Any, bool]] = [("base", False), ("tool", False), ("joint", False), ("lag", True)]
+    causes = tuple(
+        Cause(replace(block, kind=kind, is_constant=is_constant), step, np.full(6, 1e-3), covariance)
+        for kind, is_constant in kinds
+    )
+    pose = images.image_poses()
+    session = Session(order_samples([pose], ()), posed, True, causes=causes)
+    result: Any = SimpleNamespace(session=session, chain=posed)
+    for arm, expected in ((INDUSTRIAL, ["base", "tool", "joint"]), (ARM_TYPES[LOW_COST], ["base", "tool"])):
+        found = find_image_session(nominal, [images], (), lambda _: result, arm)
+        assert found is not None
+        assert [cause.block.kind for cause in found.causes] == expected
+        fixed, moving = (cause.block for cause in found.causes[:2])
+        assert (fixed.of, moving.of) == (("board", "camera") if is_on_wrist else ("camera", "board"))
+        # The origins are those of the frame of the board in the one of the camera, or the other way round.
+        np.testing.assert_allclose(fixed.origin, np.linalg.inv(base)[:3, 3])
+        np.testing.assert_allclose(moving.origin, tool[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(found.causes[1].values, se3.adjoint(tool) @ causes[1].values)
+        assert found.chain is nominal
+        assert found.timeline.unit == "image"
+    nothing: Any = SimpleNamespace(session=None)
+    assert find_image_session(nominal, [images], (), lambda _: nothing, INDUSTRIAL) is None
+
+    def failing(_):
+        raise DhcalError("too few images")
+
+    assert find_image_session(nominal, [images], (), failing, INDUSTRIAL) is None
