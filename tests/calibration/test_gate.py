@@ -533,3 +533,14 @@ def test_corners_are_not_tried_without_boards_or_errors(monkeypatch, right):
     assert target_points.try_target_points(right, images, folds, 40) is None
     monkeypatch.setattr(target_points, "judged_boards", lambda _: [])
     assert target_points.try_target_points(right, images, folds, 40) is None
+
+
+def test_images_that_cannot_be_left_out_share_their_displacement(monkeypatch, wrong):
+    """Without left-out clusters, no model of the noise predicts better."""
+    monkeypatch.setattr(gate, "cluster_folds", lambda _: ())
+    gated = apply_gate(wrong, (), 40, INDUSTRIAL)
+    assert np.isnan(gated.gate.ratio)
+    assert not gated.gate.is_open
+    assert gated.with_arm.problem.data[0].has_jitter  # type: ignore[attr-defined]
+    assert gated.with_arm.problem.temperature == pytest.approx(1 + 12 / 5)
+    assert gated.fit.problem.data[0].has_jitter  # type: ignore[attr-defined]
