@@ -626,17 +626,22 @@ def test_the_board_whose_corners_are_displaced_most_is_described():
     chain, rng = ARMS["ur10"](), np.random.default_rng(1)
     images = simulate(chain, chain, rng, is_on_wrist=False, n_images=6, sigma=0.2, n_boards=2).images
     few = images.take((images.board == 0) | (images.corner == images.corner[images.board == 1][0]))
-    for item, name, size in ((images, "board1", 2e-3), (few, "board0", 1e-3)):
+    for item, name, sizes in (
+        (images, "board1", (1e-3, 2e-3)),
+        (images, "board0", (2e-3, 1e-3)),
+        (few, "board0", (1e-3, 2e-3)),
+    ):
         item = models._with_rig(Causes(has_points=True), item)
         values = {p.name: p.nominal for p in item.instrument_parameters}
         for number, board in enumerate(images.rig.boards):
             for k in range(len(board.points)):
-                values[f"board_board{number}.p{k}z"] += (number + 1) * rng.choice([-1e-3, 1e-3])
+                values[f"board_board{number}.p{k}x"] += sizes[number] * rng.choice([-1, 1])
         state: Any = SimpleNamespace(fit=SimpleNamespace(data=(item,)), values=values)
         hand_eye: Any = SimpleNamespace(data=(item,))
         text, _ = diagnosis._corner_text(hand_eye, state)
         assert f"the corners of board {name!r}, " in text
-        assert float(text.split(", ")[1].split(" mm")[0]) == pytest.approx(1e3 * size, rel=0.15)
+        size = float(text.split(", ")[1].split(" mm")[0])
+        assert size == pytest.approx(1e3 * sizes[int(name[-1])], rel=0.15)
 
 
 @pytest.mark.parametrize(

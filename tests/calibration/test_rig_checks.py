@@ -511,6 +511,9 @@ def test_a_shift_that_reduces_the_cost_is_found(monkeypatch, least, depth, n_row
     monkeypatch.setattr(causes, "_cost", lambda _, cause, __: 1 + depth * (cause.shift - least) ** 2)
     hand_eye: Any = SimpleNamespace(sequence=np.zeros((n_rows, 6)))
     assert causes.find_shift(hand_eye, Causes()) == pytest.approx(shift, abs=1e-3)
+    # Without a fit there is no shift.
+    monkeypatch.setattr(causes, "_cost", lambda *_: np.inf)
+    assert causes.find_shift(hand_eye, Causes()) == 0.0
 
 
 def test_a_cause_changes_its_part_of_the_rig_alone(setup):
