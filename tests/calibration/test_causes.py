@@ -241,6 +241,11 @@ def test_rejected_corners_are_examined_if_they_are_many(monkeypatch, n_rejected,
     assert found.noise.pixels == pytest.approx(2.0)
     assert found.noise.distance == pytest.approx(2e-4)
     assert found.noise.n_corners == 99
+    # Noise explains no more than the whole error.
+    inliers.noise = whole.noise = 99.0
+    whole_noise = diagnosis.diagnose_hand_eye(fit, 1e-3, (), False)
+    assert whole_noise is not None
+    assert whole_noise.noise == whole_noise.error
     assert (found.rotation, found.position_std) == (0.5, 1e-3)
 
 

@@ -26,6 +26,7 @@ from dhcal_pin.calibration.cameras.stages import (
     Stage,
     fitted_error,
     held_out_error,
+    held_out_prediction_std,
 )
 from dhcal_pin.calibration.cameras.target_points import TargetPoints, judged_boards
 from dhcal_pin.calibration.model_selection import FamilyTrial
@@ -327,13 +328,14 @@ def test_errors_of_images_are_those_of_corners_that_are_no_outliers(right):
     item = right.data[0]
     u = right.problem.instruments(right.solution.x)
     chain = right.problem.chain(right.solution.x)
-    pixels = errors_of(item, chain, u)["pixels"]
+    errors = errors_of(item, chain, u)
     weights = np.ones(len(item.rows))
     weights[::3], weights[1::3] = 0.5, 0.51
     found = fitted_error(replace(right, weights=(weights,)))
     used = weights > 0.5
     assert found.n_corners == used.sum()
-    assert found.pixels == pytest.approx(np.sqrt(np.mean(np.sum(pixels[used] ** 2, 1))))
+    for rms, name in ((found.pixels, "pixels"), (found.distance, "board")):
+        assert rms == pytest.approx(np.sqrt(np.sum(errors[name][used] ** 2) / used.sum()))
     assert held_out_error(right, ()) is None
     nothing = fitted_error(replace(right, weights=(np.zeros(len(item.rows)),)))
     assert (nothing.pixels, nothing.distance, nothing.n_corners) == (0.0, 0.0, 0)
@@ -544,3 +546,20 @@ def test_images_that_cannot_be_left_out_share_their_displacement(monkeypatch, wr
     assert gated.with_arm.problem.data[0].has_jitter  # type: ignore[attr-defined]
     assert gated.with_arm.problem.temperature == pytest.approx(1 + 12 / 5)
     assert gated.fit.problem.data[0].has_jitter  # type: ignore[attr-defined]
+
+
+def test_predictions_of_left_out_images_have_the_uncertainty_of_the_fit_of_the_others(right):
+    problem, x = right.problem, right.solution.x
+    squares = []
+    for (is_left_out,) in k_fold(right.data, 5):
+        parts = [problem.with_data([problem.data[0].take(mask)]) for mask in (~is_left_out, is_left_out)]
+        fitted, left = (
+            np.concatenate(
+                [part.linearize(x).rows(chunk)[:-1].reshape(len(x), -1) for chunk in part.chunks], 1
+            )
+            for part in parts
+        )
+        covariance = np.linalg.inv(fitted @ fitted.T + np.diag(problem.weights**2))
+        squares += np.einsum("ik,ij,jk->k", left, covariance, left).tolist()
+    found = held_out_prediction_std(right, k_fold(right.data, 5))
+    assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-4)
