@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, simulate
+from camera_setups import ARMS, placement_fit, simulate
 
 from dhcal_pin.calibration import calibrate
 from dhcal_pin.calibration.cameras.corner_noise import _with_corner_noise, estimate_corner_variances
@@ -26,7 +26,7 @@ def simulated_rows(rng, sigma, displacement):
 def test_variances_agree_with_the_truth(sigma, displacement, is_stated):
     """The mean of 20 simulations is within 4 of its standard errors, and 2 % of the total variance."""
     rng, found = np.random.default_rng(1), []
-    placeholder = np.full(N_ROWS, sigma**2 if is_stated else 1.0)
+    placeholder = np.full(N_ROWS, sigma**2 if is_stated else 0.3)
     for _ in range(N_SEEDS):
         squares, slopes = simulated_rows(rng, sigma, displacement)
         factor, variance = estimate_corner_variances(squares, placeholder, slopes, 0.0, is_stated)
@@ -91,3 +91,19 @@ def test_noise_of_corners_without_displacements_is_that_of_the_simulation(sim_6d
     (found,) = _with_corner_noise(fit.fit)
     assert isinstance(found, CameraCorners)
     np.testing.assert_allclose(np.mean(found.sigma**2), 0.3**2, rtol=0.1)
+
+
+def test_corners_that_are_displaced_at_the_board_have_more_noise_the_nearer_they_are():
+    fit, rng = placement_fit(0.0, 20, 0), np.random.default_rng(3)
+    (item,) = fit.problem.data
+    assert isinstance(item, CameraCorners)
+    frames = fit.problem.chain(fit.solution.x).forward_kinematics(item.conditions())
+    slopes = item.corner_derivative(frames, fit.problem.instrument_values_of(item, fit.solution.x))
+    moved = np.einsum("mij,mj->mi", slopes, 5e-4 * rng.standard_normal((len(item.rows), 3)))
+    data = (item.replace(values=item.values + moved),)
+    fit = replace(fit, data=data, problem=replace(fit.problem, data=data)).solved(20)
+    (found,) = _with_corner_noise(fit)
+    assert isinstance(found, CameraCorners)
+    expected = np.sqrt(0.2**2 + 5e-4**2 * np.sum(slopes**2, 2))
+    assert expected.max() > 1.5 * expected.min()
+    np.testing.assert_allclose(found.sigma, expected, rtol=0.15)

@@ -421,8 +421,11 @@ def test_the_largest_error_of_the_arm_is_named(sets, parameter, text):
     x = np.array([1e-3 * (p.name == parameter) for p in errors.parameters])
     fit = SimpleNamespace(problem=SimpleNamespace(errors=errors), solution=SimpleNamespace(x=x))
     state: Any = SimpleNamespace(fit=fit, causes=Causes(arm=ARM_SETS[sets]))
-    hand_eye: Any = SimpleNamespace(is_arm_tried=False)
-    assert text in _arm_text(hand_eye, state)[0]
+    for is_arm_tried, remedy in ((False, "Estimate the arm, too"), (True, "The arm was estimated, too")):
+        hand_eye: Any = SimpleNamespace(is_arm_tried=is_arm_tried)
+        found, what_to_do = _arm_text(hand_eye, state)
+        assert text in found
+        assert what_to_do.startswith(remedy)
 
 
 def test_a_rigid_motion_does_not_bend_a_board():

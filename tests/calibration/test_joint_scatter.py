@@ -102,8 +102,11 @@ def test_as_many_images_as_the_verdict_names_are_enough(seeds):
     assert n_found
 
 
-def densely_integrated(fit: Fit, scatters: np.ndarray) -> tuple[float, float]:
-    """Return RMS and quantile of the scatter from the covariance matrix of all image coordinates."""
+def densely_integrated(fit: Fit, scatters: np.ndarray) -> tuple[float, float, float]:
+    """Return RMS and quantile of the scatter, and the logarithm of the likelihood of its best value over 0.
+
+    They follow from the covariance matrix of all image coordinates.
+    """
     (images,), x, weights = fit.data, fit.solution.x, fit.problem.prior_weights
     chain = fit.problem.chain(x)
     frames = chain.forward_kinematics(images.q)
@@ -127,7 +130,8 @@ def densely_integrated(fit: Fit, scatters: np.ndarray) -> tuple[float, float]:
     density = np.exp(np.array(logs) - max(logs))
     cumulated = cumulative_trapezoid(density, scatters, initial=0)
     square = np.trapezoid(density * scatters**2, scatters) / cumulated[-1]
-    return np.sqrt(square), np.interp(CONFIDENCE * cumulated[-1], cumulated, scatters)
+    largest = np.interp(CONFIDENCE * cumulated[-1], cumulated, scatters)
+    return np.sqrt(square), largest, max(logs) - logs[0]
 
 
 def test_the_scatter_is_that_of_the_restricted_likelihood():
@@ -136,7 +140,9 @@ def test_the_scatter_is_that_of_the_restricted_likelihood():
     data = tuple(item.with_scaled_sigma({"pixels": 0.2}) for item in fit.data)
     plain = replace(fit.with_sigmas(data), data=data)
     scatters = np.append(0, np.geomspace(1e-6, 1e-2, 400))
-    assert (found.expected, found.largest) == pytest.approx(densely_integrated(plain, scatters), rel=0.01)
+    *expected, log_ratio = densely_integrated(plain, scatters)
+    assert (found.expected, found.largest) == pytest.approx(expected, rel=0.01)
+    assert found.log_likelihood_ratio == pytest.approx(log_ratio, abs=1e-3)
 
 
 def test_images_of_even_joints_exclude_more_the_more_they_are():

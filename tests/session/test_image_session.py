@@ -1,8 +1,9 @@
 """Cameras and boards that move while photographs are taken."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,14 @@ from dhcal_pin.calibration.cameras.image_session import find_image_session
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import Rig
 from dhcal_pin.estimation.parameters import LOW_COST, select_parameters
+from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import CameraCorners, Pose
 from dhcal_pin.measurements.base import whitened_jacobian
 from dhcal_pin.measurements.images import image_pose
 from dhcal_pin.measurements.mounting import mount_rig
+from dhcal_pin.session import Session
+from dhcal_pin.session.causes import Block, Cause, Constant, Step
+from dhcal_pin.session.timeline import order_samples
 
 pytestmark = pytest.mark.usefixtures("untried", "ordered_axes")
 
@@ -225,3 +230,139 @@ def test_covariances_of_poses_agree_with_their_scatter(monkeypatch):
         scaled.append(np.einsum("mij,mj->mi", found.roots, errors))
     spread = np.std(scaled, (0, 1))
     assert np.all((spread > 0.8) & (spread < 1.2)), spread
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Stand-in of a fit of some measurements."""
+
+    data: tuple[str, ...]
+    problem: Any = None
+    solution: Any = None
+
+
+@pytest.mark.parametrize(
+    ("is_empty", "failing", "has_two_robots", "is_better", "fitted", "holdout", "has_changes"),
+    [
+        (True, (), False, True, "read", "held", None),
+        (False, (), False, True, "refined", "refined held", True),
+        (False, (), False, False, "read", "held", False),
+        (False, (), True, False, "refined", "refined held", True),
+        (False, ("found",), False, True, "read", "held", False),
+        (False, ("refined",), False, True, "read", "held", False),
+        (False, ("read",), False, False, "refined", "refined held", True),
+    ],
+)
+def test_changes_are_kept_if_images_fit_better_with_them(
+    monkeypatch, is_empty, failing, has_two_robots, is_better, fitted, holdout, has_changes
+):
+    def session(name: str) -> Any:
+        changes = SimpleNamespace(is_empty=is_empty)
+        applied = (name,), (f"{name} held",)
+        return SimpleNamespace(
+            name=name, changes=changes, has_two_robots=has_two_robots, applied=lambda *_: applied
+        )
+
+    def start(data: Any) -> Any:
+        if data[0] in failing:
+            raise DhcalError("no fit")
+        return Fitted(data, Fitted(data), SimpleNamespace(x=None))
+
+    found = session("found")
+    monkeypatch.setattr(image_session, "find_image_session", lambda *_: found)
+    monkeypatch.setattr(image_session, "refine_changes", lambda *_: session("refined"))
+    monkeypatch.setattr(image_session, "without_changes", lambda each: f"{each.name} without changes")
+    monkeypatch.setattr(image_session, "_explains_better", lambda *_: is_better)
+    fit_session: Any = image_session.fit_image_session
+    result = fit_session(None, ("read",), ("held",), None, start, INDUSTRIAL)
+    assert result.fit.data == (fitted,)
+    assert result.holdout == (holdout,)
+    if has_changes is None:
+        assert result.session is found
+    else:
+        assert isinstance(result.session, str) != has_changes
+
+
+def test_the_square_of_an_image_is_the_mean_of_its_coordinates(monkeypatch):
+    images = photograph(1, True, True, MOTION, count=6)[2]
+    residuals = np.random.default_rng(0).normal(size=(2, len(images.rows)))
+    monkeypatch.setattr(image_session, "residuals_of", lambda _: [residuals])
+    fit: Any = SimpleNamespace(data=(images,))
+    found = image_session._image_squares(fit)
+    expected = [np.mean(residuals[:, images.sample_groups == k] ** 2) for k in range(6)]
+    np.testing.assert_allclose(found, expected)
+
+
+def test_corners_have_the_number_of_their_image_among_those_with_a_pose():
+    """The first and the fourth image in the order of the rows show no pose."""
+    images = photograph(1, True, True, MOTION, count=6)[2]
+    order = np.argsort(images.rows)
+    number = np.zeros(len(order), int)
+    number[order] = np.cumsum(np.r_[0, np.diff(images.image[order]) != 0])
+    poses = images.image_poses()
+    shown = poses.take(~np.isin(np.argsort(np.argsort(poses.rows)), (0, 3)))
+    expected = np.array([0, 0, 1, 1, 2, 3])[number]
+    found = image_session._timeline_of_images([images], (), [shown], "row")
+    np.testing.assert_array_equal(found.numbers[0], expected)
+    np.testing.assert_array_equal(found.times[0], expected)
+    assert found.unit == "image"
+    in_seconds = image_session._timeline_of_images([images], (), [shown], "s")
+    assert in_seconds.unit != "image"
+    np.testing.assert_array_equal(in_seconds.numbers[0], expected)
+
+
+def test_a_motion_of_the_tool_is_that_of_another_tool_pose():
+    """A twist ξ at one frame is M·ξ·M⁻¹ at another one, with the same displacement."""
+    rng = np.random.default_rng(3)
+    tool, twist = se3.exp6(rng.normal(0, 0.5, 6)), rng.normal(0, 1, 6)
+    covariance = np.diag(rng.uniform(1, 2, 6))
+    cause = Cause(Block("tool", "", np.arange(6), np.ones(6)), Constant(), twist, covariance)
+    found = image_session._carried_cause(cause, tool)
+    size = 1e-6
+    expected = tool @ se3.exp6(size * twist) @ se3.inverse(tool)
+    np.testing.assert_allclose(se3.exp6(size * found.values), expected, atol=1e-11)
+    each = [image_session._carried_cause(replace(cause, values=axis), tool).values for axis in np.eye(6)]
+    np.testing.assert_allclose(found.covariance, np.transpose(each) @ covariance @ np.array(each))
+    two = replace(cause, values=np.tile(twist, 2), covariance=np.eye(12))
+    np.testing.assert_allclose(image_session._carried_cause(two, tool).values, np.tile(found.values, 2))
+    of_base = replace(cause, block=replace(cause.block, kind="base"))
+    assert image_session._carried_cause(of_base, tool) is of_base
+
+
+@pytest.mark.parametrize("is_on_wrist", [True, False])
+def test_changes_of_poses_are_those_of_camera_and_board(is_on_wrist):
+    """Images calibrate the arm with a base and a tool of their own; constant causes are left out."""
+    nominal, _, images, _ = photograph(1, is_on_wrist, True, 0 * MOTION, count=10)
+    base, tool = (
+        se3.exp6(np.array(each)) for each in ([0.3, -0.2, 0.1, 0.2, 0.1, 0.4], [0.1, 0, 0.2, 0, 0.5, 0])
+    )
+    posed = nominal.with_base_and_tool(base, nominal.tool @ tool)
+    block = Block("base", "", np.arange(6), np.ones(6))
+    step, covariance = Step(5), np.eye(6)
+    kinds: list[tuple[Any, bool]] = [("base", False), ("tool", False), ("joint", False), ("lag", True)]
+    causes = tuple(
+        Cause(replace(block, kind=kind, is_constant=is_constant), step, np.full(6, 1e-3), covariance)
+        for kind, is_constant in kinds
+    )
+    pose = images.image_poses()
+    session = Session(order_samples([pose], ()), posed, True, causes=causes)
+    result: Any = SimpleNamespace(session=session, chain=posed)
+    for arm, expected in ((INDUSTRIAL, ["base", "tool", "joint"]), (ARM_TYPES[LOW_COST], ["base", "tool"])):
+        found = find_image_session(nominal, [images], (), lambda _: result, arm)
+        assert found is not None
+        assert [cause.block.kind for cause in found.causes] == expected
+        fixed, moving = (cause.block for cause in found.causes[:2])
+        assert (fixed.of, moving.of) == (("board", "camera") if is_on_wrist else ("camera", "board"))
+        # The origins are those of the frame of the board in the one of the camera, or the other way round.
+        np.testing.assert_allclose(fixed.origin, np.linalg.inv(base)[:3, 3])
+        np.testing.assert_allclose(moving.origin, tool[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(found.causes[1].values, se3.adjoint(tool) @ causes[1].values)
+        assert found.chain is nominal
+        assert found.timeline.unit == "image"
+    nothing: Any = SimpleNamespace(session=None)
+    assert find_image_session(nominal, [images], (), lambda _: nothing, INDUSTRIAL) is None
+
+    def failing(_):
+        raise DhcalError("too few images")
+
+    assert find_image_session(nominal, [images], (), failing, INDUSTRIAL) is None

@@ -245,8 +245,8 @@ def find_shift(hand_eye: HandEyeData, causes: Causes) -> float:
     def cost(shift: float) -> float:
         return _cost(hand_eye, replace(causes, shift=shift), None)
 
-    best = min((0.0, *SHIFTS), key=cost)
-    if not best or cost(best) > MAX_SHIFT_COST * cost(0.0):
+    best = min(SHIFTS, key=cost)
+    if cost(best) >= MAX_SHIFT_COST * cost(0.0):
         return 0.0
     found = find_minimum(cost, best, _SHIFT_STEP, 0.5)
     return best if best.is_integer() and abs(found - best) < MAX_WHOLE_DIFFERENCE else found

@@ -445,7 +445,7 @@ def _find_causes(
         if state.error.pixels <= MAX_NOISE_RATIO * noise:
             break
         if least > MAX_ERROR_SHARE * state.error.pixels:
-            if state.is_displaced and state.error.pixels > MAX_NOISE_RATIO * state.noise:
+            if state.is_displaced:
                 found.append(_displacement(hand_eye, state))
             break
         equal = [name for name, each in states.items() if each.error.pixels <= MAX_TIE_RATIO * least]

@@ -87,7 +87,7 @@ def add_joint_errors(
         temperature,
         gate.n_configurations,
         random_ratio=random_ratio,
-        region_ratio=after / before if before else float("nan"),
+        region_ratio=after / before,
     )
     with_arm = gated.with_arm if gated.gate.is_open else opened
     gate = replace(gate, temperature=temperature)

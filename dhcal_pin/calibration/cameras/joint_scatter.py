@@ -95,7 +95,7 @@ def estimate_scatter(problem: Problem, x: Array) -> JointScatter:
         log_likelihoods.append(-log_determinant - system.min_cost / 2)
     best = max(log_likelihoods)
     density = np.exp(np.array(log_likelihoods) - best)
-    shares = (density[1:] + density[:-1]) / 2 * np.diff(scatters)
+    shares = (density[1:] + density[:-1]) * np.diff(scatters)
     squares = (scatters[1:] ** 2 + scatters[:-1] ** 2) / 2
     cumulated = np.append(0.0, np.cumsum(shares))
     largest = float(np.interp(CONFIDENCE * cumulated[-1], cumulated, scatters))

@@ -105,5 +105,5 @@ def _image_error(fit: Fit, parts: Sequence[tuple[Array, Sequence[Array]]]) -> Im
                 squares += float(np.sum(errors["pixels"] ** 2))
                 distances += float(np.sum(errors["board"] ** 2))
                 count += len(errors["pixels"])
-    count = max(count, 1)
-    return ImageError(float(np.sqrt(squares / count)), float(np.sqrt(distances / count)), count)
+    squares, distances = squares / max(count, 1), distances / max(count, 1)
+    return ImageError(float(np.sqrt(squares)), float(np.sqrt(distances)), count)

@@ -1,7 +1,7 @@
 """Mistakes in a rig or in the names of images, which are looked for before cameras and boards are fitted.
 
 `rig` corrects all of them. Each module finds one sort: values in the order of other axes (`axis_order`), and
-poses that are stated the other way round (`stated_poses`).
+poses that are stated the other way round (`inverse_poses`).
 """
 
 import lazy_loader

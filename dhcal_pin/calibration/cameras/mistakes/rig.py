@@ -9,7 +9,7 @@ from ....measurements.base import Measurement
 from ....robot.chain import Chain
 from ..stages import Stage
 from .axis_order import Exchange, axis_stages, exchange_axes, reorder
-from .stated_poses import PoseDifference, free_wrong_poses
+from .inverse_poses import PoseDifference, free_wrong_poses
 
 
 @frozen
