@@ -108,6 +108,15 @@ def test_changes_are_estimated_exactly_without_noise(kind):
         assert changed.is_changed(block)
 
 
+def test_what_two_samples_do_not_determine_is_pulled_to_no_change():
+    """An estimate from another start ends at the same change, which only its prior determines in part."""
+    model = model_of(positions(Q[:2]))
+    block = model._block("base")
+    start = changes_of(model, 0.3 * np.arange(1, 7) * block.sizes)
+    values, *_ = model.estimate(block, start)
+    np.testing.assert_allclose(values / block.sizes, 0, atol=1e-3)
+
+
 def test_the_covariance_of_a_fit_of_two_changes_is_that_of_normal_equations():
     model = model_of(positions(), uncertainty=uncertainty_of(1e-3))
     joints = [block for block in model.blocks if block.kind == "joint"][1:3]
