@@ -516,6 +516,21 @@ def test_joints_of_a_low_cost_arm_displace_the_tool():
         np.testing.assert_allclose(found[:, joint], twist, atol=1e-5)
 
 
+def test_images_have_the_covariance_of_displacements_by_joints():
+    servo = replace(ARMS["ur10"](), parameters=LOW_COST)
+    images = simulate(servo, servo, np.random.default_rng(2), is_on_wrist=True, n_images=6, sigma=0.2).exact
+    problem = make_problem(select_parameters(servo, "base"), (images,), np.ones(6), {})
+    x = np.concatenate([np.zeros(6), problem.instrument_start({})])
+    (found,) = jitter.with_jitter(problem, x, (images,), Jitter(0.3, 1e-7, 1e-7, 2e-3))
+    assert isinstance(found, CameraCorners)
+    step, values = 1e-6, problem.instruments(x)
+    turns = [images.replace(q=images.q + sign * step * axis) for axis in np.eye(6) for sign in (1, -1)]
+    pixels = [errors_of(turned, servo, values)["pixels"] for turned in turns]
+    moved = np.stack(np.subtract(pixels[::2], pixels[1::2]), -1) * 2e-3 / (2 * step)
+    covariances = (each @ each.swapaxes(1, 2) for each in (found.jitter, moved))
+    np.testing.assert_allclose(*covariances, rtol=1e-3, atol=1e-3)
+
+
 @pytest.mark.parametrize(("log_ratio", "temperature"), [(9.0, 1.6), (5.0, 1.0)])
 def test_images_that_share_no_displacement_with_joint_errors_count_in_full(
     monkeypatch, displaced, log_ratio, temperature
