@@ -555,6 +555,12 @@ def test_products_of_cells(edges):
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+def test_one_robot_can_change_in_base_tool_payload_and_zeros_at_a_sample():
+    steps = search_of(Changes())._steps_of_all(30)
+    assert [step.block.kind for step in steps] == ["base", "tool", *["joint"] * 6, "payload"]
+    assert {step.shape for step in steps} == {Step(30)}
+
+
 def test_costs_of_samples_grow_linearly_beyond_the_limit():
     residual = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [10.0, -10.0]])
     np.testing.assert_allclose(_bounded_cost(residual), 2 * np.array([1.0, 4.0, 8.0, 36.0]))
