@@ -525,8 +525,8 @@ def test_images_have_the_covariance_of_displacements_by_joints():
     assert isinstance(found, CameraCorners)
     step, values = 1e-6, problem.instruments(x)
     turns = [images.replace(q=images.q + sign * step * axis) for axis in np.eye(6) for sign in (1, -1)]
-    pixels = [errors_of(turned, servo, values)["pixels"] for turned in turns]
-    moved = np.stack(np.subtract(pixels[::2], pixels[1::2]), -1) * 2e-3 / (2 * step)
+    pixels = np.stack([errors_of(turned, servo, values)["pixels"] for turned in turns], -1)
+    moved = (pixels[..., ::2] - pixels[..., 1::2]) * 2e-3 / (2 * step)
     covariances = (each @ each.swapaxes(1, 2) for each in (found.jitter, moved))
     np.testing.assert_allclose(*covariances, rtol=1e-3, atol=1e-3)
 
