@@ -758,8 +758,11 @@ def with_shown_entries(data: Sequence[Measurement]) -> tuple[Measurement, ...]:
 def _solve_symmetric(matrices: Array, right: Array) -> Array:
     """Solve A·x = b for positive matrices (m, 2, 2), which rounding may make singular, and b (m, 2)."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    # Corners far outside of the image of a wrong model have squares that overflow.
+    scale = np.fmax(np.maximum(a, c), np.finfo(float).tiny)
+    a, b, c = a / scale, b / scale, c / scale
     determinant = np.maximum(a * c - b * b, np.finfo(float).eps * a * c)
-    x, y = right.T
+    x, y = right.T / scale
     numerators, is_known = np.stack([c * x - b * y, a * y - b * x], 1), determinant[:, None] > 0
     # NaN for a matrix of zeros, such as that of a corner behind the camera.
     return np.divide(numerators, determinant[:, None], np.full_like(numerators, np.nan), where=is_known)

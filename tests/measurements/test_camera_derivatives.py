@@ -11,6 +11,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration.cameras.jitter import Jitter, with_jitter
 from dhcal_pin.estimation.problem import Problem
 from dhcal_pin.measurements import CameraCorners
+from dhcal_pin.measurements.camera import _solve_symmetric
 from dhcal_pin.measurements.images.camera_parameters import camera_parameters
 from dhcal_pin.robot.conditions import Conditions
 
@@ -120,3 +121,13 @@ def test_units_and_priors_of_cameras_follow_from_their_names():
         assert len({found[name] for name in alike.split()}) == 1
     units = "m m m rad rad rad px px px px 1 1 1 1 1".split()
     assert [unit for unit, _ in found.values()] == units
+
+
+@pytest.mark.parametrize("size", [1e-170, 1.0, 1e170])
+def test_errors_at_the_board_are_solved_for_images_of_any_size(size):
+    rng = np.random.default_rng(0)
+    roots, right = rng.normal(size=(9, 2, 3)), rng.normal(size=(9, 2))
+    matrices = roots @ roots.swapaxes(1, 2)
+    expected = np.linalg.solve(matrices, right[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(size * _solve_symmetric(size * matrices, right), expected, rtol=1e-9)
+    assert np.isnan(_solve_symmetric(0 * matrices, right)).all()
