@@ -107,6 +107,11 @@ def exp_coefficients(angle: Array) -> tuple[Array, Array, Array]:
     return np.sinc(angle / np.pi), 0.5 * half**2, third
 
 
+def angles_of_traces(traces: Array) -> Array:
+    """Compute the angles of rotations from the traces of their matrices."""
+    return np.arccos(np.clip(0.5 * (traces - 1), -1, 1))
+
+
 def exp3(rotvec: ArrayLike) -> Array:
     """Compute rotation matrices from rotation vectors."""
     rotvec = np.asarray(rotvec, float)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,12 @@ z = {from = "Z", unit = "mm"}
 # Height of the shoulder and lengths of the links [mm]: of the paper's robot as designed, and of the robot
 # with errors that is measured here.
 DESIGNED, ACTUAL = (433, 400, 345), (436, 403, 343)
+
+
+def assert_harmless(text):
+    """Require a text without characters that a terminal acts on, but the ends of lines."""
+    assert {unicodedata.category(char) for char in text} & {"Cf", "Cs", "Zl", "Zp"} == set(), text
+    assert {char for char in text if unicodedata.category(char) == "Cc"} <= {"\n"}, text
 
 
 def unfolded(screen):

@@ -94,12 +94,7 @@ def choose_poses(link_poses: Array, candidates: Array) -> Array:
 def _angles(a: Array, p: Array, rotation_c: Array, rotation_b: Array) -> Array:
     """Return the angles (..., i, k) of rotations p (i, k, 3, 3) to those that camera and board predict."""
     predicted = rotation_c.swapaxes(-1, -2)[..., None, :, :] @ a @ rotation_b[..., None, :, :]
-    return _angles_of_traces(np.einsum("...iab,ikab->...ik", predicted, p))
-
-
-def _angles_of_traces(traces: Array) -> Array:
-    """Return the angles of rotations with these traces."""
-    return np.arccos(np.clip(0.5 * (traces - 1), -1, 1))
+    return se3.angles_of_traces(np.einsum("...iab,ikab->...ik", predicted, p))
 
 
 def _require_two_axes(rotations: Array, where: str) -> None:
@@ -119,7 +114,7 @@ def _require_two_axes(rotations: Array, where: str) -> None:
 def mean_pose(candidates: Array) -> Array:
     """Compute the mean of the poses of several images that agree best."""
     rotations = candidates[..., :3, :3]
-    angles = _angles_of_traces(np.einsum("jlab,ikab->jlik", rotations, rotations))
+    angles = se3.angles_of_traces(np.einsum("jlab,ikab->jlik", rotations, rotations))
     angles = angles.reshape(-1, *candidates.shape[:2])
     central = angles[np.argmin(np.sum(np.minimum(angles.min(2), _MAX_ANGLE), 1))]
     poses = candidates[np.arange(len(candidates)), np.argmin(central, 1)]

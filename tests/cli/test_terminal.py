@@ -5,20 +5,14 @@ import os
 import shutil
 import subprocess
 import sys
-import unicodedata
 from pathlib import Path
 
 import pytest
-from command_line import HEADER, positions_csv, stderr_of
+from command_line import HEADER, assert_harmless, positions_csv, stderr_of
 from robots import URDF
 
 # Clears the screen, rings the bell, turns the text around; also as a C1 control character.
 HOSTILE = "\x1b[2J\x07\u202e\x9b31m"
-
-
-def assert_harmless(text):
-    assert {unicodedata.category(char) for char in text} & {"Cf", "Cs", "Zl", "Zp"} == set()
-    assert {char for char in text if unicodedata.category(char) == "Cc"} <= {"\n"}
 
 
 def hostile_name(name):

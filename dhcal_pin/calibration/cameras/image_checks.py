@@ -105,8 +105,7 @@ def _angle_difference(chain: Chain, item: CameraCorners, sequence: Array) -> flo
 def _angles(poses: Array) -> Array:
     """Return the angles of the rotations between poses (n, 4, 4), shape (n, n) [rad]."""
     rotations = poses[:, :3, :3]
-    trace = np.einsum("aij,bij->ab", rotations, rotations)
-    return np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return se3.angles_of_traces(np.einsum("aij,bij->ab", rotations, rotations))
 
 
 # Share of the range of a joint below which a warning names it, and largest number of joints that it names.

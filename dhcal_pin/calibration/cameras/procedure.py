@@ -121,9 +121,9 @@ def calibrate_images(
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     max_error = fitting.arm_type.max_error
-    is_stuck = not (fit.solution.converged or fit.solution.iterations)
+    has_moved = fit.solution.converged or fit.solution.iterations
+    is_stuck = not has_moved and fitted_error(fit).pixels > max_error
     unrelated = find_unrelated_images(fit, holdout, chain, max_error)
-    is_stuck = is_stuck and fitted_error(fit).pixels > max_error
     if is_stuck and not unrelated and stated_poses(select_images(fit.data)):
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
