@@ -104,6 +104,8 @@ MAX_CAUSES, MAX_ITERATIONS, N_PASSES = 8, 8, 12
 MIN_NOISE = 1e-3
 # Passes end when no weight and no noise changes by more than this.
 PASS_TOL = 0.01
+# Smallest effect of a cause in the linear model for a fit with the cause: half of that of one that is kept.
+MIN_LINEAR_EFFECT = 0.5 * MIN_EFFECT
 # Share of the information about a cause that the fit leaves even if it can explain all of it.
 MIN_UNEXPLAINED = 1e-8
 # Two robots are named if they lower the logarithm of the noise by this, beyond what more parameters and steps
@@ -540,20 +542,38 @@ class _Search:
             self._add(gross)
             fit = self._fit()
         fit = self.iterate(fit)
+        candidates = list(self._candidates(fit))
         while len(self.causes) < MAX_CAUSES:
-            found = self.best_cause(fit)
+            left = [each for each in candidates if (each.block, type(each.shape)) not in self.rejected]
+            found = max(left, key=lambda cause: cause.log_evidence, default=None)
             if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
                 break
-            before = self.x, self.changes, [*self.causes]
-            settled, evidence = self._settle_with(found)
-            if evidence >= MIN_LOG_EVIDENCE:
-                fit = settled
-                continue
-            self.x, self.changes, self.causes = before
+            if self._can_have_effect(fit, found):
+                before = self.x, self.changes, [*self.causes]
+                settled, evidence = self._settle_with(found)
+                if evidence >= MIN_LOG_EVIDENCE:
+                    fit, candidates = settled, list(self._candidates(settled))
+                    continue
+                self.x, self.changes, self.causes = before
             self.rejected.add((found.block, type(found.shape)))
             if len(self.rejected) > MAX_REJECTED:
                 break
         self._confirm()
+
+    def _can_have_effect(self, fit: LinearFit, found: Cause) -> bool:
+        """Return whether the linear model shows enough effect of a cause that is not in a fit."""
+        if found.block.kind == "lag":
+            return True  # Its effect is not linear.
+        trial = copy.copy(self)
+        trial.rows, trial.causes = fit.rows, [*self.causes]
+        trial._add(found)
+        with_cause = trial.solve(fit.rows, trial.causes)
+        # A step concerns fewer samples than a drift.
+        if trial._change_drifts(with_cause):
+            with_cause = trial.solve(fit.rows, trial.causes)
+        cause = trial.causes[-1]
+        values = with_cause.step[-len(cause.values) :]
+        return self._effect(fit, replace(cause, values=values)) >= MIN_LINEAR_EFFECT
 
     def _settle_with(self, found: Cause) -> tuple[LinearFit, float]:
         """Fit with one more cause and those of its outliers, and return the smallest evidence of them."""

@@ -118,6 +118,8 @@ def test_only_an_order_shows_lags_and_drifts(monkeypatch):
     assert search.paths is not None
     lag, links = (cause_of(search, kind, Constant()).block for kind in ("lag", "links"))
     assert search._kinds(lag) == [Constant]
+    # Its linear effect does not say how large it is.
+    assert search._can_have_effect(search.first_fit, cause_of(search, "lag", Constant()))
     assert search._kinds(links) == [Drift, FreeDrift]
     search.causes = [cause_of(search, "lag", Constant())]
     assert search._kinds(lag) == [Step, Drift]
@@ -311,6 +313,19 @@ def test_a_drift_becomes_what_fits_best(changes, begun, shape):
     assert [cause.shape for cause in search.causes] == [Step(20), shape or begun]
     # What another function of time explained is no longer part of the robot.
     assert (not search.changes.base.drifts) == isinstance(shape, Step)
+
+
+@pytest.mark.parametrize(
+    ("length", "shape", "can_have"),
+    [(2e-3, Step(30), True), (2e-3, FreeDrift(0.0, 59.0), True), (0.0, Step(30), False)],
+)
+def test_a_cause_is_fitted_if_the_linear_model_shows_an_effect(length, shape, can_have):
+    search = search_of(Changes("base", length))
+    fit = search.iterate(search._fit())
+    state = search.x, search.changes, list(search.causes), search.rows
+    assert search._can_have_effect(fit, cause_of(search, "base", shape)) == can_have
+    assert not search._can_have_effect(fit, cause_of(search, "tool", Step(15)))
+    assert (search.x, search.changes, search.causes, search.rows) == state
 
 
 def test_a_lag_is_found_from_which_a_search_begins():
