@@ -130,7 +130,7 @@ class Problem:
         model = self.errors.derivative(x[:n_robot])
         size, rates = 1.0, np.zeros((n_robot, 4))
         if self.scale_gauge:
-            size, rates = self.scale_gauge.size(model[0]), self.scale_gauge.rates(*model)
+            size, rates = self.scale_gauge.size_and_rates(*model)
         n_coefficients = self.errors.n_coefficients
         return Linearization(*model, self.instruments(x), columns, size, rates, n_coefficients)
 

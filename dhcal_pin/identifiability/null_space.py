@@ -188,8 +188,8 @@ class ObservabilityProbe:
         if gauge is None:
             return False
         n_robot = len(problem.errors.parameters)
-        growth = gauge.rates(*problem.errors.derivative(self.x[:n_robot]))[:, 0]
-        return bool(np.abs(growth @ qr.null_space(self.r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
+        _, rates = gauge.size_and_rates(*problem.errors.derivative(self.x[:n_robot]))
+        return bool(np.abs(rates[:, 0] @ qr.null_space(self.r)[:n_robot]).max(initial=0.0) > NEGLIGIBLE)
 
     def null_space_layers(self, r: Array) -> list[tuple[Cause, Array]]:
         """Split the null space by cause."""

@@ -165,7 +165,7 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
     values, gauge = problem.instruments(full), problem.scale_gauge
     size, gauge_rates = 1.0, np.zeros((len(bodies), 4))
     if gauge:
-        size, gauge_rates = gauge.size(chain), gauge.rates(chain, bodies, twists)
+        size, gauge_rates = gauge.size_and_rates(chain, bodies, twists)
     count, width = sum(len(item.rows) for item in data), max(item.residual_dim for item in data)
     out, start = np.zeros((layout.n_columns, width, count)), 0
     instrument_columns = {

@@ -37,46 +37,51 @@ from ... import se3
 from ..._frozen import frozen
 from ..._typing import Array
 from ...robot.chain import Chain
+from ...robot.conditions import SampleState
 
 # Number of configurations at which size and rotation are evaluated.
 _N_SAMPLES = 100
+# Smallest moment of inertia relative to the largest one.
+_MIN_INERTIA = 1e-15
 
 
 @frozen(eq=False)
 class ScaleGauge:
     """Size of a robot and its rates of growth and rotation."""
 
-    q: Array  # Joint positions of shape (c, n) [rad or m]
+    state: SampleState  # Joint state at c configurations
     nominal: float  # RMS distance of the nominal tool from its mean position [m]
 
     @classmethod
     def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:
         """Choose configurations by drawing each joint from the measured ones."""
         rng = np.random.default_rng(0)
-        drawn = np.stack([rng.choice(column, _N_SAMPLES) for column in q.T], 1)
-        return cls(drawn, _rms_radius(_centered(chain.forward_kinematics(drawn).tool[3])))
+        state = chain.joint_state(np.stack([rng.choice(column, _N_SAMPLES) for column in q.T], 1))
+        return cls(state, _rms_radius(_centered(chain.forward_kinematics(state).tool[3])))
 
     def size(self, chain: Chain) -> float:
         """Compute the size of a chain."""
         if not self.nominal:
             return 1.0
-        return _rms_radius(_centered(chain.forward_kinematics(self.q).tool[3])) / self.nominal
+        return _rms_radius(_centered(chain.forward_kinematics(self.state).tool[3])) / self.nominal
 
-    def rates(self, chain: Chain, bodies: Array, twists: Array) -> Array:
-        """Compute growth rate and mean angular velocity in the measuring frame per unit error, (e, 4)."""
+    def size_and_rates(self, chain: Chain, bodies: Array, twists: Array) -> tuple[float, Array]:
+        """Compute the size, and growth and angular velocity in the measuring frame per unit error, (e, 4)."""
         rates = np.zeros((len(bodies), 4))
-        if self.nominal:
-            frames = chain.forward_kinematics(self.q)
-            offsets = _centered(frames.tool[3])
-            velocities = chain.tool_jacobian(frames, bodies, twists)[:, :3]
-            rates[:, 0] = np.tensordot(velocities, offsets) / (
-                _N_SAMPLES * _rms_radius(offsets) * self.nominal
-            )
-            inertia = np.vdot(offsets, offsets) * np.eye(3) - offsets @ offsets.T
-            product = offsets @ velocities.swapaxes(1, 2)
-            turned = (product - product.swapaxes(1, 2))[:, [1, 2, 0], [2, 0, 1]]
-            rates[:, 1:] = turned @ np.linalg.pinv(inertia, hermitian=True)
-        return rates
+        if not self.nominal:
+            return 1.0, rates
+        frames = chain.forward_kinematics(self.state)
+        offsets = _centered(frames.tool[3])
+        radius, velocities = _rms_radius(offsets), chain.tool_jacobian(frames, bodies, twists)[:, :3]
+        rates[:, 0] = np.tensordot(velocities, offsets) / (_N_SAMPLES * radius * self.nominal)
+        inertia = np.vdot(offsets, offsets) * np.eye(3) - offsets @ offsets.T
+        product = offsets @ velocities.swapaxes(1, 2)
+        turned = (product - product.swapaxes(1, 2))[:, [1, 2, 0], [2, 0, 1]]
+        values, axes = np.linalg.eigh(inertia)
+        # Points on a line do not show the rotation about it.
+        is_shown = values > _MIN_INERTIA * values[-1]
+        rates[:, 1:] = (turned @ axes[:, is_shown] / values[is_shown]) @ axes[:, is_shown].T
+        return radius / self.nominal, rates
 
 
 def _centered(points: Array) -> Array:
