@@ -494,6 +494,8 @@ def test_a_touched_base_is_stated_by_its_points():
     points = np.array([[values[f"point_{name}.{axis}"] for axis in "xyz"] for name in ("p1", "p2", "p3")])
     np.testing.assert_allclose(se3.transform_points(search._base(), found), points, atol=1e-12)
     assert search.stated(cause_of(search, "tool", Step(20))).block.touched is None
+    drifting = search.stated(cause_of(search, "base", Drift(3.0, 32.0))).block.touched
+    np.testing.assert_array_equal(drifting, found)
 
 
 def test_two_robots_are_told_from_one():
