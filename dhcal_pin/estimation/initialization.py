@@ -331,7 +331,8 @@ def compare_tools(
     for each in chains:
         items = tuple(item.initialized(each) for item in drawn)
         problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
-        costs.append(problem.cost(np.zeros(len(problem.weights))))
+        residuals = problem.residuals(np.zeros(len(problem.weights)), items)
+        costs.append(sum(float(np.vdot(each, each)) for each in residuals))
     best = np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]
     fits = [_fit_frames(replace(frames, chain=chains[k]), drawn, known, max_iterations) for k in best]
     return replace(started, chain=min(fits, key=lambda each: each[0])[1])
