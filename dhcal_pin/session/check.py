@@ -989,10 +989,12 @@ def _is_possible(slip: Slip) -> bool:
 
 def _robot_sentence(judge: _CheckModel | None) -> str:
     """Say that no single part changed, and whether the base may have moved during the check."""
-    slip = judge and judge.slip()
-    if slip and not (_is_possible(slip) and slip.lead > -MAX_EQUAL):
-        return "More than one part of the robot changed, or the origin of a joint: calibrate again."
-    place = f", from {judge.place(slip.first)} on" if judge and slip else ""
+    place = ""
+    if judge:
+        slip = judge.slip()
+        if not (_is_possible(slip) and slip.lead > -MAX_EQUAL):
+            return "More than one part of the robot changed, or the origin of a joint: calibrate again."
+        place = f", from {judge.place(slip.first)} on"
     return (
         "More than one part of the robot changed, or the origin of a joint, or the base or the instrument "
         f"moved during the check{place}. Fasten both, and measure again; with the same answer, calibrate "

@@ -245,10 +245,11 @@ def test_exchanges_of_axes_say_where_and_how_they_were_found():
     )
     assert "u and v are exchanged in the measurements: with" in replace(found, what="u and v").sentence
     size = Exchange("c", "width and height", None, None)
-    assert size.sentence == (
-        "camera 'c': width and height are exchanged in the rig file: corners lie outside its images, and "
-        "inside if they are exchanged. Correct them."
-    )
+    for each in (size, replace(size, stated=errors[0]), replace(size, exchanged=errors[1])):
+        assert each.sentence == (
+            "camera 'c': width and height are exchanged in the rig file: corners lie outside its images, and "
+            "inside if they are exchanged. Correct them."
+        )
     (stage,) = axis_stages([found, size])
     assert (stage.name, stage.is_kept, stage.n_unknowns, stage.fitted) == ("axis order", True, 12, errors[0])
     assert stage.reason == found.sentence

@@ -150,6 +150,16 @@ def rail():
     return Chain.from_urdf(parse_urdf(RAIL.encode(), "rail"), "c")
 
 
+def gantry():
+    """Return an arm with a revolute joint on two rails."""
+    rails = (
+        '<link name="d"/><joint name="y" type="prismatic"><parent link="d"/><child link="a"/>'
+        '<origin xyz="0 0 0"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    return Chain.from_urdf(parse_urdf(RAIL.replace("</robot>", f"{rails}</robot>").encode(), "gantry"), "c")
+
+
 def joint_step(index, number, *, size=2e-3, std=1e-4):
     """Return a step of the zero of a joint."""
     block = Block("joint", f"j{index}", np.array([index]), np.array([0.5]), index)
@@ -196,6 +206,14 @@ def test_events_are_in_the_order_of_measurement_with_their_places_and_rivals(kin
         timeline,
     )
     assert of_base.rivals == (("touched object",) if kind is PointContact else ())
+
+
+def test_rails_before_the_first_revolute_joint_move_the_arm_as_the_base_does():
+    (item,) = files_of(9)
+    timeline = order_samples((item.replace(q=np.pad(item.q, ((0, 0), (0, 1)))),), ())
+    for index, rivals in enumerate([("base",), ("base",), ()]):
+        (event,) = describe_events((joint_step(index, 3),), RobotChanges(), gantry(), timeline)
+        assert event.rivals == rivals
 
 
 def test_a_lag_is_no_event_and_no_drift():

@@ -10,8 +10,9 @@ from sessions import NOISE, Changes, Simulation, search_of, searched
 
 from dhcal_pin import se3
 from dhcal_pin.measurements import PointContact, PointDistance, Pose, Position
+from dhcal_pin.robot.error_families import MIN_TORQUE
 from dhcal_pin.session import search as search_module
-from dhcal_pin.session.causes import Block, Cause, Constant, Drift, FreeDrift, Step
+from dhcal_pin.session.causes import HELD_SIZE, Block, Cause, Constant, Drift, FreeDrift, Step
 from dhcal_pin.session.linear_model import covariance_root, inverse, measures_positions, solve_information
 from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.search import (
@@ -668,6 +669,12 @@ def test_causes_have_the_sizes_that_move_the_tool_by_a_metre(kind):
         block = sizes["scale", axis, 1]
         assert (block.columns[0], block.index, block.is_constant) == (layout.scale + 1 + i, i + 1, True)
     assert sizes["lag", "", 1].columns[0] == layout.lag == layout.n_columns - 2
+    # A payload bends the joint with the largest torque as if the tool moved by a metre.
+    torques = np.abs(chain.loads.torques_per_kilogram(layout.problem.data[0].q.T)).max(1)
+    payload = sizes["payload", "", 6].sizes
+    np.testing.assert_allclose(
+        payload, np.where(torques > MIN_TORQUE, 1 / (length * torques.max()), HELD_SIZE)
+    )
     grows = [block for (kind, *_), block in sizes.items() if kind == "links"]
     assert len(grows) == 2
     assert all(block.sizes == pytest.approx(1 / length) for block in grows)
