@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from sessions import NOISE, Changes, Simulation, search_of, searched
 
-from dhcal_pin import se3
+from dhcal_pin import se3, select_parameters
+from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.measurements import PointContact, PointDistance, Pose, Position
 from dhcal_pin.robot.error_families import MIN_TORQUE
 from dhcal_pin.session import search as search_module
@@ -27,6 +28,7 @@ from dhcal_pin.session.search import (
     _is_part_of_model,
     _predicted_gain,
     can_have_session,
+    find_session,
     has_enough_rows,
 )
 from dhcal_pin.session.timeline import order_samples
@@ -447,6 +449,19 @@ def test_causes_are_found_confirmed_and_placed(changes):
     assert size == pytest.approx(changes.length, rel=0.1) or changes.angle
     assert search.with_lag_alone() is None
     assert search.stated(cause) is cause
+
+
+@pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
+def test_a_search_that_ends_with_more_noise_than_it_began_with_finds_nothing(monkeypatch, rise, is_found):
+    def log_noise(self, fit):
+        return 0.0 if fit is self.first_fit else rise
+
+    monkeypatch.setattr(search_module._Search, "log_noise", log_noise)
+    problem = search_of(Changes("base", 2e-3)).layout.problem
+    errors = select_parameters(problem.errors.chain, "minimal,base,tool")
+    problem = make_problem(errors, problem.data, 1 / errors.priors, {})
+    session = find_session(problem, np.zeros(len(problem.weights)), (), is_ordered=True)
+    assert session.changes.is_empty != is_found
 
 
 def test_steps_are_placed_among_held_out_samples():
