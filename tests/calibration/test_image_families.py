@@ -118,15 +118,18 @@ def test_prior_widths_of_the_gate_have_the_greatest_evidence(plain, temperature)
         assert log_evidence(weights) < log_evidence(best)
 
 
-def test_corners_that_become_unknowns_have_no_bounds(plain):
+def test_corners_that_become_unknowns_have_no_bounds_and_their_priors(plain):
     bounds = np.outer([-1.0, 1.0], 1 + np.abs(plain.x))
-    problem = replace(plain.problem, bounds=bounds)
+    problem = replace(plain.problem, bounds=bounds, temperature=4.0)
     fit = Fit(plain.data, problem, plain.solution, plain.weights)
     freed = with_free_points(fit, [plain.data[0].rig.boards[0].name])
     n_more = len(freed.solution.x) - len(plain.x)
     assert n_more > 0
     expected = np.concatenate([bounds, np.outer([-np.inf, np.inf], np.ones(n_more))], 1)
     np.testing.assert_array_equal(freed.problem.bounds, expected)
+    # Their priors are those of boards, at the temperature of the residuals.
+    priors = np.array([p.prior for p in freed.problem.parameters[-n_more:]])
+    np.testing.assert_allclose(freed.problem.weights[-n_more:], 2 / priors)
 
 
 def test_play_and_sag_are_selected_and_corrected(shot, plain, fit):

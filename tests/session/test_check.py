@@ -800,6 +800,7 @@ def test_two_changes_are_named_if_only_one_pair_explains_the_samples():
         assert (found.verdict, found.what, found.has_several) == ("changed", "base and joint j0", True)
         first, second = found.changes
         assert (first.size, first.std, first.angle) == pytest.approx((5e-3, 1e-4, 0.5))
+        assert (first.share, second.share) == (1.0, 1.0)
         assert (second.size, second.std, second.unit, second.angle) == (0.01, pytest.approx(1e-4), "rad", 0.0)
         assert found.reasons[0].startswith("The base or the instrument moved by 5.00 mm and turned by 28.6")
         assert found.reasons[1].startswith("The zero of joint j0 changed by ")

@@ -451,6 +451,20 @@ def test_causes_are_found_confirmed_and_placed(changes):
     assert search.stated(cause) is cause
 
 
+def test_the_evidence_of_a_cause_has_the_information_of_the_samples_without_that_of_its_prior():
+    search = search_of(Changes())
+    cause = cause_of(search, "base", Step(30), 0.1)
+    search.causes = [cause]
+    fit, information = search.solve(search.rows, search.causes), np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0])
+    covariance = np.eye(len(fit.prior))
+    covariance[-6:, -6:] = np.diag(cause.sizes**2 / (information + 1))
+    vars(fit)["covariance"] = covariance
+    squares = WIDTHS[:, None] ** 2
+    cost = np.log1p(squares * information) + (cause.values / cause.sizes) ** 2 / squares
+    expected = -0.5 * cost.sum(1).min() - np.log(len(search.edges)) - np.log(len(search.layout.blocks))
+    assert search._log_evidence(cause, 0, fit, fit) == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
 def test_a_search_that_ends_with_more_noise_than_it_began_with_finds_nothing(monkeypatch, rise, is_found):
     def log_noise(self, fit):
