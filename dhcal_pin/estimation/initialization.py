@@ -60,6 +60,7 @@ from ..robot.chain import BASE_FRAME, Chain
 from ..se3 import nearest_rotation
 from .error_model import ErrorModel
 from .problem import Problem, linear_system, merge_instrument_parameters
+from .qr import sum_of_squares
 from .solver import SolverResult, complete, minimize
 
 # Spacing of the grid of tool offsets that are tried [m].
@@ -331,8 +332,9 @@ def compare_tools(
     for each in chains:
         items = tuple(item.initialized(each) for item in drawn)
         problem = make_problem(ErrorModel(each, ()), items, np.empty(0), known)
+        # Each chain is the nominal one of its problem: the size of the robot does not count.
         residuals = problem.residuals(np.zeros(len(problem.weights)), items)
-        costs.append(sum(float(np.vdot(each, each)) for each in residuals))
+        costs.append(sum(map(sum_of_squares, residuals)))
     best = np.argsort(costs, kind="stable")[:_MAX_CANDIDATES]
     fits = [_fit_frames(replace(frames, chain=chains[k]), drawn, known, max_iterations) for k in best]
     return replace(started, chain=min(fits, key=lambda each: each[0])[1])

@@ -372,7 +372,11 @@ class _Search:
     # ------------------------------------------------------------------------------------------- test
     def best_cause(self, fit: LinearFit) -> Cause | None:
         """Return the cause of greatest evidence that is not in a fit."""
-        return max(self._candidates(fit), key=lambda cause: cause.log_evidence, default=None)
+        return next(iter(self._ranked_causes(fit)), None)
+
+    def _ranked_causes(self, fit: LinearFit) -> list[Cause]:
+        """Return the causes that are not in a fit, that of greatest evidence first."""
+        return sorted(self._candidates(fit), key=lambda cause: -cause.log_evidence)
 
     def _candidates(self, fit: LinearFit) -> Iterator[Cause]:
         """Yield the causes that are not in a fit, the function of time of greatest evidence of each."""
@@ -542,17 +546,16 @@ class _Search:
             self._add(gross)
             fit = self._fit()
         fit = self.iterate(fit)
-        candidates = list(self._candidates(fit))
-        while len(self.causes) < MAX_CAUSES:
-            left = [each for each in candidates if (each.block, type(each.shape)) not in self.rejected]
-            found = max(left, key=lambda cause: cause.log_evidence, default=None)
-            if not found or found.log_evidence < MIN_PROPOSED_EVIDENCE:
+        ranked = self._ranked_causes(fit)
+        while ranked and len(self.causes) < MAX_CAUSES:
+            found = ranked.pop(0)
+            if found.log_evidence < MIN_PROPOSED_EVIDENCE:
                 break
             if self._can_have_effect(fit, found):
                 before = self.x, self.changes, [*self.causes]
                 settled, evidence = self._settle_with(found)
                 if evidence >= MIN_LOG_EVIDENCE:
-                    fit, candidates = settled, list(self._candidates(settled))
+                    fit, ranked = settled, self._ranked_causes(settled)
                     continue
                 self.x, self.changes, self.causes = before
             self.rejected.add((found.block, type(found.shape)))
