@@ -255,6 +255,7 @@ def convert_robot(
     convention: Convention | None = None,
     template: PathLike | None = None,
     template_tip: str | None = None,
+    root: str | None = None,
 ) -> ConvertedRobot:
     """Convert a robot file to the format of the ending of the target; return its text, and notes."""
     robot_format = find_format(target)
@@ -268,19 +269,24 @@ def convert_robot(
                 f"{os.fspath(target)}: a URDF has no DH convention; leave out --convention"
             )
         if template is not None:
-            return _with_template(source, target, tip, template, template_tip)
+            return _with_template(source, target, tip, template, template_tip, root)
         if source_format is None or source_format.read_urdf is not None:
             return _copy(source, target, _read_urdf(source))
     elif template is not None:
         raise InvalidArgumentError(f"{os.fspath(target)}: only a URDF or an MJCF has a template")
-    chain, table = _read(source, tip, None)
+    chain, table = _read(source, tip, None, root=root)
     robot = RobotSource(chain.urdf_alone, table, convention)
     converted = robot_format.convert(robot, target)
     return ConvertedRobot(converted.text, [*converted.notes, *_notes_on_sidecar(source)])
 
 
 def _with_template(
-    source: PathLike, target: PathLike, tip: str | None, template: PathLike, template_tip: str | None
+    source: PathLike,
+    target: PathLike,
+    tip: str | None,
+    template: PathLike,
+    template_tip: str | None,
+    root: str | None,
 ) -> ConvertedRobot:
     """Write the kinematics of a robot into another file of it."""
     nominal = None if has_dh_table(template) else _read_urdf(resolve_robot_file(template))
@@ -292,19 +298,19 @@ def _with_template(
     notes: list[str] = []
     source_format = find_format(source)
     if source_format is not None and source_format.correct is not None:
-        robot, applied = source_format.correct(source, Chain.from_urdf(nominal, template_tip or tip))
+        robot, applied = source_format.correct(source, Chain.from_urdf(nominal, template_tip or tip, root))
         notes += applied
     else:
-        robot = _read(source, tip, None)[0].urdf_alone
+        robot = _read(source, tip, None, root=root)[0].urdf_alone
     if template_tip is None and robot.tip not in nominal.links:
         raise InvalidArgumentError(
             f"{nominal.source}: no link {quote(robot.tip)} as in {robot.urdf.source}; name the same frame "
             f"with --template-tip: {suggest_names(robot.tip, nominal.links)}"
         )
-    nominal_chain = Chain.from_urdf(nominal, template_tip or robot.tip)
+    nominal_chain = Chain.from_urdf(nominal, template_tip or robot.tip, root)
     filled = with_kinematics(nominal_chain, robot, template)
     data, urdf = with_written_origins(nominal, joint_origins(filled)[0], target)
-    parsed = Chain.from_urdf(urdf, filled.tip)
+    parsed = Chain.from_urdf(urdf, filled.tip, root)
     q = _random_positions(len(robot.moving_joints))
     ideal = replace(robot, base=np.eye(4), tool=np.eye(4))
     difference = np.abs(without_mimics(parsed).poses(q) - without_mimics(ideal).poses(q)).max()

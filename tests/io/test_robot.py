@@ -1,12 +1,14 @@
 """Robot files: formats by ending, reading and converting."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import URDF, write
 
 from dhcal_pin import se3
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.io import FORMATS, convert_robot, read_robot, robot, robot_name, urdf_files
+from dhcal_pin.io import FORMATS, convert_robot, read_robot, robot, robot_name, urdf_files, write_urdf
 from dhcal_pin.io.robot import find_format, has_dh_table
 
 TABLE, ROBOT = URDF / "ur10.dh.toml", URDF / "sim_6dof.urdf"
@@ -71,6 +73,23 @@ def test_a_converted_robot_has_the_same_poses(tmp_path, robot_format):
         arm, again = read_robot(TABLE), read_robot(path)
         q = np.random.default_rng(0).uniform(-3, 3, (20, arm.n_joints))
         np.testing.assert_allclose(again.poses(q), arm.poses(q), atol=1e-12)
+
+
+def test_a_converted_robot_begins_at_the_root_that_is_named(tmp_path):
+    """Joints before it are those of the template."""
+    arm = read_robot(ROBOT, root="link_2")
+    assert arm.n_joints < read_robot(ROBOT).n_joints
+    q = np.random.default_rng(0).uniform(-3, 3, (20, arm.n_joints))
+    path = write(tmp_path, "arm.dh.toml", convert_robot(ROBOT, "arm.dh.toml", root="link_2").text)
+    np.testing.assert_allclose(read_robot(path).poses(q), arm.poses(q), atol=1e-12)
+
+    origins = se3.exp6(1e-3 * np.random.default_rng(1).normal(size=(len(arm.origins), 6)))
+    write_urdf(replace(arm, origins=arm.origins @ origins), tmp_path / "moved.urdf")
+    text = convert_robot(tmp_path / "moved.urdf", "out.urdf", template=ROBOT, root="link_2").text
+    filled = write(tmp_path, "out.urdf", text)
+    moved = read_robot(tmp_path / "moved.urdf", root="link_2")
+    np.testing.assert_allclose(read_robot(filled, root="link_2").poses(q), moved.poses(q), atol=1e-12)
+    assert np.array_equal(read_robot(filled).origins[0], read_robot(ROBOT).origins[0])
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def _convert_robot(args: Namespace) -> tuple[str, Sequence[str]]:
     if args.template_tip and not args.template:
         raise InvalidArgumentError("--template-tip: needs --template, the file that it is in")
     return io.convert_robot(
-        args.input, args.output, args.tip, args.convention, args.template, args.template_tip
+        args.input, args.output, args.tip, args.convention, args.template, args.template_tip, args.root
     )
 
 
