@@ -535,7 +535,8 @@ def _has_counts(fit: Evidence) -> bool:
 
 def _usual_errors(fit: Evidence) -> str:
     """Return the parameter sets of the errors that such a robot usually has."""
-    return HAND_BUILT if fit.signs or _has_counts(fit) else MANUFACTURED
+    is_hand_built = fit.errors.chain.parameters == HAND_BUILT or _has_counts(fit)
+    return HAND_BUILT if is_hand_built else MANUFACTURED
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, bool, str], float]:

@@ -212,7 +212,7 @@ def calibrate(
             lambda fit: (
                 supported(fit, AUTO, setup.families) if setup.families else (fit, model_selection.Extension())
             ),
-            HAND_BUILT if setup.signs else MANUFACTURED,
+            HAND_BUILT if setup.chain.parameters == HAND_BUILT else MANUFACTURED,
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
     groups = groups_of(begun.fit)

@@ -12,12 +12,13 @@ from touching_arms import NOMINAL as TOUCHING
 from touching_arms import TouchingArm
 
 from dhcal_pin.calibration import calibrate
+from dhcal_pin.calibration.evidence import _usual_errors
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io.servo_file import read_servos
-from dhcal_pin.measurements import Pose, Position, Wires
+from dhcal_pin.measurements import Noise, Pose, Position, Wires
 from dhcal_pin.plausibility import decide_signs
 from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
-from dhcal_pin.plausibility.evidence import HAND_BUILT, fit_evidence
+from dhcal_pin.plausibility.evidence import HAND_BUILT, MANUFACTURED, fit_evidence
 from dhcal_pin.plausibility.hypotheses import list_hypotheses, mend, ratio_hypothesis
 from dhcal_pin.plausibility.mixups import diagnose_mixups
 from dhcal_pin.plausibility.signs import known_signs
@@ -199,6 +200,14 @@ def test_exchanged_links_of_camera_and_board_are_named(seed):
     )
     with pytest.raises(InvalidArgumentError, match=message):
         decide_signs(shot.nominal, [images.with_rig(stated)])
+
+
+@pytest.mark.parametrize(("parameters", "expected"), [(None, MANUFACTURED), (HAND_BUILT, HAND_BUILT)])
+def test_known_signs_do_not_make_an_arm_hand_built(parameters, expected):
+    rng = np.random.default_rng(0)
+    data = Position.simulate(NOMINAL, rng.uniform(-1, 1, (30, 5)), Noise(1e-4), rng)
+    fit = calibrate(NOMINAL, data, parameters, turned="none", extend="none", session="off")
+    assert _usual_errors(fit) == expected
 
 
 def test_turned_joints_turn_the_other_way_in_the_urdf():
