@@ -18,6 +18,8 @@ from dhcal_pin.session.linear_model import covariance_root, inverse, measures_po
 from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.search import (
     HUBER_LIMIT,
+    MAX_ITERATIONS,
+    MAX_MOVES,
     OUTLIER_WEIGHT,
     WIDTHS,
     _bounded_cost,
@@ -463,6 +465,281 @@ def test_the_evidence_of_a_cause_has_the_information_of_the_samples_without_that
     cost = np.log1p(squares * information) + (cause.values / cause.sizes) ** 2 / squares
     expected = -0.5 * cost.sum(1).min() - np.log(len(search.edges)) - np.log(len(search.layout.blocks))
     assert search._log_evidence(cause, 0, fit, fit) == pytest.approx(expected, rel=1e-9)
+
+
+# ------------------------------------------------------------------------------- fits and their evidence
+@pytest.mark.parametrize(
+    ("number", "inside", "predicted", "is_supported"),
+    [
+        (30, 46.0, 18.5, True),
+        (30, 46.0, 18.3, False),  # left-out blocks show less than 0.4 of it
+        (30, 44.0, 44.0, False),  # an RMS effect below 0.5 on 180 rows
+        (54, 10.0, 10.0, True),
+        (54, 8.0, 8.0, False),  # on 36 rows
+        (None, 91.0, 91.0, True),
+        (None, 89.0, 89.0, False),  # on all rows
+        (None, -1.0, -1.0, False),
+    ],
+)
+def test_a_cause_needs_an_effect_that_left_out_blocks_show(
+    monkeypatch, number, inside, predicted, is_supported
+):
+    search, given = search_of(Changes("base", 2e-3)), []
+    shape = Drift(0.0, 59.0) if number is None else Step(number)
+    search.causes = [cause_of(search, "tool", Step(40), 1e-4), cause_of(search, "base", shape, 1e-3)]
+    search._drop_others()
+    search._advance(replace(search._fit(), step=np.zeros(len(search.x) + 12)))
+    full = search._fit()
+
+    def predicted_gain(*args):
+        given.append(args)
+        return inside, predicted
+
+    monkeypatch.setattr(search_module, "_predicted_gain", predicted_gain)
+    monkeypatch.setattr(search, "_log_evidence", lambda *args: 7.0)
+    judged = search._judge(search.rows, full, 1)
+    assert judged.log_evidence == (7.0 if is_supported else -np.inf)
+    # 20 blocks, but 6 on the shorter side of a step.
+    (((without, with_it), prior, begin, length),) = given
+    assert (begin, length) == (0, pytest.approx({30: 3.0, 54: 1.0, None: 3.0}[number]))
+    np.testing.assert_array_equal(prior, full.prior)
+    # Both models explain the residuals of a robot without the cause, with the weights of the fit with it.
+    root = (np.sqrt(full.weights)[:, None] / full.noise)[..., None]
+    rows = search._linearized_without(1)
+    other = search.causes[0].columns_of(rows, search.numbers, search.times)
+    expected = np.concatenate([rows[..., search.layout.model], other, rows[..., -1:]], -1)
+    np.testing.assert_allclose(without, root * expected)
+    np.testing.assert_allclose(with_it[..., :-1], root * full.columns)
+    own = full.columns[..., -6:] @ search.causes[1].values
+    np.testing.assert_allclose(with_it[..., -1], root[..., 0] * (search.rows[..., -1] + own))
+
+
+@pytest.mark.parametrize("shape", [Step(30), Drift(0.0, 59.0), FreeDrift(0.0, 59.0)])
+def test_the_evidence_of_a_cause_has_the_costs_of_both_fits_in_the_noise_of_the_full_one(shape):
+    """A sample costs at most the number of its rows and 16."""
+    search = search_of(Changes())
+    cause, other = cause_of(search, "base", shape), cause_of(search, "tool", Step(20))
+    search.causes = [other, cause, other]
+    full = search.solve(search.rows, search.causes)
+    size = np.full((60, 6), np.sqrt(1 / 6))
+    size[:2], size[2:4] = np.sqrt(23 / 6), np.sqrt(21 / 6)
+    full = replace(full, residual=np.full((60, 6), 0.1), noise=np.full((60, 6), 2.0))
+    without = replace(full, residual=size / 2, noise=np.full((60, 6), 4.0))
+    # Samples show nothing of the cause: the covariance is that of its prior.
+    own = slice(len(search.x) + 6, len(search.x) + 6 + len(cause.values))
+    covariance = np.zeros((len(full.prior), len(full.prior)))
+    covariance[own, own] = np.diag(cause.sizes**2)
+    vars(full)["covariance"] = covariance
+    costs = 2 * 22 + 2 * 21 + 56 * 1, 60 * 6 * 0.01
+    n_places = {Step: 61, Drift: 8, FreeDrift: 1}[type(shape)]
+    expected = 0.5 * (costs[0] - costs[1]) - np.log(n_places) - np.log(len(search.layout.blocks))
+    assert search._log_evidence(cause, 1, full, without) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "begun", "shape"),
+    [
+        (Changes("base", 2e-3), Step(24), Step(30)),
+        (Changes("base", 2e-3), FreeDrift(0.0, 59.0), Step(30)),
+        (Changes("base", 2e-3), Step(30), Step(30)),
+    ],
+)
+def test_a_fit_settles_where_no_step_and_no_drift_changes(changes, begun, shape):
+    search = search_of(changes)
+    search.causes = [cause_of(search, "base", begun)]
+    fit = search._settle()
+    assert [cause.shape for cause in search.causes] == [shape]
+    # It is that of the last place.
+    assert np.sqrt(np.mean((search.rows[..., -1] / fit.noise) ** 2)) == pytest.approx(1.0, abs=0.1)
+    assert np.linalg.norm(search.causes[0].values[:3]) == pytest.approx(2e-3, rel=0.1)
+
+
+def test_a_fit_that_does_not_settle_ends(monkeypatch):
+    search, fits = search_of(Changes()), []
+    first = search.first_fit
+    monkeypatch.setattr(search, "_fit", lambda: first)
+    monkeypatch.setattr(search, "_move_steps", lambda fit: True)
+    monkeypatch.setattr(search, "iterate", lambda fit: [fits.append(fit), fit][1])
+    search._settle()
+    assert len(fits) == 1 + MAX_MOVES
+
+
+@pytest.mark.parametrize(
+    ("sizes", "count"), [([0.2, 0.06, 0.04, 0.2], 3), ([0.04, 0.2], 1), ([0.06] * 10, MAX_ITERATIONS)]
+)
+def test_a_fit_is_repeated_until_its_steps_are_negligible(monkeypatch, sizes, count):
+    """A step is negligible if it changes the residuals by a twentieth of their noise."""
+    search = search_of(Changes())
+    unit = search.first_fit
+    change = np.sqrt(np.mean((unit.columns[..., 0] / unit.noise) ** 2 * unit.weights[:, None]))
+    steps = [np.zeros(len(unit.step)) for _ in sizes]
+    for step, size in zip(steps, sizes, strict=True):
+        step[0] = size / change
+    fits, taken = [replace(unit, step=step) for step in steps], []
+    monkeypatch.setattr(search, "_advance", taken.append)
+    monkeypatch.setattr(search, "_fit", lambda: fits[len(taken)])
+    assert search.iterate(fits[0]) is fits[count]
+    assert taken == fits[:count]
+
+
+# ----------------------------------------------------------------------------------- order of the search
+def proposing(monkeypatch, search, causes, evidence):
+    """Let a search propose causes, of which those with a value have an effect, and judge them by number."""
+    fitted = []
+
+    def ranked(fit):
+        used = {id(cause.block) for cause in search.causes}
+        used |= {id(block) for block, _ in search.rejected}
+        return [cause for cause in causes if id(cause.block) not in used]
+
+    def settle_with(found):
+        fitted.append(causes.index(found))
+        search.causes = [*search.causes, found]
+        search.x, search.changes = search.x + 1.0, RobotChanges(zeros=((0, Step(3), np.zeros(1)),))
+        return search.first_fit, evidence[causes.index(found)]
+
+    for name, function in (
+        ("_ranked_causes", ranked),
+        ("_can_have_effect", lambda fit, found: found.values.any()),
+        ("_settle_with", settle_with),
+        ("_confirm", lambda: fitted.append("confirmed")),
+        ("iterate", lambda fit: fit),
+        ("_fit", lambda: search.first_fit),
+    ):
+        monkeypatch.setattr(search, name, function)
+    return fitted
+
+
+def joints_of(search, proposed, values=(1.0,) * 6):
+    """Return steps of the joints with an evidence of the score test."""
+    return [
+        replace(cause_of(search, "joint", Step(30), value, index=i), log_evidence=evidence)
+        for i, (evidence, value) in enumerate(zip(proposed, values, strict=False))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("proposed", "values", "evidence", "fitted", "kept"),
+    [
+        # Causes are kept from an evidence of 12, and the search ends with the third one in vain.
+        ([20, 19, 18, 17, 16, 15], [1] * 6, [11.9, 12.0, 11.0, 30.0, -np.inf, 30.0], [0, 1, 2, 3, 4], [1, 3]),
+        # A cause without an effect is not fitted, but tried in vain.
+        ([20, 19, 18, 17, 16], [0, 1, 0, 0, 1], [30.0] * 5, [1], [1]),
+        # Causes are proposed from an evidence of 2.
+        ([2.1, 2.0, 1.9], [1, 1, 1], [30.0] * 3, [0, 1], [0, 1]),
+        ([], [], [], [], []),
+    ],
+)
+def test_causes_are_tried_in_the_order_of_their_evidence(
+    monkeypatch, proposed, values, evidence, fitted, kept
+):
+    search = search_of(Changes())
+    causes, x = joints_of(search, proposed, values), search.x
+    found = proposing(monkeypatch, search, causes, evidence)
+    search.run()
+    assert found == [*fitted, "confirmed"]
+    assert search.causes == [causes[i] for i in kept]
+    # What was tried in vain leaves no traces.
+    np.testing.assert_array_equal(search.x, x + len(kept))
+    assert search.changes.is_empty == (not kept)
+    in_vain = [i for i in range(len(causes)) if i not in kept and (i in fitted or not values[i])]
+    assert search.rejected == {(causes[i].block, Step) for i in in_vain}
+
+
+@pytest.mark.parametrize(
+    ("evidence", "effect", "is_gross"),
+    [(60.1, 3.1, True), (59.9, 3.1, False), (60.1, 2.9, False)],
+)
+def test_a_gross_cause_is_in_the_first_fit(monkeypatch, evidence, effect, is_gross):
+    search, causes_of_fits = search_of(Changes()), []
+    (gross,) = joints_of(search, [evidence])
+    proposing(monkeypatch, search, [gross], [30.0])
+    monkeypatch.setattr(search, "_effect", lambda fit, cause: effect)
+    monkeypatch.setattr(search, "iterate", lambda fit: causes_of_fits.append(len(search.causes)))
+    search.run()
+    assert causes_of_fits == [is_gross]
+    # It has been fitted from zero.
+    assert search.causes[0].values == (0.0 if is_gross else 1.0)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "shares", "outliers", "proposed", "limit", "count"),
+    [
+        # Nothing else is added to a cause with enough evidence, or without outliers.
+        ([12.0], [0.3], [20], 20.0, 8, 1),
+        ([11.0], [0.25], [20], 20.0, 8, 1),
+        # The evidence is the smallest one of all that were added, the share of outliers the largest.
+        ([11.9, 12.0], [0.26, 0.26], [20, 10], 20.0, 8, 2),
+        ([5.0, 11.9, 7.0], [0.26, 0.3, 0.25], [20, 10, 5], 20.0, 8, 3),
+        # Causes that explain no outliers end it.
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 20, 5], 20.0, 8, 2),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], 1.9, 8, 1),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], None, 8, 1),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], 20.0, 3, 2),
+    ],
+)
+def test_causes_of_the_outliers_of_a_cause_are_fitted_with_it(
+    monkeypatch, evidence, shares, outliers, proposed, limit, count
+):
+    search = search_of(Changes())
+    first, found, *others = joints_of(search, [20.0] * 6)
+    search.causes = [first]
+    left = [replace(each, log_evidence=proposed) for each in others] if proposed is not None else []
+
+    def settle():
+        weights = np.where(np.arange(60) < outliers[len(search.causes) - 2], 0.4, 1.0)
+        return replace(search.first_fit, weights=weights)
+
+    def judge(rows, fit, i):
+        assert i > 0
+        return replace(
+            search.causes[i], log_evidence=evidence[len(search.causes) - 2] + (i < len(search.causes) - 1)
+        )
+
+    monkeypatch.setattr(search_module, "MAX_CAUSES", limit)
+    monkeypatch.setattr(search, "_settle", settle)
+    monkeypatch.setattr(search, "_judge", judge)
+    monkeypatch.setattr(
+        search,
+        "_outlier_share",
+        lambda fit, c: shares[len(search.causes) - 2] - 0.1 * (c.block is not found.block),
+    )
+    monkeypatch.setattr(search, "best_cause", lambda fit: left.pop(0) if left else None)
+    fit, smallest = search._settle_with(found)
+    assert len(search.causes) == 1 + count
+    assert smallest == evidence[count - 1]
+    assert np.sum(fit.weights < OUTLIER_WEIGHT) == outliers[count - 1]
+
+
+def test_causes_with_least_evidence_are_removed_until_all_are_confirmed(monkeypatch):
+    """Then those that a function of the configuration imitates are removed, but no constant ones."""
+    search = search_of(Changes())
+    evidence = {0: 11.9, 1: 5.0, 2: 12.0, 3: 40.0, 4: 50.0}
+    joints = [cause_of(search, "joint", Step(30), index=i) for i in range(4)]
+    search.causes = [*joints, cause_of(search, "lag", Constant())]
+    removed, asked = [], []
+
+    def name(cause):
+        return cause.block.index if cause.block.kind == "joint" else 4
+
+    def judge(rows, full, i):
+        return replace(search.causes[i], log_evidence=evidence[name(search.causes[i])])
+
+    def follows(i):
+        asked.append(name(search.causes[i]))
+        return name(search.causes[i]) == 3
+
+    def remove(i):
+        removed.append(name(search.causes[i]))
+        del search.causes[i]
+
+    for each in (judge, remove):
+        monkeypatch.setattr(search, f"_{each.__name__}", each)
+    monkeypatch.setattr(search, "_follows_configuration", follows)
+    search._confirm()
+    assert removed == [1, 0, 3]
+    assert asked == [2, 3, 2]
+    assert [cause.log_evidence for cause in search.causes] == [12.0, 50.0]
 
 
 @pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
