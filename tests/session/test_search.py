@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from dhcal_pin.session.search import (
     MAX_ITERATIONS,
     MAX_MOVES,
     OUTLIER_WEIGHT,
+    TIME_CONSTANTS,
     WIDTHS,
     _bounded_cost,
     _cell_products,
@@ -28,6 +30,7 @@ from dhcal_pin.session.search import (
     _evidence_of,
     _information,
     _is_part_of_model,
+    _is_suspicious,
     _predicted_gain,
     can_have_session,
     find_session,
@@ -100,6 +103,9 @@ def test_distances_have_no_step_and_precede_all_cells():
     assert len(fine.edges) == 31
     steps = [shape.number for shape in fine._shapes(Step, (20,)) if isinstance(shape, Step)]
     assert steps == [*range(6, 18), *range(23, 31)]
+    drifts = [shape for shape in search._shapes(Drift, ()) if isinstance(shape, Drift)]
+    assert {(drift.begin, drift.end) for drift in drifts} == {(3.0, 32.0)}
+    assert [drift.time_constant / 29 for drift in drifts] == pytest.approx(TIME_CONSTANTS)
     # They are no samples of either side, and no outliers.
     assert search._concerned(cause_of(search, "base", Step(3 + 6))) == pytest.approx(0.2)
     weights = np.where(np.arange(33) < 9, 0.4, 1.0)
@@ -256,10 +262,12 @@ def test_the_effect_of_a_cause_is_what_other_unknowns_leave_of_it():
 
 
 @pytest.mark.parametrize("kind", [Step, Drift, FreeDrift])
-@pytest.mark.parametrize("n_outliers", [0, 3])
-def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers):
+@pytest.mark.parametrize(("n_outliers", "noise"), [(0, 1.0), (3, 1.0), (0, 1e4)])
+def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers, noise):
+    """With much noise, the samples hardly show a cause."""
     search = search_of(Changes("base", 3e-4, n_outliers=n_outliers))
     fit, shapes = search.first_fit, search._shapes(kind, ())
+    fit = replace(fit, noise=noise * fit.noise, score=fit.score / noise)
     blocks = [block for block in search.layout.blocks if block.kind in ("base", "tool")]
     found = list(search._scores(fit, blocks, shapes, search._products(fit)))
     assert [cause.block for cause in found] == blocks
@@ -740,6 +748,194 @@ def test_causes_with_least_evidence_are_removed_until_all_are_confirmed(monkeypa
     assert removed == [1, 0, 3]
     assert asked == [2, 3, 2]
     assert [cause.log_evidence for cause in search.causes] == [12.0, 50.0]
+
+
+def test_positions_of_a_wrong_scale_have_the_rows_of_a_right_one():
+    """A scale of an axis is a constant cause of which only the residuals know."""
+    simulation, factor = Simulation("ur10", 60, 3, errors=(0.0, 0.0)), 1e-3
+    data = simulation.measure(Position)
+    search = searched(simulation, (data,))
+    along = data.values[:, 1] - data.values[:, 1].mean()
+    scaled = data.replace(values=data.values + factor * np.outer(along, [0.0, 1.0, 0.0]))
+    wrong = searched(simulation, (scaled,))
+    difference = (wrong.rows - search.rows)[..., -1]
+    scale = next(block for block in wrong.layout.blocks if (block.kind, block.of) == ("scale", "y"))
+    wrong.causes = [Cause(scale, Constant(), np.array([factor]), np.zeros((1, 1)))]
+    rows = wrong.linearize()
+    assert np.abs(difference).max() > 0.9
+    np.testing.assert_allclose(rows[..., -1], search.rows[..., -1], atol=5e-3 * np.abs(difference).max())
+    np.testing.assert_array_equal(rows[..., :-1], wrong.rows[..., :-1])
+    # A lag is in the joint positions instead.
+    wrong.causes = [cause_of(wrong, "lag", Constant(), 0.1)]
+    np.testing.assert_array_equal(wrong.linearize(), wrong.rows)
+
+
+def test_few_rows_for_each_unknown_do_not_make_outliers():
+    """The residuals of 60 rows with 36 unknowns are smaller than the noise."""
+    simulation = Simulation("ur10", 10, 3)
+    data = simulation.measure(Pose)
+    fit = searched(simulation, (data,)).first_fit
+    assert np.all(fit.weights == 1)
+    assert fit.noise[0, 0] * data.sigma[0, 0] == pytest.approx(NOISE, rel=0.5)
+
+
+@pytest.mark.parametrize(("n_cells", "first"), [(60, 60), (1, None)])
+def test_a_search_can_begin_with_a_lag_from_a_sample_on(n_cells, first):
+    """The joint values of the last 40 of 100 rows are 0.3 rows too early."""
+    simulation = Simulation("ur10", 100, 3, is_path=True)
+    before, after = (simulation.measure(Pose, Changes(lag=lag)).poses for lag in (0.0, 0.3))
+    poses = np.concatenate([before[:60], after[60:]])
+    search = searched(simulation, (Pose(simulation.q, poses),), n_cells=n_cells)
+    search.move_lag()
+    found = search.changes.lag_at(search.numbers, search.times)
+    if first is None:  # no place is left for a step
+        assert [cause.shape for cause in search.causes] == [Constant()]
+    else:
+        assert [cause.shape for cause in search.causes] == [Constant(), Step(first)]
+        np.testing.assert_allclose(found, np.where(np.arange(100) < first, 0.0, 0.3), atol=0.02)
+    assert search.log_noise(search.first_fit) == search.log_noise(search.solve(search.rows, search.causes))
+
+
+def test_blocks_that_are_left_out_are_those_of_samples_with_a_time(monkeypatch):
+    simulation, contacts, distances = touching()
+    search, given = searched(simulation, (contacts.initialized(simulation.chain), distances)), []
+    monkeypatch.setattr(search_module, "_predicted_gain", lambda *args: [given.append(args), (0.0, 0.0)][1])
+    for shape in (Step(3 + 6), Step(3 + 15), Drift(3.0, 32.0)):
+        search.causes = [cause_of(search, "base", shape)]
+        search._judge(search.rows, search.solve(search.rows, search.causes), 0)
+    assert [args[2] for args in given] == [3, 3, 3]
+    assert [args[3] for args in given] == pytest.approx([1.0, 1.5, 1.5])
+
+
+@pytest.mark.parametrize(("left", "follows"), [(89.0, True), (91.0, False)])
+def test_a_true_change_keeps_its_evidence_beside_a_function_of_the_configuration(monkeypatch, left, follows):
+    simulation = Simulation("ur10", 60, 3)
+    is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
+    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    data = simulation.measure(Pose)
+    poses = data.poses.copy()
+    poses[is_high, 0, 3] += 2e-3
+    search = searched(simulation, (Pose(data.q, poses),))
+    search.causes = [cause_of(search, "base", Step(36))]
+    search.iterate(search._fit())
+    evidence = iter([100.0])
+    monkeypatch.setattr(search_module, "_evidence_of", lambda block, causes: next(evidence, left))
+    assert search._follows_configuration(0) == follows
+
+
+# -------------------------------------------------------------------------------------------- two robots
+@pytest.mark.parametrize(
+    ("gains", "of_side", "first"),
+    [
+        ((0.60, 0.61), 0.31, 40),
+        ((0.61, 0.60), 0.31, 20),
+        ((0.59, 0.60), 0.31, 40),
+        ((0.59, 0.59), 0.31, None),
+        ((0.60, 0.61), 0.29, None),
+    ],
+)
+def test_a_second_robot_needs_a_gain_on_all_samples_and_on_the_shorter_side(
+    monkeypatch, gains, of_side, first
+):
+    """Each of its parameters costs half of the logarithm of the number of rows."""
+    search = search_of(Changes())
+    count, p = 360, len(search.layout.model)
+    assert 0.59 < 0.5 * p * np.log(count) / count + 0.3 < 0.60
+    search.causes = [cause_of(search, "base", Step(20)), cause_of(search, "tool", Step(40))]
+    one, given = search.first_fit, []
+
+    def second_robot(rows, others, block, number):
+        given.append(([cause.shape for cause in others], number))
+        two = replace(
+            one, noise=one.noise * np.exp(-gains[number // 40]), step=np.append(1e3, np.arange(1.0, p + 1))
+        )
+        vars(two)["covariance"] = np.diag(np.append(9.0, np.full(p, 4.0)))
+        return number, two
+
+    monkeypatch.setattr(search, "solve", lambda rows, causes: one)
+    monkeypatch.setattr(search, "_candidates", lambda fit: iter(()))
+    monkeypatch.setattr(search, "_second_robot", second_robot)
+    monkeypatch.setattr(search, "_gain_of_side", lambda *args: of_side)
+    event = search.other_robot()
+    assert given == [([Step(40)], 20), ([Step(20)], 40)]
+    if first is None:
+        assert event is None
+        return
+    assert event is not None
+    assert (event.before.line, event.after.line) == (first, first + 1)
+    # Base and tool, which come last, have no part in the most significant difference of the arm.
+    errors = search.layout.problem.errors
+    last = int(np.flatnonzero(errors.is_of_arm)[-1])
+    assert (event.of, event.size, event.std) == (errors.parameters[last].name, last + 1, 2.0)
+
+
+# ------------------------------------------------------------------------------------ beginning and end
+@pytest.mark.parametrize(
+    ("evidence", "n_low", "is_suspicious"),
+    [(2.1, 0, True), (1.9, 0, False), (None, 0, False), (None, 6, False), (None, 7, True)],
+)
+def test_a_search_is_called_for_by_evidence_or_by_outliers(monkeypatch, evidence, n_low, is_suspicious):
+    """Outliers are more than a tenth of 60 samples."""
+    search = search_of(Changes())
+    (found,) = joints_of(search, [evidence])
+    fit = replace(search.first_fit, weights=np.where(np.arange(60) < n_low, 0.4, 1.0))
+    monkeypatch.setattr(search_module._Search, "solve", lambda self, rows, causes: fit)
+    best = found if evidence else None
+    monkeypatch.setattr(search_module._Search, "best_cause", lambda self, fit: best)
+    problem = search.layout.problem
+    errors = select_parameters(problem.errors.chain, "minimal,base,tool")
+    problem = make_problem(errors, problem.data, 1 / errors.priors, {})
+    assert _is_suspicious(problem, search.x, search.timeline, True) == is_suspicious
+
+
+def begun_with(noise, of_lag, search, x):
+    """Return a stand-in for a search that begins with a noise, or with that of a lag."""
+    state = SimpleNamespace(noise=noise, has_run=False, x=x, causes=[], first_fit="first")
+    state.chain, state.changes, state.has_different_rows = search.chain, RobotChanges(), True
+    state.paths = None if of_lag is None else search.paths
+    state.log_noise = lambda fit: state.noise if fit == "first" else -9.0
+    state.move_lag = lambda: vars(state).update(noise=of_lag)
+    state.move_frames = lambda changes: vars(state).update(noise=state.noise - 1)
+    state.run = lambda: vars(state).update(has_run=True)
+    state.linearize = state.place_steps = state.other_robot = lambda: None
+    state.solve = lambda rows, causes: "last"
+    return state
+
+
+@pytest.mark.parametrize(
+    ("noises", "of_lag", "is_placed", "chosen"),
+    [
+        ((1.0, 1.1), 9.0, False, 0),  # the nominal robot
+        ((1.1, 1.0), 9.0, False, 1),  # the solution
+        ((1.1, 1.0, 1.9), 9.0, True, 2),  # base and tool of each part
+        ((1.1, 1.0, 2.1), 9.0, True, 1),
+        ((1.1, 1.0), 0.49, False, 2),  # a lag from some sample on
+        ((1.1, 1.0), 0.51, False, 1),
+        ((1.1, 1.0), None, False, 1),  # no paths
+    ],
+)
+def test_a_search_begins_with_the_least_noise(monkeypatch, noises, of_lag, is_placed, chosen):
+    search, begun, left = search_of(Changes(), is_ordered=True), [], [*noises, 1.0]
+    problem = search.layout.problem
+
+    def begin(problem, x, timeline, is_ordered, n_samples, n_cells):
+        assert (n_samples, n_cells) == (4000, 400)
+        begun.append(begun_with(left.pop(0), of_lag, search, x))
+        return begun[-1]
+
+    monkeypatch.setattr(search_module, "_is_suspicious", lambda *args: True)
+    monkeypatch.setattr(search_module, "_Search", begin)
+    monkeypatch.setattr(search_module, "starts_of_parts", lambda *args: (20,))
+    placed = [(problem, RobotChanges())] if is_placed else []
+    monkeypatch.setattr(
+        search_module, "place_parts", lambda problem, timeline, starts: placed.pop() if placed else None
+    )
+    x = np.ones(len(problem.weights))
+    session = find_session(problem, x, (), is_ordered=True)
+    assert [each.has_run for each in begun] == [i == chosen for i in range(len(begun))]
+    assert len(begun) == len(noises) + (of_lag is not None)
+    assert [each.x.any() for each in begun] == [i == 1 for i in range(len(begun))]
+    assert (session.causes, session.events, session.scales) == ((), (), ())
 
 
 @pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
