@@ -18,6 +18,7 @@ from dhcal_pin.session.causes import HELD_SIZE, Block, Cause, Constant, Drift, F
 from dhcal_pin.session.linear_model import covariance_root, inverse, measures_positions, solve_information
 from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.search import (
+    FINE_CONSTANTS,
     HUBER_LIMIT,
     MAX_ITERATIONS,
     MAX_MOVES,
@@ -358,12 +359,14 @@ def test_a_lag_is_found_from_which_a_search_begins():
     np.testing.assert_allclose(alone.changes.lag_at(search.numbers, search.times)[-1], 0.3, atol=0.02)
 
 
-@pytest.mark.parametrize("is_of_configuration", [True, False])
-def test_errors_that_follow_a_joint_are_no_change_over_time(is_of_configuration):
-    """A joint is above zero in 18 of 60 consecutive samples, or the base moves at the first of them."""
+@pytest.mark.parametrize(("of", "is_of_configuration"), [("joint", True), ("link", True), ("joint", False)])
+def test_errors_that_follow_a_joint_or_a_link_are_no_change_over_time(of, is_of_configuration):
+    """A joint or the forearm points upwards in 18 of 60 consecutive samples; or the base moves there."""
     simulation = Simulation("ur10", 60, 3)
     is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
-    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    angle = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    # The forearm is turned by two joints.
+    simulation.q[:, 2 if of == "link" else 1] = angle - (simulation.q[:, 1] if of == "link" else 0.0)
     data = simulation.measure(Pose)
     poses = data.poses.copy()
     poses[is_high if is_of_configuration else np.arange(60) >= 36, 0, 3] += 2e-3
@@ -936,6 +939,120 @@ def test_a_search_begins_with_the_least_noise(monkeypatch, noises, of_lag, is_pl
     assert len(begun) == len(noises) + (of_lag is not None)
     assert [each.x.any() for each in begun] == [i == 1 for i in range(len(begun))]
     assert (session.causes, session.events, session.scales) == ((), (), ())
+
+
+@pytest.mark.parametrize(("factor", "is_free"), [(0.96, False), (1.04, True)])
+def test_each_coefficient_of_a_free_drift_costs_the_logarithm_of_the_number_of_rows(factor, is_free):
+    """The residuals are its last function, of which other drifts leave the most part."""
+    search = search_of(Changes())
+    base = cause_of(search, "base", FreeDrift(0.0, 59.0))
+    given = base.columns_of(search.rows, search.numbers, search.times).reshape(360, 48)[:, 42]
+    model = search.rows[..., search.layout.model].reshape(360, -1)
+    costs = []
+    for ratio in FINE_CONSTANTS:
+        other = replace(base, shape=Drift(0.0, 59.0, 59 * ratio), values=np.zeros(6))
+        columns = other.columns_of(search.rows, search.numbers, search.times).reshape(360, 6)
+        a = np.hstack([model, columns])
+        costs.append(np.sum((given - a @ np.linalg.lstsq(a, given)[0]) ** 2))
+    # 42 coefficients more; a linear drift has a bonus of twice the gain of a curvature.
+    needed = 42 * np.log(360) + np.array([6.0, *np.zeros(len(costs) - 1)])
+    size = np.max(needed / costs)
+    search.rows[..., -1] = (np.sqrt(factor * size) * given).reshape(60, 6)
+    search.causes, search.rejected = [base], {(base.block, Step)}
+    fit = replace(search.first_fit, weights=np.ones(60), noise=np.ones((60, 6)))
+    assert search._change_drifts(fit) != is_free
+    assert isinstance(search.causes[0].shape, FreeDrift) == is_free
+
+
+def test_a_part_has_no_two_steps_near_each_other():
+    search = search_of(Changes("tool", 2e-3))
+    search.causes = [cause_of(search, "base", Step(31))]
+    steps = {
+        c.block.kind: c.shape.number
+        for c in search._candidates(search.first_fit)
+        if isinstance(c.shape, Step)
+    }
+    assert steps["tool"] == 30
+    assert abs(steps["base"] - 31) >= 3
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_joint_that_moves_one_way_does_not_tell_its_position_from_the_time(direction):
+    simulation = Simulation("ur10", 60, 3)
+    simulation.q[:, 1] = direction * np.linspace(-1.0, 1.0, 60)
+    search = searched(simulation, (simulation.measure(Pose, Changes("base", 2e-3)),))
+    search.causes = [cause_of(search, "base", Step(30))]
+    search.iterate(search._fit())
+    assert not search._follows_configuration(0)
+
+
+def robot_of(search):
+    """Return the parameters of the geometry as a block of a second robot."""
+    sizes = np.array([p.prior for p in search.layout.problem.errors.parameters])
+    return Block("robot", "", search.layout.model[: len(sizes)], sizes)
+
+
+def test_the_place_of_a_second_robot_is_found_from_another_one():
+    search = search_of(Changes(has_second_robot=True, at=0.4))
+    number, fit = search._second_robot(search.rows, [], robot_of(search), 19)
+    assert number == 24
+    expected = search.solve(search.rows, [Cause(robot_of(search), Step(24), np.zeros(36), np.empty((0, 0)))])
+    np.testing.assert_array_equal(fit.step, expected.step)
+
+
+def test_the_place_of_a_second_robot_is_moved_a_few_times(monkeypatch):
+    search, places = search_of(Changes()), []
+    monkeypatch.setattr(
+        search, "_best_place", lambda fit, change, number: [places.append(number), number + 1][1]
+    )
+    number, _ = search._second_robot(search.rows, [], robot_of(search), 20)
+    assert places == [20, 21, 22, 23]
+    assert number == 24
+
+
+def test_scales_of_up_to_a_half_are_stated(monkeypatch):
+    search = search_of(Changes())
+    state = begun_with(0.0, None, search, search.x)
+    state.causes = [
+        replace(cause_of(search, "scale", Constant(), value, index=i), covariance=np.array([[1e-6]]))
+        for i, value in enumerate((0.49, 0.51, -0.49))
+    ]
+    state.stated = lambda cause: cause
+    state.with_lag_alone = lambda: None
+    monkeypatch.setattr(search_module, "_is_suspicious", lambda *args: True)
+    monkeypatch.setattr(search_module, "_Search", lambda *args: state)
+    session = find_session(search.layout.problem, search.x, (), is_ordered=False)
+    assert [(scale.axis, scale.factor, scale.std) for scale in session.scales] == [
+        ("x", 1.49, pytest.approx(1e-3)),
+        ("z", 0.51, pytest.approx(1e-3)),
+    ]
+    assert session.causes == tuple(state.causes)
+
+
+@pytest.mark.parametrize(
+    ("n_causes", "has_lag", "is_suspicious", "is_alone"),
+    [(2, True, False, True), (2, True, True, False), (2, False, False, False), (1, True, False, False)],
+)
+def test_a_lag_alone_is_the_cause_if_nothing_else_remains(
+    monkeypatch, n_causes, has_lag, is_suspicious, is_alone
+):
+    search = search_of(Changes())
+    state, alone = (begun_with(0.0, None, search, search.x) for _ in range(2))
+    state.causes = [
+        replace(cause_of(search, "scale", Constant(), 0.1, index=i), covariance=np.array([[1e-6]]))
+        for i in range(n_causes)
+    ]
+    state.stated = lambda cause: cause
+    state.with_lag_alone = lambda: alone if has_lag else None
+    alone.corrected_timeline = lambda: "corrected"
+    monkeypatch.setattr(
+        search_module,
+        "_is_suspicious",
+        lambda problem, x, timeline, *args: timeline != "corrected" or is_suspicious,
+    )
+    monkeypatch.setattr(search_module, "_Search", lambda *args: state)
+    session = find_session(search.layout.problem, search.x, (), is_ordered=False)
+    assert len(session.causes) == (0 if is_alone else n_causes)
 
 
 @pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
