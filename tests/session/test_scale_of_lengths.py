@@ -88,18 +88,20 @@ def problem():
     return make_problem(errors, (data,), 1 / errors.priors, {})
 
 
-def corrections(problem, change, *, errors=1.0, n_shown=24, pattern=2e3, seed=0):
-    """Return corrections of an arm by a scale and by errors of unit size, and what `_responses` returns.
+def corrections(problem, change, *, errors=1.0, of_angles=1.0, n_shown=24, pattern=2e3):
+    """Return corrections of an arm by a scale and by errors, and what `_responses` returns.
 
-    A scale of 1 causes `pattern` standard deviations of each length. Noise hides all but some corrections.
+    The errors are in expected ones; those of angles have another factor. A scale of 1 causes `pattern`
+    standard deviations of each length. Noise hides all but some corrections.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     (arm,) = np.nonzero(problem.errors.is_of_arm)
     prior = problem.errors.priors[arm]
     is_length = np.array([problem.errors.parameters[i].unit == "m" for i in arm])
     by_scale = np.where(is_length, pattern, 0.0) * prior * rng.choice([-1, 1], len(arm))
     x = np.zeros(len(problem.weights))
-    x[arm] = change * by_scale + errors * prior * rng.permutation(np.linspace(-1.5, 1.5, len(arm)))
+    drawn = errors * np.where(is_length, 1.0, of_angles) * rng.permutation(np.linspace(-1.5, 1.5, len(arm)))
+    x[arm] = change * by_scale + drawn * prior
     is_hidden = np.isin(np.arange(len(arm)), np.flatnonzero(is_length)[n_shown:])
     noise = np.diag(prior**2 * np.where(is_hidden, 1e8, 1e-6))
     by_lengths, by_angles = (np.diag(np.where(chosen, prior**2, 0.0)) for chosen in (is_length, ~is_length))
@@ -126,11 +128,13 @@ def test_a_scale_is_stated_from_a_thousandth_to_a_half(problem, monkeypatch, cha
     [
         ({}, True),
         ({"n_shown": 3}, True),
-        ({"n_shown": 2}, False),  # two lengths hardly show their own size
+        ({"n_shown": 2, "pattern": 2e5}, False),  # two lengths hardly show their own size
         ({"errors": 100.0, "pattern": 2e5}, False),  # larger errors than any arm has
         ({"errors": 10.0, "pattern": 2e5}, True),
+        ({"of_angles": 100.0}, False),
+        ({"of_angles": 10.0}, True),
         ({"errors": 1.0, "pattern": 80.0}, False),  # chance explains it
-        ({"pattern": 1e-4}, False),  # a scale changes no correction
+        ({"pattern": 0.0}, False),  # a scale changes no correction
     ],
 )
 def test_a_scale_needs_several_lengths_of_plausible_errors(problem, monkeypatch, options, is_found):
