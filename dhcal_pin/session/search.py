@@ -580,7 +580,7 @@ class _Search:
 
     def _settle_with(self, found: Cause) -> tuple[LinearFit, float]:
         """Fit with one more cause and those of its outliers, and return the smallest evidence of them."""
-        first, n_outliers = len(self.causes), len(self.numbers) + 1
+        first, n_outliers = len(self.causes), np.inf
         while True:
             self._add(found)
             fit = self._settle()
@@ -711,9 +711,9 @@ class _Search:
         is_after = self.numbers >= number
         after = np.where(is_after[:, None], fit.residual, fit.residual - change)
         costs = [_bounded_cost(r) for r in (after + change, after)]
-        # Cost of a step before each sample: `before` for the samples in front of it, `after` behind.
-        total = np.concatenate([[0.0], np.cumsum(costs[0] - costs[1])])
-        return int(self.numbers[int(inner[np.argmin(total[inner])])])
+        # Cost of a step behind each sample: `before` for the samples up to it, `after` behind.
+        total = np.cumsum(costs[0] - costs[1])
+        return int(self.numbers[int(inner[np.argmin(total[inner - 1])])])
 
     def _confirm(self) -> None:
         """Remove the causes that left-out blocks of samples do not show."""
@@ -904,7 +904,7 @@ class _Search:
             rivals = one, self.solve(rows, [*self.causes, *self._steps_of_all(number)])
             gain = count * min(float(np.mean(np.log(each.noise / two.noise))) for each in rivals)
             of_side = min(self._gain_of_side(each, two, number, len(sizes)) for each in rivals)
-            if of_side > MIN_ROBOT_GAIN and gain > max(needed, best[0] if best else 0.0):
+            if of_side > MIN_ROBOT_GAIN and gain > (best[0] if best else needed):
                 best = gain, number, two
         if best is None:
             return None

@@ -1,6 +1,7 @@
 """Causes that a calibration can show, first values of parts, and changes refined without a search."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from dhcal_pin import se3
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.session import part_frames
 from dhcal_pin.session.causes import Cause, Step
 from dhcal_pin.session.facts import Session
 from dhcal_pin.session.linear_model import Layout, _largest_torques, _scale_motions, whitened_rows
@@ -17,6 +19,7 @@ from dhcal_pin.session.part_frames import (
     _can_turn,
     _mean_squares,
     _motion,
+    _placed,
     _samples_between,
     place_parts,
     starts_of_parts,
@@ -134,6 +137,84 @@ def test_parts_begin_where_the_base_turned(first, end, starts):
     sizes = _mean_squares(problem_of(shuffled, simulation=simulation), np.zeros(n), of_files)
     (residual,) = problem.residuals(np.zeros(n), problem.data)
     np.testing.assert_allclose(sizes, np.mean(residual**2, 0))
+
+
+@pytest.mark.parametrize(
+    ("far", "ratio", "n_unfit", "starts"),
+    [
+        (range(20, 40), 10.1, 40, (20,)),
+        (range(20, 40), 9.9, 40, ()),
+        (range(20, 23), 10.1, 40, (20,)),
+        (range(20, 22), 10.1, 40, ()),  # two samples are outliers
+        (range(5, 8), 10.1, 40, ()),
+        (range(6, 9), 10.1, 40, (6,)),
+        (range(37, 40), 10.1, 40, (37,)),
+        (range(20, 40), 10.1, 4, (20,)),
+        (range(20, 40), 10.1, 3, ()),  # one solution fits nine tenths of the samples
+    ],
+)
+def test_a_part_begins_with_three_samples_that_are_far(monkeypatch, far, ratio, n_unfit, starts):
+    simulation = Simulation("ur10", 40, 3)
+    data = simulation.measure(Position)
+    problem, timeline = problem_of([data], simulation=simulation), order_samples([data], ())
+    begun, number = [], np.arange(40)
+
+    def initialize(errors, part, known, n_iterations):
+        begun.append(part[0].q)
+        return SimpleNamespace(chain=errors.chain)
+
+    def mean_squares(problem, x, timeline):
+        of_solution = np.where(number < n_unfit, 1e3, 0.0)
+        is_far = np.isin(number, far) & (len(begun) == 1)
+        return np.where(is_far, ratio**2, 1.0) if begun else of_solution
+
+    monkeypatch.setattr(part_frames, "initialize_frames", initialize)
+    monkeypatch.setattr(part_frames, "_mean_squares", mean_squares)
+    assert starts_of_parts(problem, np.zeros(len(problem.weights)), timeline) == starts
+    # Base and tool are fitted to the first samples of each part.
+    np.testing.assert_array_equal(begun[0], data.q[:16])
+    assert len(begun) == 1 + (starts != () and starts[0] <= 34)
+    for first, q in zip(starts, begun[1:], strict=False):
+        np.testing.assert_array_equal(q, data.q[first : first + 16])
+
+
+def test_a_session_has_a_largest_number_of_parts(monkeypatch):
+    """Nine samples after the other fit by themselves."""
+    simulation = Simulation("ur10", 126, 3)
+    data = simulation.measure(Position)
+    problem, timeline = problem_of([data], simulation=simulation), order_samples([data], ())
+    begun = []
+
+    def initialize(errors, part, known, n_iterations):
+        begun.append(part[0].q)
+        return SimpleNamespace(chain=errors.chain)
+
+    def mean_squares(problem, x, timeline):
+        return np.where(np.arange(126) < 9 * len(begun), 1.0, 1e3)
+
+    monkeypatch.setattr(part_frames, "initialize_frames", initialize)
+    monkeypatch.setattr(part_frames, "_mean_squares", mean_squares)
+    found = starts_of_parts(problem, np.zeros(len(problem.weights)), timeline)
+    assert found == tuple(range(9, 9 * 13, 9))
+
+
+def test_a_placed_problem_has_the_instruments_of_a_part():
+    """First values of targets are those in the last part, where base and tool are known."""
+    simulation = Simulation("ur10", 12, 3, errors=(0.0, 0.0))
+    data = simulation.measure_targets()
+    moved = data.replace(values=data.values + np.array([1.0, 0.0, 0.0]))
+    parts = data.take(np.s_[:18]).replace(source="a"), moved.take(np.s_[18:]).replace(source="b")
+    problem = problem_of(parts, "base,tool", simulation)
+    base, tool = simulation.base.homogeneous, simulation.tool.homogeneous
+    chain = problem.errors.chain.with_base_and_tool(se3.exp6(np.array([1.0, 0, 0, 0, 0, 0])) @ base, tool)
+    placed = _placed(problem, chain, parts[1:])
+    np.testing.assert_array_equal(placed.errors.chain.base, chain.base)
+    np.testing.assert_array_equal(placed.errors.chain.tool, tool)
+    expected = {p.name: p.nominal for p in parts[1].initialized(chain).instrument_parameters}
+    for item, own in zip(placed.data, problem.data, strict=True):
+        assert [p.name for p in item.instrument_parameters] == [p.name for p in own.instrument_parameters]
+        assert {p.name: p.nominal for p in item.instrument_parameters} == expected
+    assert any(value for value in expected.values())
 
 
 @pytest.mark.parametrize(

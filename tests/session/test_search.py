@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,12 @@ from dhcal_pin.session.causes import HELD_SIZE, Block, Cause, Constant, Drift, F
 from dhcal_pin.session.linear_model import covariance_root, inverse, measures_positions, solve_information
 from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.search import (
+    FINE_CONSTANTS,
     HUBER_LIMIT,
+    MAX_ITERATIONS,
+    MAX_MOVES,
     OUTLIER_WEIGHT,
+    TIME_CONSTANTS,
     WIDTHS,
     _bounded_cost,
     _cell_products,
@@ -26,6 +31,7 @@ from dhcal_pin.session.search import (
     _evidence_of,
     _information,
     _is_part_of_model,
+    _is_suspicious,
     _predicted_gain,
     can_have_session,
     find_session,
@@ -98,6 +104,9 @@ def test_distances_have_no_step_and_precede_all_cells():
     assert len(fine.edges) == 31
     steps = [shape.number for shape in fine._shapes(Step, (20,)) if isinstance(shape, Step)]
     assert steps == [*range(6, 18), *range(23, 31)]
+    drifts = [shape for shape in search._shapes(Drift, ()) if isinstance(shape, Drift)]
+    assert {(drift.begin, drift.end) for drift in drifts} == {(3.0, 32.0)}
+    assert [drift.time_constant / 29 for drift in drifts] == pytest.approx(TIME_CONSTANTS)
     # They are no samples of either side, and no outliers.
     assert search._concerned(cause_of(search, "base", Step(3 + 6))) == pytest.approx(0.2)
     weights = np.where(np.arange(33) < 9, 0.4, 1.0)
@@ -254,10 +263,12 @@ def test_the_effect_of_a_cause_is_what_other_unknowns_leave_of_it():
 
 
 @pytest.mark.parametrize("kind", [Step, Drift, FreeDrift])
-@pytest.mark.parametrize("n_outliers", [0, 3])
-def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers):
+@pytest.mark.parametrize(("n_outliers", "noise"), [(0, 1.0), (3, 1.0), (0, 1e4)])
+def test_evidence_of_the_score_test_is_that_of_its_formula(kind, n_outliers, noise):
+    """With much noise, the samples hardly show a cause."""
     search = search_of(Changes("base", 3e-4, n_outliers=n_outliers))
     fit, shapes = search.first_fit, search._shapes(kind, ())
+    fit = replace(fit, noise=noise * fit.noise, score=fit.score / noise)
     blocks = [block for block in search.layout.blocks if block.kind in ("base", "tool")]
     found = list(search._scores(fit, blocks, shapes, search._products(fit)))
     assert [cause.block for cause in found] == blocks
@@ -348,12 +359,14 @@ def test_a_lag_is_found_from_which_a_search_begins():
     np.testing.assert_allclose(alone.changes.lag_at(search.numbers, search.times)[-1], 0.3, atol=0.02)
 
 
-@pytest.mark.parametrize("is_of_configuration", [True, False])
-def test_errors_that_follow_a_joint_are_no_change_over_time(is_of_configuration):
-    """A joint is above zero in 18 of 60 consecutive samples, or the base moves at the first of them."""
+@pytest.mark.parametrize(("of", "is_of_configuration"), [("joint", True), ("link", True), ("joint", False)])
+def test_errors_that_follow_a_joint_or_a_link_are_no_change_over_time(of, is_of_configuration):
+    """A joint or the forearm points upwards in 18 of 60 consecutive samples; or the base moves there."""
     simulation = Simulation("ur10", 60, 3)
     is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
-    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    angle = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    # The forearm is turned by two joints.
+    simulation.q[:, 2 if of == "link" else 1] = angle - (simulation.q[:, 1] if of == "link" else 0.0)
     data = simulation.measure(Pose)
     poses = data.poses.copy()
     poses[is_high if is_of_configuration else np.arange(60) >= 36, 0, 3] += 2e-3
@@ -463,6 +476,582 @@ def test_the_evidence_of_a_cause_has_the_information_of_the_samples_without_that
     cost = np.log1p(squares * information) + (cause.values / cause.sizes) ** 2 / squares
     expected = -0.5 * cost.sum(1).min() - np.log(len(search.edges)) - np.log(len(search.layout.blocks))
     assert search._log_evidence(cause, 0, fit, fit) == pytest.approx(expected, rel=1e-9)
+
+
+# ------------------------------------------------------------------------------- fits and their evidence
+@pytest.mark.parametrize(
+    ("number", "inside", "predicted", "is_supported"),
+    [
+        (30, 46.0, 18.5, True),
+        (30, 46.0, 18.3, False),  # left-out blocks show less than 0.4 of it
+        (30, 44.0, 44.0, False),  # an RMS effect below 0.5 on 180 rows
+        (54, 10.0, 10.0, True),
+        (54, 8.0, 8.0, False),  # on 36 rows
+        (None, 91.0, 91.0, True),
+        (None, 89.0, 89.0, False),  # on all rows
+        (None, -1.0, -1.0, False),
+    ],
+)
+def test_a_cause_needs_an_effect_that_left_out_blocks_show(
+    monkeypatch, number, inside, predicted, is_supported
+):
+    search, given = search_of(Changes("base", 2e-3)), []
+    shape = Drift(0.0, 59.0) if number is None else Step(number)
+    search.causes = [cause_of(search, "tool", Step(40), 1e-4), cause_of(search, "base", shape, 1e-3)]
+    search._drop_others()
+    search._advance(replace(search._fit(), step=np.zeros(len(search.x) + 12)))
+    full = search._fit()
+
+    def predicted_gain(*args):
+        given.append(args)
+        return inside, predicted
+
+    monkeypatch.setattr(search_module, "_predicted_gain", predicted_gain)
+    monkeypatch.setattr(search, "_log_evidence", lambda *args: 7.0)
+    judged = search._judge(search.rows, full, 1)
+    assert judged.log_evidence == (7.0 if is_supported else -np.inf)
+    # 20 blocks, but 6 on the shorter side of a step.
+    (((without, with_it), prior, begin, length),) = given
+    assert (begin, length) == (0, pytest.approx({30: 3.0, 54: 1.0, None: 3.0}[number]))
+    np.testing.assert_array_equal(prior, full.prior)
+    # Both models explain the residuals of a robot without the cause, with the weights of the fit with it.
+    root = (np.sqrt(full.weights)[:, None] / full.noise)[..., None]
+    rows = search._linearized_without(1)
+    other = search.causes[0].columns_of(rows, search.numbers, search.times)
+    expected = np.concatenate([rows[..., search.layout.model], other, rows[..., -1:]], -1)
+    np.testing.assert_allclose(without, root * expected)
+    np.testing.assert_allclose(with_it[..., :-1], root * full.columns)
+    own = full.columns[..., -6:] @ search.causes[1].values
+    np.testing.assert_allclose(with_it[..., -1], root[..., 0] * (search.rows[..., -1] + own))
+
+
+@pytest.mark.parametrize("shape", [Step(30), Drift(0.0, 59.0), FreeDrift(0.0, 59.0)])
+def test_the_evidence_of_a_cause_has_the_costs_of_both_fits_in_the_noise_of_the_full_one(shape):
+    """A sample costs at most the number of its rows and 16."""
+    search = search_of(Changes())
+    cause, other = cause_of(search, "base", shape), cause_of(search, "tool", Step(20))
+    search.causes = [other, cause, other]
+    full = search.solve(search.rows, search.causes)
+    size = np.full((60, 6), np.sqrt(1 / 6))
+    size[:2], size[2:4] = np.sqrt(23 / 6), np.sqrt(21 / 6)
+    full = replace(full, residual=np.full((60, 6), 0.1), noise=np.full((60, 6), 2.0))
+    without = replace(full, residual=size / 2, noise=np.full((60, 6), 4.0))
+    # Samples show nothing of the cause: the covariance is that of its prior.
+    own = slice(len(search.x) + 6, len(search.x) + 6 + len(cause.values))
+    covariance = np.zeros((len(full.prior), len(full.prior)))
+    covariance[own, own] = np.diag(cause.sizes**2)
+    vars(full)["covariance"] = covariance
+    costs = 2 * 22 + 2 * 21 + 56 * 1, 60 * 6 * 0.01
+    n_places = {Step: 61, Drift: 8, FreeDrift: 1}[type(shape)]
+    expected = 0.5 * (costs[0] - costs[1]) - np.log(n_places) - np.log(len(search.layout.blocks))
+    assert search._log_evidence(cause, 1, full, without) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "begun", "shape"),
+    [
+        (Changes("base", 2e-3), Step(24), Step(30)),
+        (Changes("base", 2e-3), FreeDrift(0.0, 59.0), Step(30)),
+        (Changes("base", 2e-3), Step(30), Step(30)),
+    ],
+)
+def test_a_fit_settles_where_no_step_and_no_drift_changes(changes, begun, shape):
+    search = search_of(changes)
+    search.causes = [cause_of(search, "base", begun)]
+    fit = search._settle()
+    assert [cause.shape for cause in search.causes] == [shape]
+    # It is that of the last place.
+    assert np.sqrt(np.mean((search.rows[..., -1] / fit.noise) ** 2)) == pytest.approx(1.0, abs=0.1)
+    assert np.linalg.norm(search.causes[0].values[:3]) == pytest.approx(2e-3, rel=0.1)
+
+
+def test_a_fit_that_does_not_settle_ends(monkeypatch):
+    search, fits = search_of(Changes()), []
+    first = search.first_fit
+    monkeypatch.setattr(search, "_fit", lambda: first)
+    monkeypatch.setattr(search, "_move_steps", lambda fit: True)
+    monkeypatch.setattr(search, "iterate", lambda fit: [fits.append(fit), fit][1])
+    search._settle()
+    assert len(fits) == 1 + MAX_MOVES
+
+
+@pytest.mark.parametrize(
+    ("sizes", "count"), [([0.2, 0.06, 0.04, 0.2], 3), ([0.04, 0.2], 1), ([0.06] * 10, MAX_ITERATIONS)]
+)
+def test_a_fit_is_repeated_until_its_steps_are_negligible(monkeypatch, sizes, count):
+    """A step is negligible if it changes the residuals by a twentieth of their noise."""
+    search = search_of(Changes())
+    unit = search.first_fit
+    change = np.sqrt(np.mean((unit.columns[..., 0] / unit.noise) ** 2 * unit.weights[:, None]))
+    steps = [np.zeros(len(unit.step)) for _ in sizes]
+    for step, size in zip(steps, sizes, strict=True):
+        step[0] = size / change
+    fits, taken = [replace(unit, step=step) for step in steps], []
+    monkeypatch.setattr(search, "_advance", taken.append)
+    monkeypatch.setattr(search, "_fit", lambda: fits[len(taken)])
+    assert search.iterate(fits[0]) is fits[count]
+    assert taken == fits[:count]
+
+
+# ----------------------------------------------------------------------------------- order of the search
+def proposing(monkeypatch, search, causes, evidence):
+    """Let a search propose causes, of which those with a value have an effect, and judge them by number."""
+    fitted = []
+
+    def ranked(fit):
+        used = {id(cause.block) for cause in search.causes}
+        used |= {id(block) for block, _ in search.rejected}
+        return [cause for cause in causes if id(cause.block) not in used]
+
+    def settle_with(found):
+        fitted.append(causes.index(found))
+        search.causes = [*search.causes, found]
+        search.x, search.changes = search.x + 1.0, RobotChanges(zeros=((0, Step(3), np.zeros(1)),))
+        return search.first_fit, evidence[causes.index(found)]
+
+    for name, function in (
+        ("_ranked_causes", ranked),
+        ("_can_have_effect", lambda fit, found: found.values.any()),
+        ("_settle_with", settle_with),
+        ("_confirm", lambda: fitted.append("confirmed")),
+        ("iterate", lambda fit: fit),
+        ("_fit", lambda: search.first_fit),
+    ):
+        monkeypatch.setattr(search, name, function)
+    return fitted
+
+
+def joints_of(search, proposed, values=(1.0,) * 6):
+    """Return steps of the joints with an evidence of the score test."""
+    return [
+        replace(cause_of(search, "joint", Step(30), value, index=i), log_evidence=evidence)
+        for i, (evidence, value) in enumerate(zip(proposed, values, strict=False))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("proposed", "values", "evidence", "fitted", "kept"),
+    [
+        # Causes are kept from an evidence of 12, and the search ends with the third one in vain.
+        ([20, 19, 18, 17, 16, 15], [1] * 6, [11.9, 12.0, 11.0, 30.0, -np.inf, 30.0], [0, 1, 2, 3, 4], [1, 3]),
+        # A cause without an effect is not fitted, but tried in vain.
+        ([20, 19, 18, 17, 16], [0, 1, 0, 0, 1], [30.0] * 5, [1], [1]),
+        # Causes are proposed from an evidence of 2.
+        ([2.1, 2.0, 1.9], [1, 1, 1], [30.0] * 3, [0, 1], [0, 1]),
+        ([], [], [], [], []),
+    ],
+)
+def test_causes_are_tried_in_the_order_of_their_evidence(
+    monkeypatch, proposed, values, evidence, fitted, kept
+):
+    search = search_of(Changes())
+    causes, x = joints_of(search, proposed, values), search.x
+    found = proposing(monkeypatch, search, causes, evidence)
+    search.run()
+    assert found == [*fitted, "confirmed"]
+    assert search.causes == [causes[i] for i in kept]
+    # What was tried in vain leaves no traces.
+    np.testing.assert_array_equal(search.x, x + len(kept))
+    assert search.changes.is_empty == (not kept)
+    in_vain = [i for i in range(len(causes)) if i not in kept and (i in fitted or not values[i])]
+    assert search.rejected == {(causes[i].block, Step) for i in in_vain}
+
+
+@pytest.mark.parametrize(
+    ("evidence", "effect", "is_gross"),
+    [(60.1, 3.1, True), (59.9, 3.1, False), (60.1, 2.9, False)],
+)
+def test_a_gross_cause_is_in_the_first_fit(monkeypatch, evidence, effect, is_gross):
+    search, causes_of_fits = search_of(Changes()), []
+    (gross,) = joints_of(search, [evidence])
+    proposing(monkeypatch, search, [gross], [30.0])
+    monkeypatch.setattr(search, "_effect", lambda fit, cause: effect)
+    monkeypatch.setattr(search, "iterate", lambda fit: causes_of_fits.append(len(search.causes)))
+    search.run()
+    assert causes_of_fits == [is_gross]
+    # It has been fitted from zero.
+    assert search.causes[0].values == (0.0 if is_gross else 1.0)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "shares", "outliers", "proposed", "limit", "count"),
+    [
+        # Nothing else is added to a cause with enough evidence, or without outliers.
+        ([12.0], [0.3], [20], 20.0, 8, 1),
+        ([11.0], [0.25], [20], 20.0, 8, 1),
+        # The evidence is the smallest one of all that were added, the share of outliers the largest.
+        ([11.9, 12.0], [0.26, 0.26], [20, 10], 20.0, 8, 2),
+        ([5.0, 11.9, 7.0], [0.26, 0.3, 0.25], [20, 10, 5], 20.0, 8, 3),
+        # Causes that explain no outliers end it.
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 20, 5], 20.0, 8, 2),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], 1.9, 8, 1),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], None, 8, 1),
+        ([5.0, 6.0, 7.0], [0.3, 0.3, 0.3], [20, 10, 5], 20.0, 3, 2),
+    ],
+)
+def test_causes_of_the_outliers_of_a_cause_are_fitted_with_it(
+    monkeypatch, evidence, shares, outliers, proposed, limit, count
+):
+    search = search_of(Changes())
+    first, found, *others = joints_of(search, [20.0] * 6)
+    search.causes = [first]
+    left = [replace(each, log_evidence=proposed) for each in others] if proposed is not None else []
+
+    def settle():
+        weights = np.where(np.arange(60) < outliers[len(search.causes) - 2], 0.4, 1.0)
+        return replace(search.first_fit, weights=weights)
+
+    def judge(rows, fit, i):
+        assert i > 0
+        return replace(
+            search.causes[i], log_evidence=evidence[len(search.causes) - 2] + (i < len(search.causes) - 1)
+        )
+
+    monkeypatch.setattr(search_module, "MAX_CAUSES", limit)
+    monkeypatch.setattr(search, "_settle", settle)
+    monkeypatch.setattr(search, "_judge", judge)
+    monkeypatch.setattr(
+        search,
+        "_outlier_share",
+        lambda fit, c: shares[len(search.causes) - 2] - 0.1 * (c.block is not found.block),
+    )
+    monkeypatch.setattr(search, "best_cause", lambda fit: left.pop(0) if left else None)
+    fit, smallest = search._settle_with(found)
+    assert len(search.causes) == 1 + count
+    assert smallest == evidence[count - 1]
+    assert np.sum(fit.weights < OUTLIER_WEIGHT) == outliers[count - 1]
+
+
+def test_causes_with_least_evidence_are_removed_until_all_are_confirmed(monkeypatch):
+    """Then those that a function of the configuration imitates are removed, but no constant ones."""
+    search = search_of(Changes())
+    evidence = {0: 11.9, 1: 5.0, 2: 12.0, 3: 40.0, 4: 50.0}
+    joints = [cause_of(search, "joint", Step(30), index=i) for i in range(4)]
+    search.causes = [*joints, cause_of(search, "lag", Constant())]
+    removed, asked = [], []
+
+    def name(cause):
+        return cause.block.index if cause.block.kind == "joint" else 4
+
+    def judge(rows, full, i):
+        return replace(search.causes[i], log_evidence=evidence[name(search.causes[i])])
+
+    def follows(i):
+        asked.append(name(search.causes[i]))
+        return name(search.causes[i]) == 3
+
+    def remove(i):
+        removed.append(name(search.causes[i]))
+        del search.causes[i]
+
+    for each in (judge, remove):
+        monkeypatch.setattr(search, f"_{each.__name__}", each)
+    monkeypatch.setattr(search, "_follows_configuration", follows)
+    search._confirm()
+    assert removed == [1, 0, 3]
+    assert asked == [2, 3, 2]
+    assert [cause.log_evidence for cause in search.causes] == [12.0, 50.0]
+
+
+def test_positions_of_a_wrong_scale_have_the_rows_of_a_right_one():
+    """A scale of an axis is a constant cause of which only the residuals know."""
+    simulation, factor = Simulation("ur10", 60, 3, errors=(0.0, 0.0)), 1e-3
+    data = simulation.measure(Position)
+    search = searched(simulation, (data,))
+    along = data.values[:, 1] - data.values[:, 1].mean()
+    scaled = data.replace(values=data.values + factor * np.outer(along, [0.0, 1.0, 0.0]))
+    wrong = searched(simulation, (scaled,))
+    difference = (wrong.rows - search.rows)[..., -1]
+    scale = next(block for block in wrong.layout.blocks if (block.kind, block.of) == ("scale", "y"))
+    wrong.causes = [Cause(scale, Constant(), np.array([factor]), np.zeros((1, 1)))]
+    rows = wrong.linearize()
+    assert np.abs(difference).max() > 0.9
+    np.testing.assert_allclose(rows[..., -1], search.rows[..., -1], atol=5e-3 * np.abs(difference).max())
+    np.testing.assert_array_equal(rows[..., :-1], wrong.rows[..., :-1])
+    # A lag is in the joint positions instead.
+    wrong.causes = [cause_of(wrong, "lag", Constant(), 0.1)]
+    np.testing.assert_array_equal(wrong.linearize(), wrong.rows)
+
+
+def test_few_rows_for_each_unknown_do_not_make_outliers():
+    """The residuals of 60 rows with 36 unknowns are smaller than the noise."""
+    simulation = Simulation("ur10", 10, 3)
+    data = simulation.measure(Pose)
+    fit = searched(simulation, (data,)).first_fit
+    assert np.all(fit.weights == 1)
+    assert fit.noise[0, 0] * data.sigma[0, 0] == pytest.approx(NOISE, rel=0.5)
+
+
+@pytest.mark.parametrize(("n_cells", "first"), [(60, 60), (1, None)])
+def test_a_search_can_begin_with_a_lag_from_a_sample_on(n_cells, first):
+    """The joint values of the last 40 of 100 rows are 0.3 rows too early."""
+    simulation = Simulation("ur10", 100, 3, is_path=True)
+    before, after = (simulation.measure(Pose, Changes(lag=lag)).poses for lag in (0.0, 0.3))
+    poses = np.concatenate([before[:60], after[60:]])
+    search = searched(simulation, (Pose(simulation.q, poses),), n_cells=n_cells)
+    search.move_lag()
+    found = search.changes.lag_at(search.numbers, search.times)
+    if first is None:  # no place is left for a step
+        assert [cause.shape for cause in search.causes] == [Constant()]
+    else:
+        assert [cause.shape for cause in search.causes] == [Constant(), Step(first)]
+        np.testing.assert_allclose(found, np.where(np.arange(100) < first, 0.0, 0.3), atol=0.02)
+    assert search.log_noise(search.first_fit) == search.log_noise(search.solve(search.rows, search.causes))
+
+
+def test_blocks_that_are_left_out_are_those_of_samples_with_a_time(monkeypatch):
+    simulation, contacts, distances = touching()
+    search, given = searched(simulation, (contacts.initialized(simulation.chain), distances)), []
+    monkeypatch.setattr(search_module, "_predicted_gain", lambda *args: [given.append(args), (0.0, 0.0)][1])
+    for shape in (Step(3 + 6), Step(3 + 15), Drift(3.0, 32.0)):
+        search.causes = [cause_of(search, "base", shape)]
+        search._judge(search.rows, search.solve(search.rows, search.causes), 0)
+    assert [args[2] for args in given] == [3, 3, 3]
+    assert [args[3] for args in given] == pytest.approx([1.0, 1.5, 1.5])
+
+
+@pytest.mark.parametrize(("left", "follows"), [(89.0, True), (91.0, False)])
+def test_a_true_change_keeps_its_evidence_beside_a_function_of_the_configuration(monkeypatch, left, follows):
+    simulation = Simulation("ur10", 60, 3)
+    is_high = (np.arange(60) >= 36) & (np.arange(60) < 54)
+    simulation.q[:, 1] = np.where(is_high, 1.0, -1.0) + simulation.rng.uniform(-0.5, 0.5, 60)
+    data = simulation.measure(Pose)
+    poses = data.poses.copy()
+    poses[is_high, 0, 3] += 2e-3
+    search = searched(simulation, (Pose(data.q, poses),))
+    search.causes = [cause_of(search, "base", Step(36))]
+    search.iterate(search._fit())
+    evidence = iter([100.0])
+    monkeypatch.setattr(search_module, "_evidence_of", lambda block, causes: next(evidence, left))
+    assert search._follows_configuration(0) == follows
+
+
+# -------------------------------------------------------------------------------------------- two robots
+@pytest.mark.parametrize(
+    ("gains", "of_side", "first"),
+    [
+        ((0.60, 0.61), 0.31, 40),
+        ((0.61, 0.60), 0.31, 20),
+        ((0.59, 0.60), 0.31, 40),
+        ((0.59, 0.59), 0.31, None),
+        ((0.60, 0.61), 0.29, None),
+    ],
+)
+def test_a_second_robot_needs_a_gain_on_all_samples_and_on_the_shorter_side(
+    monkeypatch, gains, of_side, first
+):
+    """Each of its parameters costs half of the logarithm of the number of rows."""
+    search = search_of(Changes())
+    count, p = 360, len(search.layout.model)
+    assert 0.59 < 0.5 * p * np.log(count) / count + 0.3 < 0.60
+    search.causes = [cause_of(search, "base", Step(20)), cause_of(search, "tool", Step(40))]
+    one, given = search.first_fit, []
+
+    def second_robot(rows, others, block, number):
+        given.append(([cause.shape for cause in others], number))
+        two = replace(
+            one, noise=one.noise * np.exp(-gains[number // 40]), step=np.append(1e3, np.arange(1.0, p + 1))
+        )
+        vars(two)["covariance"] = np.diag(np.append(9.0, np.full(p, 4.0)))
+        return number, two
+
+    monkeypatch.setattr(search, "solve", lambda rows, causes: one)
+    monkeypatch.setattr(search, "_candidates", lambda fit: iter(()))
+    monkeypatch.setattr(search, "_second_robot", second_robot)
+    monkeypatch.setattr(search, "_gain_of_side", lambda *args: of_side)
+    event = search.other_robot()
+    assert given == [([Step(40)], 20), ([Step(20)], 40)]
+    if first is None:
+        assert event is None
+        return
+    assert event is not None
+    assert (event.before.line, event.after.line) == (first, first + 1)
+    # Base and tool, which come last, have no part in the most significant difference of the arm.
+    errors = search.layout.problem.errors
+    last = int(np.flatnonzero(errors.is_of_arm)[-1])
+    assert (event.of, event.size, event.std) == (errors.parameters[last].name, last + 1, 2.0)
+
+
+# ------------------------------------------------------------------------------------ beginning and end
+@pytest.mark.parametrize(
+    ("evidence", "n_low", "is_suspicious"),
+    [(2.1, 0, True), (1.9, 0, False), (None, 0, False), (None, 6, False), (None, 7, True)],
+)
+def test_a_search_is_called_for_by_evidence_or_by_outliers(monkeypatch, evidence, n_low, is_suspicious):
+    """Outliers are more than a tenth of 60 samples."""
+    search = search_of(Changes())
+    (found,) = joints_of(search, [evidence])
+    fit = replace(search.first_fit, weights=np.where(np.arange(60) < n_low, 0.4, 1.0))
+    monkeypatch.setattr(search_module._Search, "solve", lambda self, rows, causes: fit)
+    best = found if evidence else None
+    monkeypatch.setattr(search_module._Search, "best_cause", lambda self, fit: best)
+    problem = search.layout.problem
+    errors = select_parameters(problem.errors.chain, "minimal,base,tool")
+    problem = make_problem(errors, problem.data, 1 / errors.priors, {})
+    assert _is_suspicious(problem, search.x, search.timeline, True) == is_suspicious
+
+
+def begun_with(noise, of_lag, search, x):
+    """Return a stand-in for a search that begins with a noise, or with that of a lag."""
+    state = SimpleNamespace(noise=noise, has_run=False, x=x, causes=[], first_fit="first")
+    state.chain, state.changes, state.has_different_rows = search.chain, RobotChanges(), True
+    state.paths = None if of_lag is None else search.paths
+    state.log_noise = lambda fit: state.noise if fit == "first" else -9.0
+    state.move_lag = lambda: vars(state).update(noise=of_lag)
+    state.move_frames = lambda changes: vars(state).update(noise=state.noise - 1)
+    state.run = lambda: vars(state).update(has_run=True)
+    state.linearize = state.place_steps = state.other_robot = lambda: None
+    state.solve = lambda rows, causes: "last"
+    return state
+
+
+@pytest.mark.parametrize(
+    ("noises", "of_lag", "is_placed", "chosen"),
+    [
+        ((1.0, 1.1), 9.0, False, 0),  # the nominal robot
+        ((1.1, 1.0), 9.0, False, 1),  # the solution
+        ((1.1, 1.0, 1.9), 9.0, True, 2),  # base and tool of each part
+        ((1.1, 1.0, 2.1), 9.0, True, 1),
+        ((1.1, 1.0), 0.49, False, 2),  # a lag from some sample on
+        ((1.1, 1.0), 0.51, False, 1),
+        ((1.1, 1.0), None, False, 1),  # no paths
+    ],
+)
+def test_a_search_begins_with_the_least_noise(monkeypatch, noises, of_lag, is_placed, chosen):
+    search, begun, left = search_of(Changes(), is_ordered=True), [], [*noises, 1.0]
+    problem = search.layout.problem
+
+    def begin(problem, x, timeline, is_ordered, n_samples, n_cells):
+        assert (n_samples, n_cells) == (4000, 400)
+        begun.append(begun_with(left.pop(0), of_lag, search, x))
+        return begun[-1]
+
+    monkeypatch.setattr(search_module, "_is_suspicious", lambda *args: True)
+    monkeypatch.setattr(search_module, "_Search", begin)
+    monkeypatch.setattr(search_module, "starts_of_parts", lambda *args: (20,))
+    placed = [(problem, RobotChanges())] if is_placed else []
+    monkeypatch.setattr(
+        search_module, "place_parts", lambda problem, timeline, starts: placed.pop() if placed else None
+    )
+    x = np.ones(len(problem.weights))
+    session = find_session(problem, x, (), is_ordered=True)
+    assert [each.has_run for each in begun] == [i == chosen for i in range(len(begun))]
+    assert len(begun) == len(noises) + (of_lag is not None)
+    assert [each.x.any() for each in begun] == [i == 1 for i in range(len(begun))]
+    assert (session.causes, session.events, session.scales) == ((), (), ())
+
+
+@pytest.mark.parametrize(("factor", "is_free"), [(0.96, False), (1.04, True)])
+def test_each_coefficient_of_a_free_drift_costs_the_logarithm_of_the_number_of_rows(factor, is_free):
+    """The residuals are its last function, of which other drifts leave the most part."""
+    search = search_of(Changes())
+    base = cause_of(search, "base", FreeDrift(0.0, 59.0))
+    given = base.columns_of(search.rows, search.numbers, search.times).reshape(360, 48)[:, 42]
+    model = search.rows[..., search.layout.model].reshape(360, -1)
+    costs = []
+    for ratio in FINE_CONSTANTS:
+        other = replace(base, shape=Drift(0.0, 59.0, 59 * ratio), values=np.zeros(6))
+        columns = other.columns_of(search.rows, search.numbers, search.times).reshape(360, 6)
+        a = np.hstack([model, columns])
+        costs.append(np.sum((given - a @ np.linalg.lstsq(a, given)[0]) ** 2))
+    # 42 coefficients more; a linear drift has a bonus of twice the gain of a curvature.
+    needed = 42 * np.log(360) + np.array([6.0, *np.zeros(len(costs) - 1)])
+    size = np.max(needed / costs)
+    search.rows[..., -1] = (np.sqrt(factor * size) * given).reshape(60, 6)
+    search.causes, search.rejected = [base], {(base.block, Step)}
+    fit = replace(search.first_fit, weights=np.ones(60), noise=np.ones((60, 6)))
+    assert search._change_drifts(fit) != is_free
+    assert isinstance(search.causes[0].shape, FreeDrift) == is_free
+
+
+@pytest.mark.parametrize(("taken", "is_near"), [(31, True), (20, False)])
+def test_a_part_has_no_two_steps_near_each_other(taken, is_near):
+    """The base moves at sample 30."""
+    search = search_of(Changes("base", 2e-3))
+    search.causes = [cause_of(search, "base", Step(taken))]
+    found = [cause.shape for cause in search._candidates(search.first_fit) if cause.block.kind == "base"]
+    (number,) = (shape.number for shape in found if isinstance(shape, Step))
+    assert abs(number - taken) >= 3
+    assert (number == 30) != is_near
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_joint_that_moves_one_way_does_not_tell_its_position_from_the_time(direction):
+    simulation = Simulation("ur10", 60, 3)
+    simulation.q[:, 1] = direction * np.linspace(-1.0, 1.0, 60)
+    search = searched(simulation, (simulation.measure(Pose, Changes("base", 2e-3)),))
+    search.causes = [cause_of(search, "base", Step(30))]
+    search.iterate(search._fit())
+    assert not search._follows_configuration(0)
+
+
+def robot_of(search):
+    """Return the parameters of the geometry as a block of a second robot."""
+    sizes = np.array([p.prior for p in search.layout.problem.errors.parameters])
+    return Block("robot", "", search.layout.model[: len(sizes)], sizes)
+
+
+def test_the_place_of_a_second_robot_is_found_from_another_one():
+    search = search_of(Changes(has_second_robot=True, at=0.4))
+    number, fit = search._second_robot(search.rows, [], robot_of(search), 19)
+    assert number == 24
+    expected = search.solve(search.rows, [Cause(robot_of(search), Step(24), np.zeros(36), np.empty((0, 0)))])
+    np.testing.assert_array_equal(fit.step, expected.step)
+
+
+def test_the_place_of_a_second_robot_is_moved_a_few_times(monkeypatch):
+    search, places = search_of(Changes()), []
+    monkeypatch.setattr(
+        search, "_best_place", lambda fit, change, number: [places.append(number), number + 1][1]
+    )
+    number, _ = search._second_robot(search.rows, [], robot_of(search), 20)
+    assert places == [20, 21, 22, 23]
+    assert number == 24
+
+
+def test_scales_of_up_to_a_half_are_stated(monkeypatch):
+    search = search_of(Changes())
+    state = begun_with(0.0, None, search, search.x)
+    state.causes = [
+        replace(cause_of(search, "scale", Constant(), value, index=i), covariance=np.array([[1e-6]]))
+        for i, value in enumerate((0.49, 0.51, -0.49))
+    ]
+    state.stated = lambda cause: cause
+    state.with_lag_alone = lambda: None
+    monkeypatch.setattr(search_module, "_is_suspicious", lambda *args: True)
+    monkeypatch.setattr(search_module, "_Search", lambda *args: state)
+    session = find_session(search.layout.problem, search.x, (), is_ordered=False)
+    assert [(scale.axis, scale.factor, scale.std) for scale in session.scales] == [
+        ("x", 1.49, pytest.approx(1e-3)),
+        ("z", 0.51, pytest.approx(1e-3)),
+    ]
+    assert session.causes == tuple(state.causes)
+
+
+@pytest.mark.parametrize(
+    ("n_causes", "has_lag", "is_suspicious", "is_alone"),
+    [(2, True, False, True), (2, True, True, False), (2, False, False, False), (1, True, False, False)],
+)
+def test_a_lag_alone_is_the_cause_if_nothing_else_remains(
+    monkeypatch, n_causes, has_lag, is_suspicious, is_alone
+):
+    search = search_of(Changes())
+    state, alone = (begun_with(0.0, None, search, search.x) for _ in range(2))
+    state.causes = [
+        replace(cause_of(search, "scale", Constant(), 0.1, index=i), covariance=np.array([[1e-6]]))
+        for i in range(n_causes)
+    ]
+    state.stated = lambda cause: cause
+    state.with_lag_alone = lambda: alone if has_lag else None
+    alone.corrected_timeline = lambda: "corrected"
+    monkeypatch.setattr(
+        search_module,
+        "_is_suspicious",
+        lambda problem, x, timeline, *args: timeline != "corrected" or is_suspicious,
+    )
+    monkeypatch.setattr(search_module, "_Search", lambda *args: state)
+    session = find_session(search.layout.problem, search.x, (), is_ordered=False)
+    assert len(session.causes) == (0 if is_alone else n_causes)
 
 
 @pytest.mark.parametrize(("rise", "is_found"), [(0.09, True), (0.11, False)])
