@@ -337,6 +337,112 @@ def test_likelihoods_without_a_change_are_those_of_each_noise():
     assert model.likely_noise == np.argmax(model.null_likelihoods(model.scaled_sets(model.rows[:, -1:])))
 
 
+def log_densities(model, residuals, columns):
+    """Return the log densities (σ, w, d) of residuals (n, d) without a change, and with one of some columns."""
+    nothing, changed = [], []
+    for variances in model.variances:
+        covariance = (model.axes * variances) @ model.axes.T
+        widths = (w**2 * columns @ columns.T + covariance for w in check.WIDTHS)
+        nothing.append(multivariate_normal.logpdf(residuals.T, cov=covariance))
+        changed.append([multivariate_normal.logpdf(residuals.T, cov=each) for each in widths])
+    return np.array(nothing), np.array(changed)
+
+
+@pytest.mark.parametrize("sigma", [NOISE, None])
+def test_likelihoods_with_a_change_are_those_of_each_noise_and_width(sigma):
+    """The columns of two coefficients are those of one direction, whose other eigenvalue is zero or less."""
+    model = model_of(positions(Q[:2], sigma), uncertainty=uncertainty_of(1e-4, (1e-6, 1e-4)))
+    rng = np.random.default_rng(0)
+    residuals = rng.normal(size=(6, 3))
+    for columns in (0.1 * rng.normal(size=(6, 2)), 0.1 * rng.normal(size=(6, 1)) @ [[1.0, 0.3, 0.7]]):
+        nothing, changed = log_densities(model, residuals, columns)
+        sets = model.scaled_sets(residuals)
+        found = model.log_likelihoods(columns, sets, model.null_likelihoods(sets)) - 3 * np.log(2 * np.pi)
+        assert found.shape == (len(model.noise_factors), 11, 3)
+        np.testing.assert_allclose(found, changed, rtol=1e-6, atol=1e-5)
+        # Their means are those over all noises and widths alike, in relation to those without a change.
+        ratios = check._log_means(found) - check._log_means(nothing[:, None])
+        expected = np.mean(np.exp(changed), (0, 1)) / np.mean(np.exp(nothing), 0)
+        np.testing.assert_allclose(np.exp(ratios), expected, rtol=1e-4)
+
+
+def test_changes_of_a_tenth_of_a_millimetre_to_ten_metres_are_equally_likely():
+    np.testing.assert_allclose(check.WIDTHS, np.geomspace(1e-4, 10, 11))
+    # An assumed noise may be a thousand times too large, and ten times too small.
+    np.testing.assert_allclose(check.NOISE_FACTORS, np.geomspace(1e-3, 10, 17))
+
+
+@pytest.mark.parametrize("sigma", [NOISE, None])
+def test_few_robots_that_did_not_change_exceed_the_limit(sigma, monkeypatch):
+    """The limit is the quantile of the sum of the weighted ratios for residuals of the most likely noise."""
+    monkeypatch.setattr(check, "N_DRAWS", 60)
+    monkeypatch.setattr(check, "MAX_FALSE_ALARMS", 0.05)
+    item = positions(Q[:2], sigma)
+    rng = np.random.default_rng(1)
+    noise = (1.0 if sigma else 3e-2) * (sigma or 1e-3) * rng.normal(size=(2, 3))
+    model = model_of(item.replace(values=item.values + noise), uncertainty=uncertainty_of(1e-4))
+    assert (model.likely_noise == model.usual_noise) == (sigma is not None)
+    groups, priors = [0.1 * rng.normal(size=(6, c)) for c in (1, 3)], np.array([0.7, 0.3])
+    draws = np.random.default_rng(0).standard_normal((6, 60))
+    residuals = model.axes @ (draws * np.sqrt(model.variances[model.likely_noise])[:, None])
+    expected = np.zeros(60)
+    for columns, prior in zip(groups, priors, strict=True):
+        nothing, changed = log_densities(model, residuals, columns)
+        expected += prior * np.mean(np.exp(changed), (0, 1)) / np.mean(np.exp(nothing), 0)
+    found = model.limit(groups, np.log(priors))
+    assert found == pytest.approx(np.log(np.quantile(expected, 0.95)), abs=0.02)
+
+
+def test_the_evidence_has_the_priors_of_the_hypotheses():
+    """Without residuals, the ratio of a change is the root of the determinants, averaged over the widths."""
+    model = model_of(positions())
+    _, likelihoods, weights, limit = model._evidence
+    blocks = model.blocks
+    assert len(likelihoods) == len(weights) == len(blocks) + 7
+    columns = [model.rows[:, block.columns] * block.sizes for block in blocks]
+    columns += [np.eye(21)[:, 3 * i : 3 * i + 3] / NOISE for i in range(7)]
+    # All parts together are less likely than a joint, and all samples as likely as one.
+    priors = np.array([1.0] * (len(blocks) - 1) + [0.3] + [1 / 7] * 7)
+    for a, prior, weight in zip(columns, priors / priors.sum(), weights, strict=True):
+        values = np.linalg.svd(a, compute_uv=False)
+        ratios = [np.prod(1 / np.sqrt(1 + w**2 * values**2)) for w in check.WIDTHS]
+        assert weight == pytest.approx(np.log(prior * np.mean(ratios)), abs=1e-5)
+    assert limit == model.limit(columns, np.log(priors / priors.sum()))
+
+
+@pytest.mark.parametrize(("share", "is_visible"), [(0.97, False), (1.03, True)])
+def test_a_joint_is_visible_if_a_tenth_has_an_effect_of_five_standard_deviations(share, is_visible):
+    """The noise is such that 0.1 rad at the elbow is a share of that effect."""
+    usual = model_of(positions(sigma=1.0))
+    column = next(each.columns for each in usual.layout.blocks if each.of == "elbow_joint")
+    noise = 0.1 * np.linalg.norm(usual.rows[:, column]) / 5
+    model = model_of(positions(sigma=noise / share))
+    assert ("elbow_joint" in {block.of for block in model.blocks}) == is_visible
+    assert ("elbow_joint" in model.hidden_joints) != is_visible
+    *parts, robot = model.blocks
+    assert (robot.kind, robot.of) == ("robot", "")
+    np.testing.assert_array_equal(robot.columns, np.concatenate([each.columns for each in parts]))
+    np.testing.assert_array_equal(robot.sizes, np.concatenate([each.sizes for each in parts]))
+    # Directions of base and tool that do not show are held.
+    assert not next(block for block in parts if block.kind == "tool").sizes[3:].any()
+
+
+def test_an_estimate_weighs_residuals_against_its_prior():
+    """Noise of 0.3 m leaves most of it to the prior, a third of a metre wide."""
+    item = positions(sigma=0.3)
+    model = model_of(item.replace(values=item.values + [2e-4, -1e-4, 3e-4]))
+    for kind in ("joint", "base"):
+        block = next(each for each in model.layout.blocks if each.kind == kind)
+        a, r = model.rows[:, block.columns] * block.sizes, model.rows[:, -1]
+        ridge = np.linalg.solve(a.T @ a + 10 * np.eye(a.shape[1]), a.T @ r)
+        values, columns, undone = model.estimate(block)
+        np.testing.assert_allclose(values, ridge * block.sizes, rtol=1e-2, atol=1e-8)
+        np.testing.assert_allclose(columns, a, atol=1e-2)
+        left = undone - columns @ ridge
+        expected = left @ left + 10 * ridge @ ridge
+        assert model._cost(block, (ridge * block.sizes, columns, undone)) == pytest.approx(expected)
+
+
 @pytest.mark.parametrize("sigma", [NOISE, None])
 def test_shares_are_those_of_all_hypotheses(sigma):
     values = positions().values + NOISE * np.random.default_rng(2).normal(size=(7, 3))
