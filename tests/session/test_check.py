@@ -208,7 +208,12 @@ def elastic(*families, mass: float | None = 5.0):
 
 @pytest.mark.parametrize(
     ("payloads", "mass", "expected"),
-    [(None, 5.0, 0.0), ((0.0, 12.0), 6.0, 12 / np.sqrt(12)), ((2.0, 4.0), 5.0, np.hypot(2 / np.sqrt(12), 2))],
+    [
+        (None, 5.0, 0.0),
+        ((0.0, 12.0), 6.0, 12 / np.sqrt(12)),
+        ((4.5, 5.5), 5.0, 1 / np.sqrt(12)),
+        ((2.0, 4.0), 5.0, np.hypot(2 / np.sqrt(12), 2)),
+    ],
 )
 def test_an_unknown_payload_spreads_as_those_of_the_calibration(payloads, mass, expected):
     arm = elastic("compliance", "thermal", mass=mass)
@@ -220,6 +225,11 @@ def test_an_unknown_payload_spreads_as_those_of_the_calibration(payloads, mass, 
     assert model.unknown_columns == unknown
     known = positions(arm=arm, temperature=np.full(7, 30.0))
     assert model_of(known, arm=arm, payloads=payloads).unknown_columns == unknown[1:]
+    # Conditions that are known are kept beside those that are not.
+    for mass in (0.0, 9.0):
+        other = positions(arm=arm, temperature=np.full(7, 30.0), payload=np.full(7, mass))
+        found = model._residual(known, payload=np.full(7, mass))
+        np.testing.assert_allclose(found.T * NOISE, known.values - other.values, atol=1e-12)
     # The effects are those of one standard deviation of each.
     effects = model._unknown_conditions(model.data[0])
     kg, degrees = (np.full(7, spreads[name][0] + spreads[name][1]) for name in ("payload", "temperature"))
@@ -324,6 +334,8 @@ def test_samples_are_named_by_line_or_by_number():
     hypotheses, *_ = model.judged()
     of = {each.of for each in hypotheses if each.kind == "sample"}
     assert of == {f"in line {i} of a.csv" for i in (2, 5, 6)} | {"1", "2", "3", "4"}
+    sizes = {(h.size, h.std, h.unit, h.revealed) for h in hypotheses if h.kind == "sample"}
+    assert sizes == {(0.0, 0.0, "m", 0.0)}
 
 
 def test_likelihoods_without_a_change_are_those_of_each_noise():
@@ -700,6 +712,46 @@ def test_a_model_gets_the_noise_of_the_calibration_where_none_is_stated():
 
 
 @pytest.mark.parametrize(
+    ("noise", "uncertainty", "sigmas"),
+    [
+        (None, None, (NOISE, 2e-4, None)), (Noise(3e-4, 1e-4), None, (3e-4, 3e-4, 3e-4)),
+        (None, uncertainty_of(1e-5), (1e-4, 2e-4, None)),
+        (Noise(3e-5, 1e-4), uncertainty_of(1e-5), (3e-5, 3e-5, 3e-5)),
+    ],
+)  # fmt: skip
+def test_a_check_has_the_given_noise_or_at_least_that_of_the_calibration(
+    noise, uncertainty, sigmas, monkeypatch
+):
+    """The errors that the calibration left are in the samples, too; unstated noise is estimated."""
+    taken: list[Any] = []
+    judged = [], 2.0, 1.0
+    model = SimpleNamespace(judged=lambda: judged)
+    monkeypatch.setattr(check, "_CheckModel", lambda *args: taken.append(args) or model)
+    monkeypatch.setattr(check, "_answer", lambda *args: args)
+    data = [positions(Q[:2]), positions(Q[2:4], 2e-4), positions(Q[4:], None)]
+    known = {"x": 1.0}
+    found = recheck(ARM, data, uncertainty, known=known, noise=noise, size=2e-3, payloads=(1.0, 2.0))
+    assert found == (model, *judged, 2e-3)
+    assert recheck(ARM, data)[-1] == 1e-3
+    (arm, items, given, *rest), (*_, unknown, payloads) = taken
+    assert (arm, given, rest, unknown, payloads) == (ARM, uncertainty, [known, (1.0, 2.0)], {}, None)
+    assert [item.has_stated_sigma for item in items] == [sigma is not None for sigma in sigmas]
+    for item, sigma in zip(items, sigmas, strict=True):
+        np.testing.assert_array_equal(
+            item.sigma, data[2].sigma if sigma is None else np.full((len(item.q), 3), sigma)
+        )
+
+
+def test_other_kinds_of_measurements_are_refused():
+    data = [Inclination.simulate(ARM, Q, Noise(0, 1e-4), np.random.default_rng(0))] * 2
+    expected = "recheck: the measurements are of the kind inclination; expected position or pose"
+    with pytest.raises(InvalidArgumentError, match=f"^{expected}$"):
+        recheck(ARM, data)
+    with pytest.raises(InvalidArgumentError, match="of the kind position, inclination; expected position"):
+        recheck(ARM, [positions(), *data])
+
+
+@pytest.mark.parametrize(
     ("shift", "count", "is_larger"), [(0.0, 7, False), (1e-3, 7, True), (1e-3, 3, False)]
 )
 def test_an_excess_error_needs_four_samples(shift, count, is_larger):
@@ -709,6 +761,8 @@ def test_an_excess_error_needs_four_samples(shift, count, is_larger):
     if found:
         # The noise is that of the calibration, which is larger than the stated one.
         assert found == pytest.approx((np.sqrt(3) * shift, np.sqrt(3) * 1e-4), rel=1e-3)
+    turned = Pose(Q, POSES @ se3.exp6(np.array([0.0, 0.0, 0.0, 0.01, 0.0, 0.0])), NOISE, ANGLE_NOISE)
+    assert find_excess_error(ARM, [turned], uncertainty_of(1e-6)) is None
     inclination = Inclination.simulate(ARM, Q, Noise(0, 1e-4), np.random.default_rng(0))
     assert find_excess_error(ARM, [inclination], uncertainty_of(1e-6)) is None
     assert find_excess_error(ARM, [data], uncertainty_of(1e-6, residual_std=None)) is None
@@ -1012,7 +1066,7 @@ ORIGIN = "More than one part of the robot changed, or the origin of a joint"
 def test_an_origin_is_blamed_if_no_single_part_explains_the_samples():
     shares = {"joint j0": 0.5, "joint j1": 0.3, "base": 0.2}
     found = answer(shares, origin_limit=1.0)
-    assert (found.verdict, found.what) == ("changed", "robot")
+    assert (found.verdict, found.what, found.has_several) == ("changed", "robot", False)
     assert found.reasons == (f"{ORIGIN}: calibrate again.",)
     assert answer(shares, origin_limit=1.0, changed=[OTHER]).verdict == "cannot say"
     assert answer(shares, origin_limit=1.0, judge=None).verdict == "cannot say"
@@ -1045,7 +1099,7 @@ def test_two_changes_are_named_if_only_one_pair_explains_the_samples():
         assert (found.verdict, found.what, found.has_several) == ("changed", "base and joint j0", True)
         first, second = found.changes
         assert (first.size, first.std, first.angle) == pytest.approx((5e-3, 1e-4, 0.5))
-        assert (first.share, second.share) == (1.0, 1.0)
+        assert (first.share, second.share, first.revealed, second.revealed) == (1.0, 1.0, 0.0, 0.0)
         assert (second.size, second.std, second.unit, second.angle) == (0.01, pytest.approx(1e-4), "rad", 0.0)
         assert found.reasons[0].startswith("The base or the instrument moved by 5.00 mm and turned by 28.6")
         assert found.reasons[1].startswith("The zero of joint j0 changed by ")
