@@ -171,6 +171,9 @@ def test_noise_of_unknown_size_has_no_expected_distance():
     assert len(model.noise_factors) == 2 * model.usual_noise + 1
     stated = model_of(positions())
     assert (len(stated.noise_factors), stated.usual_noise) == (1, 0)
+    variances = np.geomspace(1e-6, 100, 17)[:, None]
+    np.testing.assert_allclose(model.variances, np.tile(variances, 21))
+    np.testing.assert_array_equal(stated.variances, np.ones((1, 21)))
     # One of two measurements without a noise is enough.
     assert len(model_of(positions(Q[:3]), positions(Q[3:], None)).noise_factors) > 1
 
@@ -262,6 +265,22 @@ def test_payloads_beyond_those_of_the_calibration(payloads, masses, is_beyond):
     assert effects.shape == (3, 3, 6 if is_beyond else 0)
 
 
+def test_the_payload_of_a_rigid_arm_does_not_matter():
+    assert not model_of(positions(), payloads=(0.0, 12.0)).unknown_columns
+    # An arm without a payload of its own is modelled without any.
+    arm = elastic("compliance", mass=None)
+    model = model_of(positions(arm=arm), arm=arm, payloads=(0.0, 12.0))
+    assert model._condition_spreads["payload"] == (0.0, pytest.approx(np.hypot(12 / np.sqrt(12), 6.0)))
+
+
+def test_samples_with_known_conditions_are_predicted_with_them():
+    arm = elastic("compliance", "thermal", "backlash")
+    conditions = {"temperature": np.full(7, 35.0), "payload": np.full(7, 9.0), "approach": np.ones((7, 6))}
+    model = model_of(positions(arm=arm, **conditions), arm=arm)
+    np.testing.assert_allclose(model.rows[:, -1], 0, atol=1e-6)
+    np.testing.assert_allclose(model._unknown_directions(model.data[0]), 0, atol=1e-6)
+
+
 def test_yielding_to_an_excess_has_the_error_of_a_share_of_it():
     arm = elastic("compliance")
     masses = np.array([5.0, 9.0, 8.0])
@@ -325,6 +344,15 @@ def test_origins_are_those_of_the_joints_between_base_and_tool():
         values=positions(q).values + 1e-3 * np.random.default_rng(0).normal(size=(12, 3))
     )
     assert not model_of(noisy).is_origin(np.inf)
+    # Or up to the largest residuals of noise, which has the freedom of all rows but those of a motion.
+    model = model_of(noisy)
+    fits = [np.linalg.lstsq(columns, model.rows[:, -1])[1:3] for columns in model.origins]
+    largest = max(2.25 * chi2.isf(1e-3, 36 - rank) / square[0] for square, rank in fits if len(square))
+    for share, is_explained in ((0.97, True), (1.03, False)):
+        scaled, rows = model_of(noisy), model.rows.copy()
+        rows[:, -1] *= np.sqrt(share * largest)
+        vars(scaled)["rows"] = rows
+        assert scaled.is_origin(np.inf) == is_explained
 
 
 def test_samples_are_named_by_line_or_by_number():
@@ -753,7 +781,7 @@ def test_other_kinds_of_measurements_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("shift", "count", "is_larger"), [(0.0, 7, False), (1e-3, 7, True), (1e-3, 3, False)]
+    ("shift", "count", "is_larger"), [(0.0, 7, False), (1e-3, 7, True), (1e-3, 4, True), (1e-3, 3, False)]
 )
 def test_an_excess_error_needs_four_samples(shift, count, is_larger):
     data = positions(Q[:count]).replace(values=positions(Q[:count]).values + shift)
@@ -766,6 +794,7 @@ def test_an_excess_error_needs_four_samples(shift, count, is_larger):
     assert find_excess_error(ARM, [turned], uncertainty_of(1e-6)) is None
     inclination = Inclination.simulate(ARM, Q, Noise(0, 1e-4), np.random.default_rng(0))
     assert find_excess_error(ARM, [inclination], uncertainty_of(1e-6)) is None
+    assert find_excess_error(ARM, [data, inclination], uncertainty_of(1e-6)) is None
     assert find_excess_error(ARM, [data], uncertainty_of(1e-6, residual_std=None)) is None
 
 
@@ -798,9 +827,17 @@ def test_what_two_changes_cancel_is_left_out(angle, rank):
     np.testing.assert_allclose(columns @ inverse @ columns, columns, atol=0.01)
     # Multiples of a column count once, whatever their size.
     row = np.random.default_rng(0).normal(size=(4, 1))
-    for size in (1e-6, 1.0, 1e6):
+    for size in (1e-12, 1.0, 1e12):
         single, count = check._separable_inverse([size * row @ np.array([[1.0, np.pi]])])
         assert (single.shape, count) == ((2, 4), 1)
+
+
+@pytest.mark.parametrize(("share", "rank"), [(0.98, 1), (1.02, 2)])
+def test_two_changes_are_separable_if_two_hundredths_of_them_remain(share, rank):
+    """The smaller singular value of two unit vectors is √2·sin(α/2)."""
+    angle = 2 * np.arcsin(share * 0.02 / np.sqrt(2))
+    columns = [np.array([[1.0], [0.0]]), np.array([[np.cos(angle)], [np.sin(angle)]])]
+    assert check._separable_inverse(columns)[1] == rank
 
 
 @pytest.mark.parametrize(("freedom", "chi_square"), [(1, 9.0), (12, 40.0), (0, 40.0), (-1, 3.0)])
@@ -1076,7 +1113,8 @@ def test_an_origin_is_blamed_if_no_single_part_explains_the_samples():
     found = answer(shares, origin_limit=1.0)
     assert (found.verdict, found.what, found.has_several) == ("changed", "robot", False)
     assert found.reasons == (f"{ORIGIN}: calibrate again.",)
-    assert answer(shares, origin_limit=1.0, changed=[OTHER]).verdict == "cannot say"
+    for part in (JOINT, OTHER, BASE):
+        assert answer(shares, origin_limit=1.0, changed=[part]).verdict == "cannot say"
     assert answer(shares, origin_limit=1.0, judge=None).verdict == "cannot say"
     # A change of all parts alone is no single part.
     assert answer(shares, origin_limit=1.0, changed=[ROBOT]).what == "robot"
@@ -1199,7 +1237,9 @@ def test_nothing_changed_if_every_change_would_be_revealed():
         (hypothesis("tool", 1.0, angle=0.009, angle_std=1e-4), "The tool moved by 5.00 mm."),
         (hypothesis("tool", 1.0, angle=0.02, angle_std=1e-4), "The tool moved by 5.00 mm and turned "
          "by 1.146°."),
-        (hypothesis("tool", 1.0, angle=0.02, angle_std=0.005), "The tool moved by 5.00 mm."),
+        (hypothesis("tool", 1.0, angle=0.02, angle_std=0.0041), "The tool moved by 5.00 mm."),
+        (hypothesis("tool", 1.0, angle=0.02, angle_std=0.0039), "The tool moved by 5.00 mm and turned "
+         "by 1.15°."),
         (hypothesis("tool", 1.0, unit="rad", angle=0.02, angle_std=1e-4), "The tool turned by 0.286°."),
         (hypothesis("base", 1.0), "The base or the instrument moved by 5.00 mm, as after a new set-up of the "
          "instrument."),
