@@ -288,6 +288,46 @@ def test_the_history_of_a_frame_has_the_uncertainty_along_its_motion():
     np.testing.assert_allclose(found.std, 2e-4 * share, atol=1e-12)
 
 
+def test_the_history_of_an_irregular_drift_has_the_uncertainty_along_its_largest_motion():
+    """Each column of the root of the covariance is an error, whose part along that motion counts."""
+    shape = FreeDrift(0.0, COUNT - 1.0)
+    cause = cause_of("base", shape)
+    root = np.random.default_rng(2).normal(size=(6 * 8, 5))
+    cause = replace(cause, covariance=1e-10 * root @ root.T)
+    changes = changes_of(cause)
+    (found,) = histories(Session(TIMELINE, CHAIN, True, changes, (cause,)))
+    f = shape.values(TIMELINE.numbers[0], TIMELINE.times[0])
+    moved = f @ cause.amplitudes / SIZES
+    lengths = np.linalg.norm(moved, axis=1)
+    peak = lengths.argmax()
+    size, std, _ = cause_size(cause, changes, CHAIN, TIMELINE)
+    np.testing.assert_allclose(found.values, size * lengths / lengths[peak])
+    errors = [f @ column.reshape(8, 6) / SIZES @ moved[peak] for column in root.T]
+    spread = np.linalg.norm(errors, axis=0)
+    np.testing.assert_allclose(found.std, std * spread / spread[peak])
+
+
+def test_a_history_of_nothing_is_zero():
+    (found,) = histories(Session(TIMELINE, CHAIN, True, causes=(joint_step(2, 4, size=0.0, std=0.0),)))
+    np.testing.assert_array_equal(found.values, np.zeros(COUNT))
+    np.testing.assert_array_equal(found.std, np.zeros(COUNT))
+
+
+def test_without_a_lag_none_is_described():
+    assert describe_lag((joint_step(0, 5),), RobotChanges(), order_samples(files_of(9), ())) is None
+
+
+def test_a_lag_begins_with_the_first_sample_of_the_robot():
+    """Distances have no time, and precede the touches."""
+    distances = PointDistance(2, [("p1", "p2"), ("p1", "p3")], [1.0, 1.0])
+    lag = lag_of(
+        [(Constant(), 0.5), (Step(6), 0.2)], order_samples((*files_of(9, kind=PointContact), distances), ())
+    )
+    places = [(p.first.line, p.last.line) for p in lag.parts]
+    assert places == [(2, 5), (6, 10)]
+    assert [p.begin for p in lag.parts] == pytest.approx([0.3, 0.5])
+
+
 def lag_of(shapes, timeline):
     """Return the description of a lag with amplitudes by function of time, each 1 % uncertain at most."""
     block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
