@@ -215,6 +215,9 @@ def test_rails_before_the_first_revolute_joint_move_the_arm_as_the_base_does():
     for index, rivals in enumerate([("base",), ("base",), ()]):
         (event,) = describe_events((joint_step(index, 3),), RobotChanges(), gantry(), timeline)
         assert event.rivals == rivals
+    for index, rivals in enumerate([("base",), (), ()]):
+        (event,) = describe_events((joint_step(index, 3),), RobotChanges(), CHAIN, TIMELINE)
+        assert event.rivals == rivals
 
 
 def test_a_lag_is_no_event_and_no_drift():
