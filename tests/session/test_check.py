@@ -544,7 +544,7 @@ def test_a_change_imitates_another_one_if_it_leaves_a_millionth_of_its_squares(l
     rows[:3, 2] = 0.6, 0.8, left
     vars(model)["rows"] = rows
     both_columns = Block("base", "", np.array([0, 1]), np.array([2.0, 0.5]))
-    joint = Block("joint", "j0", np.array([2]), np.array([3.0]))
+    joint = Block("joint", "j0", np.array([2]), np.array([30.0]))
     assert model._has_effects_of(both_columns, joint) == is_imitated
     assert not model._has_effects_of(joint, both_columns)
     # All parts together, or a change itself, do not count.
