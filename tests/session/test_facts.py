@@ -571,11 +571,12 @@ def test_the_last_of_three_parts_of_a_lag_is_compared_with_the_one_before():
     assert lag.is_corrected
 
 
+@pytest.mark.parametrize("lever", [2.0, 0.5])
 @pytest.mark.parametrize(("share", "unit"), [(0.9, "m"), (1.1, "rad")])
-def test_a_motion_is_a_turn_if_that_moves_the_tool_ten_times_farther(share, unit):
-    """The lever of the turn is 2 m."""
-    values = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, share * 10 * 1e-3 / 2])
-    cause = Cause(BLOCKS["turned base"], Drift(0.0, COUNT - 1.0), values, np.diag(np.arange(1.0, 7) ** 2))
+def test_a_motion_is_a_turn_if_that_moves_the_tool_ten_times_farther(share, unit, lever):
+    values = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, share * 10 * 1e-3 / lever])
+    block = replace(BLOCKS["turned base"], sizes=np.repeat([1.0, 1 / lever], 3))
+    cause = Cause(block, Drift(0.0, COUNT - 1.0), values, np.diag(np.arange(1.0, 7) ** 2))
     expected = (1e-3, 2.0, "m") if unit == "m" else (values[5], 6.0, "rad")
     assert cause_size(cause, RobotChanges(), CHAIN, TIMELINE) == pytest.approx(expected)
 
