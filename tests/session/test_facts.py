@@ -295,8 +295,9 @@ def test_the_history_of_an_irregular_drift_has_the_uncertainty_along_its_largest
     """Each column of the root of the covariance is an error, whose part along that motion counts."""
     shape = FreeDrift(0.0, COUNT - 1.0)
     cause = cause_of("base", shape)
-    root = np.random.default_rng(2).normal(size=(6 * 8, 5))
-    cause = replace(cause, covariance=1e-10 * root @ root.T)
+    values, *root = 1e-3 * np.random.default_rng(2).normal(size=(6, 6 * 8))
+    root = 0.01 * np.transpose(root)
+    cause = replace(cause, values=values, covariance=root @ root.T)
     changes = changes_of(cause)
     (found,) = histories(Session(TIMELINE, CHAIN, True, changes, (cause,)))
     f = shape.values(TIMELINE.numbers[0], TIMELINE.times[0])
