@@ -740,11 +740,9 @@ class _CheckModel:
     def _hypothesis(self, block: Block, values: Array, likelihoods: Array, *, share: float) -> Hypothesis:
         """Describe a change."""
         best = int(likelihoods.max((1, 2)).argmax())
-        used = np.flatnonzero(block.sizes)
-        a = self._scaled(self.rows[:, block.columns[used]] * block.sizes[used], best)
-        unit_covariance = np.linalg.pinv(a.T @ a, rcond=1e-12, hermitian=True)
-        covariance = np.zeros((len(block.sizes),) * 2)
-        covariance[np.ix_(used, used)] = unit_covariance * np.outer(block.sizes[used], block.sizes[used])
+        a = self._scaled(self.rows[:, block.columns] * block.sizes, best)
+        covariance = np.linalg.pinv(a.T @ a, rcond=1e-12, hermitian=True)
+        covariance *= np.outer(block.sizes, block.sizes)
         size, std, unit = 0.0, 0.0, "m"
         if block.kind != "robot":
             size, std, unit = self._size(block, values, covariance)
@@ -760,9 +758,7 @@ class _CheckModel:
         if block.kind == "joint":
             size = float(values[0])
         elif unit == "m":
-            origin = np.asarray(block.origin)
-            moved = se3.transform_points(se3.exp6(values), origin[None])[0] - origin
-            size = float(np.linalg.norm(moved))
+            size = float(np.linalg.norm(se3.exp6(values)[:3, 3]))
         return size, std, unit
 
     def unchanged_p_value(self) -> float:

@@ -41,8 +41,8 @@ class Fit:
     @classmethod
     def of(cls, columns: Array, residual: Array) -> Fit:
         """Fit columns (n, c) to a residual (n,), both in units of noise and uncertainty."""
-        coefficients, _, rank, _ = np.linalg.lstsq(columns, -residual, rcond=RANK_TOL)
-        chi_square = float(np.sum((residual + columns @ coefficients) ** 2))
+        coefficients, _, rank, _ = np.linalg.lstsq(columns, residual, rcond=RANK_TOL)
+        chi_square = float(np.sum((residual - columns @ coefficients) ** 2))
         return cls(coefficients, chi_square, int(rank), chi_square + float(rank * np.log(len(residual))))
 
 

@@ -1,6 +1,7 @@
 """Sizes, places and texts of what happened during a session, against the motions of the robot."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -214,6 +215,9 @@ def test_rails_before_the_first_revolute_joint_move_the_arm_as_the_base_does():
     for index, rivals in enumerate([("base",), ("base",), ()]):
         (event,) = describe_events((joint_step(index, 3),), RobotChanges(), gantry(), timeline)
         assert event.rivals == rivals
+    for index, rivals in enumerate([("base",), (), ()]):
+        (event,) = describe_events((joint_step(index, 3),), RobotChanges(), CHAIN, TIMELINE)
+        assert event.rivals == rivals
 
 
 def test_a_lag_is_no_event_and_no_drift():
@@ -285,6 +289,47 @@ def test_the_history_of_a_frame_has_the_uncertainty_along_its_motion():
     assert (found.of, found.unit) == ("base", "m")
     np.testing.assert_allclose(found.values, 3e-3 * share, atol=1e-12)
     np.testing.assert_allclose(found.std, 2e-4 * share, atol=1e-12)
+
+
+def test_the_history_of_an_irregular_drift_has_the_uncertainty_along_its_largest_motion():
+    """Each column of the root of the covariance is an error, whose part along that motion counts."""
+    shape = FreeDrift(0.0, COUNT - 1.0)
+    cause = cause_of("base", shape)
+    values, *root = 1e-3 * np.random.default_rng(2).normal(size=(6, 6 * 8))
+    root = 0.01 * np.transpose(root)
+    cause = replace(cause, values=values, covariance=root @ root.T)
+    changes = changes_of(cause)
+    (found,) = histories(Session(TIMELINE, CHAIN, True, changes, (cause,)))
+    f = shape.values(TIMELINE.numbers[0], TIMELINE.times[0])
+    moved = f @ cause.amplitudes / SIZES
+    lengths = np.linalg.norm(moved, axis=1)
+    peak = lengths.argmax()
+    size, std, _ = cause_size(cause, changes, CHAIN, TIMELINE)
+    np.testing.assert_allclose(found.values, size * lengths / lengths[peak])
+    errors = [f @ column.reshape(8, 6) / SIZES @ moved[peak] for column in root.T]
+    spread = np.linalg.norm(errors, axis=0)
+    np.testing.assert_allclose(found.std, std * spread / spread[peak])
+
+
+def test_a_history_of_nothing_is_zero():
+    (found,) = histories(Session(TIMELINE, CHAIN, True, causes=(joint_step(2, 4, size=0.0, std=0.0),)))
+    np.testing.assert_array_equal(found.values, np.zeros(COUNT))
+    np.testing.assert_array_equal(found.std, np.zeros(COUNT))
+
+
+def test_without_a_lag_none_is_described():
+    assert describe_lag((joint_step(0, 5),), RobotChanges(), order_samples(files_of(9), ())) is None
+
+
+def test_a_lag_begins_with_the_first_sample_of_the_robot():
+    """Distances have no time, and precede the touches."""
+    distances = PointDistance(2, [("p1", "p2"), ("p1", "p3")], [1.0, 1.0])
+    lag = lag_of(
+        [(Constant(), 0.5), (Step(6), 0.2)], order_samples((*files_of(9, kind=PointContact), distances), ())
+    )
+    places = [(p.first.line, p.last.line) for p in lag.parts]
+    assert places == [(2, 5), (6, 10)]
+    assert [p.begin for p in lag.parts] == pytest.approx([0.3, 0.5])
 
 
 def lag_of(shapes, timeline):
@@ -464,7 +509,110 @@ def test_a_lag_is_stated_with_its_parts_and_what_corrects_it(lag, finding, conse
 )  # fmt: skip
 def test_a_scale_says_what_undoes_it(scale, consequence):
     assert scale.consequence == consequence
-    assert Scale(0.985, 1e-4, "x").finding.startswith("Measured x is 1.5 % too short ")
+
+
+@pytest.mark.parametrize(
+    ("scale", "finding"),
+    [
+        (Scale(1.003, 1e-4, ""), "The correction makes the whole robot 0.300 ± 0.010 % longer."),
+        (Scale(0.985, 2.3e-3, ""), "The correction makes the whole robot 1.50 ± 0.23 % shorter."),
+        (Scale(0.985, 1e-4, "x"), "Measured x is 1.5 % too short compared with the other axes."),
+        (Scale(1.01234, 1e-4, "z"), "Measured z is 1.2 % too long compared with the other axes."),
+    ],
+)
+def test_a_scale_says_what_is_too_long(scale, finding):
+    assert scale.finding == finding
+
+
+@pytest.mark.parametrize(
+    ("factor", "is_possible"), [(1.09, True), (0.91, True), (1.11, False), (0.89, False), (2.0, False)]
+)
+def test_an_instrument_is_wrong_by_a_tenth_at_most(factor, is_possible):
+    found = Scale(factor, 1e-4, "", ("a.csv", "b.csv")).consequence
+    if is_possible:
+        assert found.endswith(f" add --mend scale:{factor}@a.csv --mend scale:{factor}@b.csv.")
+    else:
+        assert found == (
+            "No instrument is so wrong: the robot file is probably that of a robot of another size."
+        )
+    # Known lengths, or a single axis, may be wrong by more.
+    for other in (Scale(factor, 1e-4, "", is_of_distances=True), Scale(factor, 1e-4, "x")):
+        assert "--mend scale:" in other.consequence
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.039, "at the time of the measured values"), (-0.039, "at the time of the measured values"),
+        (0.041, "0.041 s earlier than the measured values"),
+        (-0.041, "0.041 s later than the measured values"),
+    ],
+)  # fmt: skip
+def test_a_lag_is_stated_from_four_standard_deviations_on(value, text):
+    assert Lag(value, 0.01, "s").finding == f"The joint values are {text}."
+    parts = (FIRST, replace(SECOND, begin=value, end=value))
+    mends = f" --mend lag:{value}@a.csv:42-91" if abs(value) > 0.04 else ""
+    lag = Lag(value, 0.01, "s", parts=parts)
+    assert lag.finding.startswith(
+        f"The joint values are {text} from line 42 of a.csv on, and 0.200 s earlier"
+    )
+    assert lag.consequence.endswith(f"or add --mend lag:0.2@a.csv:2-41{mends}.")
+
+
+def test_the_last_of_three_parts_of_a_lag_is_compared_with_the_one_before():
+    third = LagPart(Place("a.csv", 92, 92, ""), Place("a.csv", 99, 99, ""), 0.5, 0.5)
+    lag = Lag(0.5, 0.01, "s", parts=(FIRST, SECOND, third))
+    assert lag.finding == (
+        "The joint values are 0.500 s earlier than the measured values from line 92 of a.csv on, and 0.300 s "
+        "later than the measured values before."
+    )
+    assert lag.consequence.endswith(
+        "add --mend lag:0.2@a.csv:2-41 --mend lag:-0.3@a.csv:42-91 --mend lag:0.5@a.csv:92-99."
+    )
+    assert lag.is_corrected
+
+
+@pytest.mark.parametrize("lever", [2.0, 0.5])
+@pytest.mark.parametrize(("share", "unit"), [(0.9, "m"), (1.1, "rad")])
+def test_a_motion_is_a_turn_if_that_moves_the_tool_ten_times_farther(share, unit, lever):
+    values = np.array([0.0, 1e-3, 0.0, 0.0, 0.0, share * 10 * 1e-3 / lever])
+    block = replace(BLOCKS["turned base"], sizes=np.repeat([1.0, 1 / lever], 3))
+    cause = Cause(block, Drift(0.0, COUNT - 1.0), values, np.diag(np.arange(1.0, 7) ** 2))
+    expected = (1e-3, 2.0, "m") if unit == "m" else (values[5], 6.0, "rad")
+    assert cause_size(cause, RobotChanges(), CHAIN, TIMELINE) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_change_of_nothing_has_the_size_zero(name):
+    for shape in (Step(COUNT), Drift(0.0, COUNT - 1.0)):
+        cause = replace(cause_of(name, shape), values=np.zeros(len(VALUES[name])))
+        size, std, _ = cause_size(cause, changes_of(cause), CHAIN, TIMELINE)
+        assert size == 0
+        assert np.isfinite(std)
+
+
+def test_a_session_applies_its_changes_to_its_samples():
+    """Those of the held-out measurements, too; a lag moves the joints along their paths."""
+    first, second = files_of(6, 6)
+    timeline = order_samples((first,), (second,))
+    step = joint_step(0, 9)
+    block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    lag = Cause(block, Constant(), np.array([0.5]), np.ones((1, 1)))
+    rate = first.q[1] - first.q[0]
+    before = [[-2e-3, 0.0]]
+    for cause, zeros in ((step, before * 9 + [[0.0, 0.0]] * 3), (lag, [0.5 * rate] * 12)):
+        changes = update(RobotChanges(), [cause], [cause.values], np.eye(4), LINKS)
+        applied: Any = Session(timeline, rail(), True, changes).applied((first,), (second,))
+        found = np.concatenate([item.conditions().zeros for (item,) in applied])
+        np.testing.assert_allclose(found, zeros, rtol=1e-6)
+
+
+def test_a_session_describes_its_causes():
+    timeline = order_samples(files_of(8, 4), ())
+    drift = replace(joint_step(1, 0), shape=Drift(0.0, 11.0))
+    session = Session(timeline, rail(), True, causes=(joint_step(0, 8), drift)).described()
+    assert [(each.of, each.place) for each in session.events] == [("j0", "between 0.csv and 1.csv")]
+    assert [(each.of, each.shape) for each in session.drifts] == [("j1", "linear")]
 
 
 def test_a_session_lists_what_was_found():

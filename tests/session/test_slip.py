@@ -14,7 +14,7 @@ def rows_of(first, noise=0.0):
     """Return columns of the base, residuals after a motion from a sample on, and the square root of noise."""
     rng = np.random.default_rng(first)
     base, root = rng.normal(size=(len(NUMBERS), 6)), np.diag(rng.uniform(0.5, 2.0, len(NUMBERS)))
-    residual = -np.where(NUMBERS[:, None] >= first, base, 0.0) @ MOTION
+    residual = np.where(NUMBERS[:, None] >= first, base, 0.0) @ MOTION
     return base, residual + noise * root @ rng.normal(size=len(NUMBERS)), root
 
 
@@ -30,7 +30,7 @@ def test_a_motion_of_the_base_is_found_with_its_uncertainty(first, is_determined
     moved = whitening @ np.where(NUMBERS[:, None] >= first, base, 0.0)
     np.testing.assert_allclose(slip.values, MOTION, atol=0.02)
     np.testing.assert_allclose(slip.covariance, np.linalg.inv(moved.T @ moved), rtol=1e-6, atol=1e-9)
-    left = whitening @ residual + moved @ slip.values
+    left = whitening @ residual - moved @ slip.values
     assert slip.chi_square == pytest.approx(left @ left)
     assert slip.freedom == len(NUMBERS) - 6
     # The criterion is that of Schwarz, of the best other change.
@@ -45,7 +45,7 @@ def test_a_motion_of_the_base_is_found_with_its_uncertainty(first, is_determined
 def test_columns_without_an_effect_do_not_count():
     """Two of three columns are multiples of each other."""
     columns = np.outer(np.arange(1.0, 9.0), [1.0, 2.0, 0.0]) + np.outer(np.arange(8) % 2, [0.0, 0.0, 1.0])
-    fit = Fit.of(columns, -columns @ [1.0, 0.0, 4.0])
+    fit = Fit.of(columns, columns @ [1.0, 0.0, 4.0])
     assert (fit.rank, fit.chi_square) == (2, pytest.approx(0.0, abs=1e-12))
     assert fit.criterion == pytest.approx(2 * np.log(8))
     assert fit.coefficients @ [1.0, 2.0, 0.0] == pytest.approx(1.0)
