@@ -666,15 +666,22 @@ def _order_hypotheses(chain: Chain) -> Iterator[Hypothesis]:
         change = JointChange.of(n, sources=sources)
         instead = f"the order of joints {names[i]} and {names[j]}{_IN_ROBOT}"
         yield Hypothesis(f"swap:{names[i]}:{names[j]}", text, change, instead)
-    if n < 3:
-        return
-    for key, sources, text in (
-        ("columns:-1", (*range(1, n), 0), "shifted by one"),
-        ("columns:+1", (n - 1, *range(n - 1)), "shifted by one"),
-        ("columns:reversed", tuple(range(n))[::-1], "in reverse order"),
-    ):
+    orders = {
+        "-1": ((*range(1, n), 0), "shifted by one"),
+        "+1": ((n - 1, *range(n - 1)), "shifted by one"),
+        "reversed": (tuple(range(n))[::-1], "in reverse order"),
+        # As the joint states of ROS.
+        "alphabetical": (tuple(map(sorted(names).index, names)), "in alphabetical order"),
+    }
+    tried = {tuple(range(n))}
+    for key, (sources, text) in orders.items():
+        # An order that exchanges two columns is listed above.
+        if sources in tried or np.sum(np.array(sources) != np.arange(n)) == 2:
+            continue
+        tried.add(sources)
         change = JointChange.of(n, sources=sources)
-        yield Hypothesis(key, f"the joint columns are {text}", change, f"the order of the joints{_IN_ROBOT}")
+        instead = f"the order of the joints{_IN_ROBOT}"
+        yield Hypothesis(f"columns:{key}", f"the joint columns are {text}", change, instead)
 
 
 def _unit_hypotheses(chain: Chain, data: Sequence[Measurement]) -> Iterator[Hypothesis]:

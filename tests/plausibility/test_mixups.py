@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from measurement_files import frames, joint_positions, real_ur10
-from robots import nominal_arm
+from robots import nominal_arm, paper
 from scipy.spatial.transform import Rotation
 from sessions import NAMES as SESSIONS
 from sessions import Simulation
@@ -95,6 +95,43 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
     assert f"--mend {key}" in found.remedy
     np.testing.assert_allclose(mend(ur10, wrong, key).q, data.q, atol=1e-12)
     assert not diagnose_mixups(ur10, [data]).is_suspicious
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_joint_values_in_alphabetical_order_are_named_and_mended(kind):
+    """ROS publishes the joints of an arm in this order, which four of these names change."""
+    names = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+    arm = Chain.from_dh(replace(paper("sim_6dof"), names=names))
+    rng = np.random.default_rng(5)
+    true = replace(arm, origins=arm.origins @ se3.exp6(1e-3 * rng.normal(size=(len(arm.origins), 6))))
+    data = kind.simulate(true, rng.uniform(-2, 2, (40, 6)), Noise(1e-4, 1e-4), rng)
+    wrong = with_joints(data, lambda q: q[:, np.argsort(names)])
+    found = diagnose_mixups(arm, [wrong])
+    assert [hypothesis.key for hypothesis in found.hypotheses] == ["columns:alphabetical"]
+    np.testing.assert_allclose(mend(arm, wrong, "columns:alphabetical").q, data.q, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("abc", ["columns:-1", "columns:+1"]),
+        ("abcd", ["columns:-1", "columns:+1", "columns:reversed"]),
+        ("cbda", ["columns:-1", "columns:+1", "columns:reversed", "columns:alphabetical"]),
+        ("acbd", ["columns:-1", "columns:+1", "columns:reversed"]),
+        ("dcba", ["columns:-1", "columns:+1", "columns:reversed"]),
+        ("ba", []),
+    ],
+)
+def test_each_order_of_the_joints_is_tried_once(names, expected):
+    """An order in which two joints are exchanged is a hypothesis of its own."""
+    n = len(names)
+    zero, limits = np.zeros(n), np.full(n, 3.0)
+    arm = Chain.from_dh(
+        DHTable("standard", tuple(names), zero > 0, zero, zero, zero, zero, zero, -limits, limits)
+    )
+    data = Position(np.zeros((3, n)), np.zeros((3, 3)))
+    keys = [each.key for each in list_hypotheses(arm, [data])]
+    assert [key for key in keys if key.startswith("columns:")] == expected
 
 
 def scara(theta, d, a):
