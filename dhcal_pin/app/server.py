@@ -244,8 +244,9 @@ def _routes(service: _Service) -> list[tuple[Any, ...]]:
     ]
 
 
+@tornado.web.stream_request_body
 class _Handler(tornado.web.RequestHandler):
-    """Handler whose answers are not stored, and that answers an error with one line of text."""
+    """Handler that keeps no body, whose answers are not stored, with one line of text for an error."""
 
     def set_default_headers(self) -> None:
         for name, value in _HEADERS.items():
@@ -254,6 +255,9 @@ class _Handler(tornado.web.RequestHandler):
 
     def write_error(self, status_code: int, **_: Any) -> None:
         self.finish(f"{status_code}: {self._reason}\n")
+
+    def data_received(self, chunk: bytes) -> None:
+        pass
 
 
 class _PageHandler(_Handler):
@@ -318,7 +322,6 @@ class _FollowHandler(_Handler):
             await self.flush()
 
 
-@tornado.web.stream_request_body
 class _RunHandler(_FollowHandler):
     """Runs one operation on the files of a form."""
 

@@ -331,6 +331,18 @@ def test_an_interrupted_upload_leaves_no_memory(app):
         wait_until(lambda: server.memory_info().rss - before < 10_000_000)
 
 
+@pytest.mark.parametrize("path", ["", "app.js", "job/1"])
+def test_a_body_where_none_belongs_is_not_kept(app, path):
+    server = psutil.Process(app.process.pid)
+    before = server.memory_info().rss
+    with begin_upload(app, f"{urlsplit(app.url).path}{path}") as connection:
+        for _ in range(40):
+            connection.sendall(bytes(1_000_000))
+        assert server.memory_info().rss - before < 10_000_000
+    body, headers = form({"a.csv": b""}, {})
+    assert post(app, path, body, **headers)[0] == 405
+
+
 @pytest.mark.parametrize("n_files", [MAX_FILES + 1, 300])
 def test_too_many_files_are_one_line(app, n_files):
     names = [f"{i}.csv" for i in range(n_files)]

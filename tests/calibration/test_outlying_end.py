@@ -5,10 +5,12 @@ from math import comb
 import numpy as np
 import pytest
 from camera_setups import ARMS, simulate
+from scipy.stats import hypergeom
 from slow_cases import some_slow
 
 import dhcal_pin as dh
 from dhcal_pin.calibration.cameras import describe_outlying_end
+from dhcal_pin.calibration.cameras.image_checks import _outlying_end
 from dhcal_pin.calibration.evaluation import compute_errors
 
 pytestmark = pytest.mark.usefixtures("own_loss", "untried", "ordered_axes")
@@ -56,6 +58,28 @@ def test_outliers_at_an_end_are_named_unless_chance_explains_them(count, is_name
         agrees = is_outlier & (np.arange(len(place)) == np.flatnonzero(is_outlier)[-1 if at_begin else 0])
         parts = [(item, ~(is_outlier & ~agrees))]
         assert not any(f" {count} images" in text for text in describe_outlying_end(parts, False))
+
+
+@pytest.mark.parametrize("n_images", [40, 3000])
+def test_a_few_images_after_a_motion_may_agree(n_images):
+    """One in ten of the images after the motion is no outlier, and one in ten before it is one."""
+    place = np.arange(n_images)
+    n_moved = n_images // 2
+    is_outlying = (place < n_moved) != (place % 10 == 4)
+    count, found, chance = _outlying_end(is_outlying.tolist())
+    assert (count, found) == (n_moved, n_moved - n_moved // 10)
+    expected = hypergeom.sf(found - 1, n_images, is_outlying.sum(), n_moved)
+    assert chance == pytest.approx(expected, rel=1e-6)
+    assert chance < 1e-5
+
+
+def test_most_of_the_images_at_an_end_are_named_with_their_number():
+    _, item = photograph(0, 0, n_images=46)
+    place = order_of(item)
+    for n_agreeing, is_named in ((1, True), (2, True), (3, False)):
+        is_outlier = (place >= 36) & ~((place < 44) & (place >= 44 - n_agreeing))
+        found = "".join(describe_outlying_end([(item, ~is_outlier)], False))
+        assert found.startswith(f"All corners of {10 - n_agreeing} of the last 10 images of") == is_named
 
 
 def test_outliers_everywhere_are_no_motion():

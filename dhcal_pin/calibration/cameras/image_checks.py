@@ -45,6 +45,8 @@ SHIFTS = (-2, -1, 1, 2)
 # Outlying images at an end of a file are named if images that are wrong at random are there with a lower
 # probability.
 MAX_CHANCE = 1e-3
+# Smallest share of outliers among them: after a motion, few images agree by chance.
+MIN_OUTLYING_SHARE = 0.8
 # Share of outliers above which a fit says nothing.
 MAX_IMAGE_OUTLIER_SHARE = 0.5
 # RMS rotation about the second axis [rad] below which an error of the arm displaces the camera far more than
@@ -229,7 +231,7 @@ def describe_weak_positions(std: float, error: float, rotation: float) -> str:
 
 
 def describe_outlying_end(parts: Sequence[tuple[Measurement, Array]], has_holdout: bool) -> list[str]:
-    """Say that all images of a camera from some image on, or up to one, are outliers, as after a motion.
+    """Say that the images of a camera from some image on, or up to one, are outliers, as after a motion.
 
     Each part of a file, fitted or held out, has a mask (m,) of the samples that are no outliers.
     """
@@ -237,20 +239,35 @@ def describe_outlying_end(parts: Sequence[tuple[Measurement, Array]], has_holdou
     for (_, camera), images in _images_of_cameras(parts).items():
         ordered = sorted(images)
         for which, motion, each in (("last", "before", ordered[::-1]), ("first", "after", ordered)):
-            is_outlying = [outlying for _, _, outlying in each]
-            count = is_outlying.index(False) if False in is_outlying else 0
-            if count < 2 or comb(sum(is_outlying), count) > MAX_CHANCE * comb(len(each), count):
+            count, n_outlying, chance = _outlying_end([outlying for _, _, outlying in each])
+            if n_outlying < 2 or n_outlying < MIN_OUTLYING_SHARE * count or chance > MAX_CHANCE:
                 continue
             labels = sorted(each[:count])
+            part = f"{n_outlying} of the {which}" if n_outlying < count else f"the {which}"
             name = f" ({labels[0][1]} to {labels[-1][1]})" if labels[0][1] and labels[-1][1] else ""
             remedy = "Check both, and take the images again."
             if has_holdout:
                 remedy = "Calibrate without hold-out images: a motion that enough images show is estimated."
             texts.append(
-                f"All corners of the {which} {count} images of camera {camera!r}{name} are outliers: camera "
+                f"All corners of {part} {count} images of camera {camera!r}{name} are outliers: camera "
                 f"or board may have moved {motion} them. The result holds for the other images. {remedy}"
             )
     return texts
+
+
+def _outlying_end(is_outlying: Sequence[bool]) -> tuple[int, int, float]:
+    """Return the number of images in front of the place that divides outliers best from others.
+
+    Then that of the outliers among them, and the probability of so many if outliers are at random places.
+    """
+    n_images, n_outliers = len(is_outlying), sum(is_outlying)
+    found = np.cumsum(is_outlying)
+    count = 1 + int(np.argmax(2 * found - np.arange(1, n_images + 1)))
+    ways = sum(
+        comb(n_outliers, n) * comb(n_images - n_outliers, count - n)
+        for n in range(int(found[count - 1]), min(count, n_outliers) + 1)
+    )
+    return count, int(found[count - 1]), ways / comb(n_images, count)
 
 
 def count_outlying_images(parts: Sequence[tuple[Measurement, Array]]) -> list[tuple[str, int, int]]:
