@@ -60,6 +60,8 @@ from .validation import validated_array, validated_joint_positions, validated_si
 PIXEL_SIGMA = 1.0
 # Rows and velocity components of the terms: each image coordinate by all six velocities of the tool.
 _TERMS = (np.repeat([0, 1], 6), np.tile(np.arange(6), 2))
+# Errors of poses that images show with a lens that is not calibrated yet, relative to those by noise.
+_SHOWN_NOISE_FACTOR = 2.5
 # Set-up of simulations: distance of the cameras from the robot as a multiple of its reach, image scale [px/m]
 # at the robot, and half the diagonals of the board [m].
 _DISTANCE, _SCALE, _BOARD_SIZE = 1.5, 1000.0, 0.3
@@ -643,9 +645,15 @@ class CameraCorners(Measurement):
         return images.estimate_views(self.corners)
 
     def tool_poses(self) -> Pose:
-        """Return the poses of the tool, for some base and some tool, that the images show one by one."""
+        """Return the poses of the tool, for some base and some tool, that the images show one by one.
+
+        Their standard deviations contain the errors of a lens that is not calibrated yet.
+        """
         samples, poses = images.moving_poses(self.corners, self.board_views)
-        return Pose(self.q[samples], poses)
+        information = images.moving_information(self.corners, self.board_views, samples)
+        variances = np.einsum("mii->mi", images.pose_covariances(poses, information))
+        sigma = _SHOWN_NOISE_FACTOR * np.sqrt(variances)
+        return Pose(self.q[samples], poses, sigma[:, :3], sigma[:, 3:])
 
     def image_poses(self) -> images.ImagePose:
         """Return the same poses with their covariances, lines and conditions."""

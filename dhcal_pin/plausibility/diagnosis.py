@@ -22,6 +22,8 @@ NO_EVIDENCE = Evidence(log=0.0, width=0.0, length_scale=np.nan, angle_scale=np.n
 # Measurements are suspicious if they need errors of this width, in default standard deviations, or leave
 # residuals of this size [m], [rad].
 _SUSPICIOUS_WIDTH, _SUSPICIOUS_LENGTH, _SUSPICIOUS_ANGLE = 4.0, 2e-3, 1e-2
+# Residuals of measurements that state a large noise may be this much larger.
+_MAX_NOISE_RATIO = 2.0
 # Residuals that fall by this factor are named in the sentence.
 _MIN_NAMED_RATIO = 2.0
 
@@ -84,7 +86,7 @@ class Diagnosis:
             # With errors of any size a robot may have fitted these measurements before.
             if leaves_residuals(self.before) and before > _MIN_NAMED_RATIO * after:
                 sizes = [format_quantity(v, unit, 0.1 * v, small=True) for v in (before, after)]
-                rest = " Something else is wrong, too." * leaves_residuals(self.after)
+                rest = "" if is_fitted(self.after) else " Something else is wrong, too."
                 return f"{text}: undoing this reduces the residuals from {sizes[0]} to {sizes[1]}.{rest}"
         return f"{text}: undoing this makes the measurements fit a robot with ordinary errors."
 
@@ -153,9 +155,9 @@ def leaves_residuals(evidence: Evidence) -> bool:
 
 def is_fitted(evidence: Evidence) -> bool:
     """Return whether a robot fits measurements after a change, with the residuals that it may leave."""
-    factor = evidence.residual_factor
+    factor, (length, angle) = evidence.residual_factor, evidence.stated_noise
     is_far = (
-        evidence.length_scale > factor * _SUSPICIOUS_LENGTH,
-        evidence.angle_scale > factor * _SUSPICIOUS_ANGLE,
+        evidence.length_scale > max(factor * _SUSPICIOUS_LENGTH, _MAX_NOISE_RATIO * length),
+        evidence.angle_scale > max(factor * _SUSPICIOUS_ANGLE, _MAX_NOISE_RATIO * angle),
     )
     return not any(is_far)

@@ -91,6 +91,8 @@ class Evidence:
     #: Values of the instrument parameters by name [m or rad].
     instruments: Mapping[str, float] = field(default_factory=dict, repr=False, compare=False)
     residual_factor: float = 1.0  #: Residuals that such a robot may leave, relative to a manufactured one.
+    #: Stated standard deviations of the measured lengths [m] and angles [rad]; 0 if none are stated.
+    stated_noise: tuple[float, float] = (0.0, 0.0)
 
     def residuals(self, item: Measurement) -> list[tuple[str, Array]] | None:
         """Compute unit and rows (k, m) of each group of residuals, relative to the noise."""
@@ -136,7 +138,7 @@ def with_noise_of(
 def fit_evidence(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
     """Fit a robot with errors of one of the keys of `_FIT_WIDTHS` and compute the evidence."""
     equal = tuple(_with_equal_sigmas(item) for item in data)
-    return _fit_initialized(_initialized_frames(chain, equal, sets), equal, sets)
+    return _with_stated_noise(_fit_initialized(_initialized_frames(chain, equal, sets), equal, sets), data)
 
 
 def fit_evidence_near(near: Evidence, chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence:
@@ -144,7 +146,7 @@ def fit_evidence_near(near: Evidence, chain: Chain, data: Sequence[Measurement],
     assert near.chain is not None
     started = chain.with_base_and_tool(near.chain.base, near.chain.tool)
     equal = tuple(_with_equal_sigmas(item) for item in data)
-    return _fit_initialized(select_parameters(started, sets), equal, sets)
+    return _with_stated_noise(_fit_initialized(select_parameters(started, sets), equal, sets), data)
 
 
 def fit_without_gross_outliers(chain: Chain, data: Sequence[Measurement], sets: str) -> Evidence | None:
@@ -161,7 +163,7 @@ def fit_without_gross_outliers(chain: Chain, data: Sequence[Measurement], sets: 
         item.initialized_from(errors.chain, ~each).with_weights(np.where(each, ZERO_WEIGHT, 1.0))
         for item, each in zip(equal, is_gross, strict=True)
     )
-    return _fit(errors, started, sets)
+    return _with_stated_noise(_fit(errors, started, sets), data)
 
 
 def _initialized_frames(chain: Chain, data: tuple[Measurement, ...], sets: str) -> ErrorModel:
@@ -214,6 +216,18 @@ def _evidence_of(problem: Problem, solution: SolverResult, noise: _Noise, prior_
         dict(zip((p.name for p in problem.errors.parameters), solution.x.tolist(), strict=False)),
         problem.instruments(solution.x),
     )
+
+
+def _with_stated_noise(evidence: Evidence, data: Sequence[Measurement]) -> Evidence:
+    """Return evidence with the largest noise that measurements state."""
+    stated = [item for item in data if item.has_stated_sigma]
+    lengths = [item.sigma for item in stated if isinstance(item, PoseMeasurement | PointMeasurement)]
+    angles = [item.rotation_sigma for item in stated if isinstance(item, PoseMeasurement)]
+    length, angle = (
+        max((float(np.sqrt(np.mean(each**2))) for each in sigmas), default=0.0)
+        for sigmas in (lengths, angles)
+    )
+    return replace(evidence, stated_noise=(length, angle))
 
 
 def _with_equal_sigmas(item: Measurement) -> Measurement:

@@ -108,6 +108,25 @@ def test_wrong_joint_values_of_images_are_named_and_mended(change, is_in_order, 
         np.testing.assert_allclose(mended.q, images.q)
 
 
+@pytest.mark.usefixtures("ordered_axes")
+@pytest.mark.parametrize(("name", "joint"), some_slow([("panda", 4), ("ur10", 2), ("xarm7", 5)], {0}))
+def test_a_wrong_sign_is_named_where_images_show_six_corners(name, joint):
+    """A pose from six corners has an error of ten milliradians, which no other instrument has."""
+    chain, rng = ARMS[name](), np.random.default_rng(joint)
+    arm = wrong_arm(chain, 5e-4, rng)
+    images = simulate(chain, arm, rng, is_on_wrist=False, n_images=30, sigma=0.2, n_cameras=2).images
+    shown = [
+        rng.permutation(np.flatnonzero(images.image == number))[:6] for number in np.unique(images.image)
+    ]
+    few = images.take(np.sort(np.concatenate(shown)))
+    sign = np.where(np.arange(chain.n_joints) == joint, -1, 1)
+    fit = calibrate(chain, with_wrong_joint_values(few, lambda q: q * sign))
+    assert fit.verdict.status == "refused"
+    (reason,) = fit.verdict.reasons
+    assert f"The sign of joint {chain.joint_names[joint]} is wrong" in reason
+    assert "Something else" not in reason
+
+
 def test_joint_values_are_moved_by_images_where_the_arm_returns_to_a_configuration():
     chain, visits = ARMS["ur10"](), [0, 1, 0, 2, 3, 0, 4]
     images = simulate(chain, chain, np.random.default_rng(0), is_on_wrist=True, n_images=5, sigma=0.2).images

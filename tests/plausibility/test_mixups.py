@@ -22,7 +22,8 @@ from dhcal_pin.io import read_robot
 from dhcal_pin.measurements import Distance, Noise, PointContact, PointDistance, Pose, Position, Wires
 from dhcal_pin.measurements.euler_angles import euler_notation
 from dhcal_pin.plausibility import diagnose_mixups, fit_evidence, list_hypotheses, mend, mixups, trials
-from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis
+from dhcal_pin.plausibility.diagnosis import NO_EVIDENCE, Diagnosis, is_fitted
+from dhcal_pin.plausibility.evidence import MANUFACTURED, Evidence
 from dhcal_pin.plausibility.hypotheses import both, ratio_hypothesis
 from dhcal_pin.plausibility.misfit import nominal_misfits
 from dhcal_pin.plausibility.signs import known_signs
@@ -95,6 +96,35 @@ def test_mixed_up_joints_are_named_and_mended(ur10, kind, mixup, key):
     assert f"--mend {key}" in found.remedy
     np.testing.assert_allclose(mend(ur10, wrong, key).q, data.q, atol=1e-12)
     assert not diagnose_mixups(ur10, [data]).is_suspicious
+
+
+@pytest.mark.parametrize(
+    ("scales", "factor", "stated", "expected"),
+    [
+        ((1.9e-3, 9e-3), 1.0, (0.0, 0.0), True),
+        ((2.1e-3, 9e-3), 1.0, (0.0, 0.0), False),
+        ((1.9e-3, 1.1e-2), 1.0, (0.0, 0.0), False),
+        ((3.9e-3, 1.9e-2), 2.0, (0.0, 0.0), True),
+        ((4.1e-3, 1.9e-2), 2.0, (0.0, 0.0), False),
+        ((5.9e-3, 2.9e-2), 1.0, (3e-3, 1.5e-2), True),
+        ((6.1e-3, 2.9e-2), 1.0, (3e-3, 1.5e-2), False),
+        ((5.9e-3, 3.1e-2), 1.0, (3e-3, 1.5e-2), False),
+        ((1.9e-3, 9e-3), 1.0, (1e-5, 1e-5), True),
+    ],
+)
+def test_a_robot_fits_with_usual_residuals_or_twice_the_stated_noise(scales, factor, stated, expected):
+    """Usual residuals are 2 mm and 10 mrad."""
+    evidence = Evidence(0.0, 1.0, *scales, residual_factor=factor, stated_noise=stated)
+    assert is_fitted(evidence) == expected
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_evidence_knows_the_stated_noise(ur10, kind):
+    data = measured(kind, 20)
+    noise = (1e-4, 1e-4 if kind is Pose else 0.0)
+    assert fit_evidence(ur10, [data], MANUFACTURED).stated_noise == pytest.approx(noise)
+    unknown = kind(data.q, data.poses if kind is Pose else data.values)
+    assert fit_evidence(ur10, [unknown], MANUFACTURED).stated_noise == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("kind", [Pose, Position])

@@ -232,6 +232,26 @@ def test_covariances_of_poses_agree_with_their_scatter(monkeypatch):
     assert np.all((spread > 0.8) & (spread < 1.2)), spread
 
 
+@pytest.mark.parametrize("n_corners", [6, 54])
+def test_poses_state_their_noise_and_some_of_the_errors_of_the_lens(n_corners):
+    """The lens is right here, so that the errors are smaller than those that are stated."""
+    rng, nominal = np.random.default_rng(3), ARMS["ur10"]()
+    exact = simulate(nominal, nominal, rng, is_on_wrist=True, n_images=6, sigma=NOISE).exact
+    exact = exact.take(np.concatenate([np.flatnonzero(exact.image == i)[:n_corners] for i in range(6)]))
+    cameras = tuple(replace(camera, intrinsics="fixed") for camera in exact.rig.cameras)
+    exact = exact.with_rig(replace(exact.rig, cameras=cameras))
+    truth = exact.tool_poses()
+    assert truth.sigma == pytest.approx(2.5 * image_pose.ARM_STD[0], rel=1e-2)
+    found = exact.replace(values=exact.values + NOISE * rng.standard_normal(exact.values.shape)).tool_poses()
+    turns = se3.log3(found.poses[:, :3, :3] @ truth.poses[:, :3, :3].swapaxes(1, 2))
+    for error, sigma in (
+        (found.positions() - truth.positions(), found.sigma),
+        (turns, found.rotation_sigma),
+    ):
+        assert np.sqrt(np.mean((error / sigma) ** 2)) < 0.8
+    assert found.has_stated_sigma
+
+
 @dataclass(frozen=True)
 class Fitted:
     """Stand-in of a fit of some measurements."""

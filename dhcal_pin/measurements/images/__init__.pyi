@@ -12,3 +12,4 @@ from .camera_start import first_values as first_values
 from .camera_start import moving_information as moving_information
 from .camera_start import moving_poses as moving_poses
 from .image_pose import ImagePose as ImagePose
+from .image_pose import pose_covariances as pose_covariances

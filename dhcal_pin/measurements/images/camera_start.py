@@ -39,6 +39,8 @@ from .camera_parameters import POSE_NAMES
 _MAX_RATIO = 5.0
 # RMS distance that is never too large: half a percent of the focal length.
 _GOOD_RMS = 5e-3
+# Smallest variance of an image coordinate [px²]; exact images have none.
+_MIN_VARIANCE = 1e-12
 # Largest number of images, and of fits of lenses, that are remembered.
 _MAX_REMEMBERED, _MAX_FITS = 2000, 32
 
@@ -183,7 +185,7 @@ def moving_information(item: Corners, views: BoardViews, samples: Array) -> Arra
             information = by_twist.T @ information @ by_twist
         out.append(information)
     # Half of the square of a distance in the image is the variance of a coordinate.
-    return np.array(out) / (0.5 * np.median(views.rms) ** 2)
+    return np.array(out) / max(0.5 * np.median(views.rms) ** 2, _MIN_VARIANCE)
 
 
 def _stated_poses(entries: Sequence[Camera] | Sequence[Board], mounts: Sequence[Mount]) -> dict[int, Array]:

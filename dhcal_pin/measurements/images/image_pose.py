@@ -24,6 +24,15 @@ _TERMS = np.repeat(np.arange(6), 6), np.tile(np.arange(6), 6)
 ARM_STD = 5e-4, 5e-4
 
 
+def pose_covariances(poses: Array, information: Array) -> Array:
+    """Return the covariances (m, 6, 6) of position and rotation vector, errors of the arm included."""
+    # The twists [v, ω] are about the origin of the measuring frame.
+    by_twist = np.tile(np.eye(6), (len(poses), 1, 1))
+    by_twist[:, :3, 3:] = -se3.skew(poses[:, :3, 3])
+    covariances = by_twist @ np.linalg.pinv(information, hermitian=True) @ by_twist.swapaxes(1, 2)
+    return covariances + np.diag(np.repeat(ARM_STD, 3) ** 2)
+
+
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class ImagePose(Pose):
     """Poses with covariances."""
@@ -35,15 +44,10 @@ class ImagePose(Pose):
     @classmethod
     def of(cls, q: Array, poses: Array, information: Array) -> Self:
         """Return poses (m, 4, 4) [m] with the information (m, 6, 6) of images about twists of them."""
-        plain = Pose(q, poses)
-        # The twists [v, ω] are about the origin of the measuring frame.
-        by_twist = np.tile(np.eye(6), (len(q), 1, 1))
-        by_twist[:, :3, 3:] = -se3.skew(plain.positions())
-        covariance = by_twist @ np.linalg.pinv(information, hermitian=True) @ by_twist.swapaxes(1, 2)
-        covariance += np.diag(np.repeat(ARM_STD, 3) ** 2)
-        roots = np.linalg.cholesky(np.linalg.inv(covariance)).swapaxes(1, 2)
+        covariances = pose_covariances(poses, information)
+        roots = np.linalg.cholesky(np.linalg.inv(covariances)).swapaxes(1, 2)
         new = object.__new__(cls)
-        new.__dict__.update(vars(plain) | {"roots": roots})
+        new.__dict__.update(vars(Pose(q, poses)) | {"roots": roots})
         return new
 
     def _scaled_roots(self) -> Array:
