@@ -246,7 +246,7 @@ def _routes(service: _Service) -> list[tuple[Any, ...]]:
 
 @tornado.web.stream_request_body
 class _Handler(tornado.web.RequestHandler):
-    """Handler that keeps no body, whose answers are not stored, with one line of text for an error."""
+    """Handler that drops the request body. Its answers are not stored, and an error is one line of text."""
 
     def set_default_headers(self) -> None:
         for name, value in _HEADERS.items():

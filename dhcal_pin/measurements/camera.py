@@ -644,12 +644,17 @@ class CameraCorners(Measurement):
         """Poses of the boards in the cameras, from each image alone."""
         return images.estimate_views(self.corners)
 
+    @property
+    def shown_poses(self) -> tuple[Array, Array]:
+        """One corner (k,) of each image that shows a pose, and these poses of the tool (k, 4, 4)."""
+        return images.moving_poses(self.corners, self.board_views)
+
     def tool_poses(self) -> Pose:
         """Return the poses of the tool, for some base and some tool, that the images show one by one.
 
         Their standard deviations contain the errors of a lens that is not calibrated yet.
         """
-        samples, poses = images.moving_poses(self.corners, self.board_views)
+        samples, poses = self.shown_poses
         information = images.moving_information(self.corners, self.board_views, samples)
         variances = np.einsum("mii->mi", images.pose_covariances(poses, information))
         sigma = _SHOWN_NOISE_FACTOR * np.sqrt(variances)
@@ -657,7 +662,7 @@ class CameraCorners(Measurement):
 
     def image_poses(self) -> images.ImagePose:
         """Return the same poses with their covariances, lines and conditions."""
-        samples, poses = images.moving_poses(self.corners, self.board_views)
+        samples, poses = self.shown_poses
         information = images.moving_information(self.corners, self.board_views, samples)
         return images.ImagePose.of(self.q[samples], poses, information).replace(
             rows=self.rows[samples],

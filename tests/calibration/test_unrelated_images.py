@@ -13,7 +13,7 @@ from dhcal_pin import calibrate
 from dhcal_pin.calibration.cameras.arm_types import ARM_TYPES
 from dhcal_pin.calibration.cameras.image_checks import MIN_DIFFERENCE, _angle_difference
 from dhcal_pin.calibration.verdict import _few_images, judge
-from dhcal_pin.measurements import Pose, Position
+from dhcal_pin.measurements import Position
 from dhcal_pin.plausibility.hypotheses import mend
 
 MESSAGE = r"do not move as the joint values say: the rotations between images differ by [1-9]\d°"
@@ -36,11 +36,10 @@ def test_images_that_are_shifted_by_rows_are_related(shift):
     # Two rows in three are fitted, and the others held out.
     of_robot, of_images = q[2 + shift : 12 + shift], q[2:12]
     is_fitted = np.arange(10) % 3 < 2
-    images: Any = SimpleNamespace(
-        tool_poses=lambda: Pose(of_robot[is_fitted], chain.poses(of_images)[is_fitted])
-    )
+    samples = np.flatnonzero(is_fitted)
+    images: Any = SimpleNamespace(q=of_robot, shown_poses=(samples, chain.poses(of_images)[samples]))
     assert _angle_difference(chain, images, of_robot) < 1e-6
-    images = SimpleNamespace(tool_poses=lambda: Pose(q[:7], chain.poses(q[7:])))
+    images = SimpleNamespace(q=q, shown_poses=(np.arange(7), chain.poses(q[7:])))
     assert _angle_difference(chain, images, q[:7]) > MIN_DIFFERENCE
 
 

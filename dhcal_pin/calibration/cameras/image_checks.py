@@ -90,11 +90,10 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
 def _angle_difference(chain: Chain, item: CameraCorners, sequence: Array) -> float:
     """Return the median difference of angles between images and robot [rad], for the best shift of rows."""
     # The sequence (k, n) has the joint values of all images of the file. The result is 0 with few images.
-    shown = item.tool_poses()
-    shown = shown.take(np.arange(min(len(shown.rows), MAX_IMAGES)))
-    if len(shown.rows) < MIN_IMAGES:
+    samples, poses = (each[:MAX_IMAGES] for each in item.shown_poses)
+    if len(samples) < MIN_IMAGES:
         return 0.0
-    of_images, places = _angles(shown.poses), places_in_sequence(sequence, shown.q)
+    of_images, places = _angles(poses), places_in_sequence(sequence, item.q[samples])
     differences = []
     for shift in (0, *SHIFTS):
         inside = np.flatnonzero((places + shift >= 0) & (places + shift < len(sequence)))
@@ -256,9 +255,10 @@ def describe_outlying_end(parts: Sequence[tuple[Measurement, Array]], has_holdou
 
 
 def _outlying_end(is_outlying: Sequence[bool]) -> tuple[int, int, float]:
-    """Return the number of images in front of the place that divides outliers best from others.
+    """Return how many images precede the change point, how many of them are outliers, and a probability.
 
-    Then that of the outliers among them, and the probability of so many if outliers are at random places.
+    The change point separates outliers from other images with the fewest exceptions. The probability is that
+    of as many outliers before it, or more, if the outliers were at random places.
     """
     n_images, n_outliers = len(is_outlying), sum(is_outlying)
     found = np.cumsum(is_outlying)
