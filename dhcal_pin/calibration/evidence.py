@@ -24,7 +24,7 @@ from ..measurements.measured_region import MeasuredRegion
 from ..plausibility.deviating_lines import DeviatingLines, extend, find_deviating_lines, find_mistake
 from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.drawn_samples import has_enough_rows
-from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
+from ..plausibility.evidence import usual_errors
 from ..plausibility.labels import WrongLabel, find_wrong_labels
 from ..plausibility.mixups import diagnose_images, diagnose_mixups
 from ..plausibility.rounding import find_rounding
@@ -523,20 +523,14 @@ def diagnose_joint_values(fit: Evidence) -> Diagnosis:
 
 def _with_servos(fit: Evidence, found: Diagnosis) -> Diagnosis:
     """Return a diagnosis whose remedies are those of a servo file if joint values come from counts."""
-    if not _has_counts(fit):
+    if not any(item.has_counts for item in fit.data):
         return found
     return found.for_servos(fit.signs.turned if fit.signs else ())
 
 
-def _has_counts(fit: Evidence) -> bool:
-    """Return whether joint values come from counts of servos."""
-    return any(item.has_counts for item in fit.data)
-
-
 def _usual_errors(fit: Evidence) -> str:
     """Return the parameter sets of the errors that such a robot usually has."""
-    is_hand_built = fit.errors.chain.parameters == HAND_BUILT or _has_counts(fit)
-    return HAND_BUILT if is_hand_built else MANUFACTURED
+    return usual_errors(fit.errors.chain, fit.data)
 
 
 def _mean_squares(fit: FittedModel, data: Sequence[Measurement]) -> dict[tuple[str, bool, str], float]:

@@ -62,7 +62,7 @@ from ..measurements.camera import with_shown_entries
 from ..parallel import SERIAL, TaskExecutor, one_blas_thread
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.drawn_samples import has_enough_rows
-from ..plausibility.evidence import HAND_BUILT, MANUFACTURED
+from ..plausibility.evidence import HAND_BUILT, usual_errors
 from ..robot.chain import Chain
 from ..robot.conditions import CONDITIONS
 from ..robot.error_families import BACKLASH, FAMILIES
@@ -212,7 +212,7 @@ def calibrate(
             lambda fit: (
                 supported(fit, AUTO, setup.families) if setup.families else (fit, model_selection.Extension())
             ),
-            HAND_BUILT if setup.chain.parameters == HAND_BUILT else MANUFACTURED,
+            usual_errors(setup.chain, setup.data),
         )
         begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
     groups = groups_of(begun.fit)

@@ -31,6 +31,7 @@ from ..identifiability import explain_unknown_size
 from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
 from ..measurements.base import Measurement, residual_of
+from ..measurements.camera import select_images
 from ..measurements.contact import PointContact
 from ..measurements.groups import ERROR_GROUPS
 from ..measurements.images.names import list_images
@@ -565,7 +566,7 @@ def _hand_eye_images(fit: Evidence) -> list[Finding]:
     if fit.hand_eye:
         # Images of another camera than they state are named with it.
         n_named = sum(len(found.images) for found in fit.wrong_labels)
-        texts = [*fit.hand_eye.rotation_sentences]
+        texts = [f"{text}{_hold_stated_poses(fit)}" for text in fit.hand_eye.rotation_sentences]
         texts += fit.hand_eye.wrong_image_sentences if fit.hand_eye.n_wrong_images > n_named else []
         return [Finding("caution", text) for text in texts]
     count = len(np.unique(configuration_groups(fit.data)))
@@ -646,7 +647,22 @@ def _weak_positions(fit: Evidence) -> list[Finding]:
         return []
     rotation = cameras.second_rotation(fit.errors.chain, fit.data)
     text = cameras.describe_weak_positions(fit.hand_eye_std, board.rms, rotation)
-    return [Finding("caution", text)] if text else []
+    hold = _hold_stated_poses(fit) if rotation < cameras.MIN_ROTATION else ""
+    return [Finding("caution", f"{text}{hold}")] if text else []
+
+
+def _hold_stated_poses(fit: Evidence) -> str:
+    """Say how to hold poses that the rig states and the images do not determine; empty without such poses."""
+    estimated = {parameter.name for parameter in fit.parameters}
+    entries = [entry for entry in cameras.stated_poses(select_images(fit.data)) if f"{entry}.x" in estimated]
+    if not entries or not fit.has_joint_values:
+        return ""
+    held, of_entry = entries[0].split("_", 1)
+    sets = [name for name in cameras.default_sets(fit.errors.chain, fit.data).split(",") if name != held]
+    return (
+        f" The rig file states the pose of {held} {of_entry!r}: if it was measured to about 2 mm and 2 mrad, "
+        f"hold it with --parameters {','.join(sets)}."
+    )
 
 
 def _describe(size: CorrectionSize) -> str:

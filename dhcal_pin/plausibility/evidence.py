@@ -75,6 +75,12 @@ _MIN_SCALE, _MAX_SCALE = 1e-4, 1e7
 _OUTLIER_RATIO = 4.0
 
 
+def usual_errors(chain: Chain, data: Sequence[Measurement]) -> str:
+    """Return the parameter sets of the errors that such a robot usually has."""
+    is_hand_built = chain.parameters == HAND_BUILT or any(item.has_counts for item in data)
+    return HAND_BUILT if is_hand_built else MANUFACTURED
+
+
 @frozen
 class Evidence:
     """Evidence of measurements for a robot with small errors."""

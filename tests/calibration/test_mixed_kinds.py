@@ -1,5 +1,6 @@
 """Calibrations with two measurement kinds at once, for all pairs of `KINDS`."""
 
+import re
 from dataclasses import replace
 from itertools import combinations
 
@@ -20,7 +21,7 @@ from dhcal_pin.calibration.cameras.jitter import (
     estimate_jitter,
 )
 from dhcal_pin.estimation import select_parameters
-from dhcal_pin.estimation.initialization import make_problem, subsample
+from dhcal_pin.estimation.initialization import align, make_problem, subsample
 from dhcal_pin.exceptions import ConvergenceError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import KINDS, CameraCorners, Noise, mount_rig
 from dhcal_pin.measurements.camera import simulated_rig
@@ -257,6 +258,30 @@ def test_images_of_a_tool_that_turns_determine_the_cameras_beside_a_tracker():
     assert result.hand_eye_std is not None
     assert result.hand_eye_std < 1e-3
     assert camera_error(result, images) < 4 * result.hand_eye_std
+
+
+@pytest.mark.parametrize("has_tracker", [False, True])
+def test_stated_poses_are_held_where_the_tool_keeps_its_orientation(has_tracker):
+    """The option that the verdict names determines cameras, board and arm."""
+    rng = np.random.default_rng(9)
+    arm = read_robot("example:ur10", tip="tool0")
+    truth = placed(small_errors(arm, rng)) if has_tracker else small_errors(arm, rng)
+    images = images_by_two_located_cameras(truth, Noise(1e-4), rng, 0.0)
+    positions = KINDS["position"].simulate(truth, rng.uniform(-2, 2, (60, 6)), Noise(5e-5), rng)
+    data = [positions, images] if has_tracker else images
+    fit = calibrate(arm, data, extend="none", session="off")
+    (reason,) = (text for text in fit.verdict.reasons if text.startswith("Too few rotations: "))
+    assert "The rig file states the pose of camera 'left': if it was measured to about 2 mm" in reason
+    (sets,) = re.findall(r"hold it with --parameters (\S+)\.$", reason)
+    held = calibrate(arm, data, sets, extend="none", session="off")
+    assert camera_error(held, images) == 0
+    assert camera_error(fit, images) > 0.02
+    assert fit.hand_eye_std is not None
+    assert (held.hand_eye_std or 0.0) < 0.1 * fit.hand_eye_std
+    # Base and tool of the tracker are those of its own frame, and rotations of the tool are small.
+    tips = [chain.poses(images.q)[:, :3, 3] for chain in (truth, held.chain, arm)]
+    found, nominal = (align(tip, tips[0])[1] for tip in tips[1:])
+    assert found < 0.2 * nominal
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from .diagnosis import HandEyeDiagnosis as HandEyeDiagnosis
 from .diagnosis import HandEyeFit as HandEyeFit
 from .diagnosis import describe_contradiction as describe_contradiction
 from .image_checks import MAX_IMAGE_OUTLIER_SHARE as MAX_IMAGE_OUTLIER_SHARE
+from .image_checks import MIN_ROTATION as MIN_ROTATION
 from .image_checks import count_outlying_images as count_outlying_images
 from .image_checks import describe_outlying_end as describe_outlying_end
 from .image_checks import describe_weak_positions as describe_weak_positions
@@ -21,6 +22,7 @@ from .lens_priors import describe_far_lenses as describe_far_lenses
 from .lens_priors import with_stated_distortion as with_stated_distortion
 from .mistakes import RigMistakes as RigMistakes
 from .mistakes import correct_rig as correct_rig
+from .mistakes import stated_poses as stated_poses
 from .procedure import ImageFitting as ImageFitting
 from .procedure import calibrate_images as calibrate_images
 from .procedure import require_shown_families as require_shown_families

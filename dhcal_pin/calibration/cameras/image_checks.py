@@ -30,6 +30,8 @@ from ...measurements.base import Measurement
 from ...measurements.camera import CameraCorners, select_images
 from ...measurements.images.names import whole_images
 from ...measurements.mounting import Mount, MountedRig
+from ...plausibility.evidence import usual_errors
+from ...plausibility.mixups import diagnose_images
 from ...robot.chain import Chain
 from ..partition import different_configurations
 from ..reweighting import Fit
@@ -85,6 +87,15 @@ def find_unrelated_images(fit: Fit, holdout: Sequence[Measurement], chain: Chain
         f"are. Use the {stated} of the same images with right units, signs and order, and the URDF of the "
         "robot in the images, and check the resolution and the lens that the rig states."
     )
+
+
+def find_wrong_joint_values(fit: Fit) -> str:
+    """Return what is wrong with the joint values of a fit of images alone, if a mistake explains them."""
+    images, chain = select_images(fit.data), fit.problem.errors.chain
+    if len(images) < len(fit.data):
+        return ""
+    found = diagnose_images(chain, images, usual_errors(chain, images))
+    return found.sentence if found.hypotheses else ""
 
 
 def _angle_difference(chain: Chain, item: CameraCorners, sequence: Array) -> float:

@@ -33,7 +33,7 @@ from .arm_types import CORNERS, IMAGES, ArmType
 from .board_size import BoardSize, find_board_size
 from .diagnosis import HandEyeFit
 from .gate import GatedFit, apply_gate, judge_stages, judge_target_points, residual_jitter, without_arm
-from .image_checks import find_unrelated_images, seen_ranges_warning
+from .image_checks import find_unrelated_images, find_wrong_joint_values, seen_ranges_warning
 from .jitter import with_jitter
 from .joint_errors import FAMILIES, add_joint_errors
 from .lens_priors import lens_prior_groups, with_lens_priors
@@ -124,13 +124,16 @@ def calibrate_images(
     has_moved = fit.solution.converged or fit.solution.iterations
     is_stuck = not has_moved and fitted_error(fit).pixels > max_error
     unrelated = find_unrelated_images(fit, holdout, chain, max_error)
+    has_arm = fit.problem.errors.has_arm
+    if has_arm and not unrelated and fitted_error(fit).pixels > max_error:
+        # Further fits of an arm with wrong joint values take many iterations.
+        unrelated = find_wrong_joint_values(fit)
     if is_stuck and not unrelated and stated_poses(select_images(fit.data)):
         raise ConvergenceError(
             "images: no step from the first values brings the model nearer to the corners; check the poses "
             "in the rig file (xyz_m, rotvec_rad), or omit those of the cameras or those of the boards, and "
             "check the joint values, or the servo file of the counts"
         )
-    has_arm = fit.problem.errors.has_arm
     if not unrelated:
         fitting, fit = _FIRST_REWEIGHT[fitting.arm_type.noise_models[0]](fitting, fit)
         unrelated = find_unrelated_images(fit, holdout, chain, max_error)

@@ -50,8 +50,8 @@ MIN_CHANGE = 5.0
 # Largest ratio of the errors for which another order is taken, and largest error with it as a fraction of the
 # size of the image: no order explains images that are paired with wrong joint values.
 MAX_RATIO, MAX_ERROR_SHARE = 0.5, 0.05
-# Largest number of iterations of one solution, and of corners of a camera that are compared.
-_MAX_ITERATIONS, _MAX_CORNERS = 30, 2000
+# Largest number of iterations of one solution, and of corners and images of a camera that are compared.
+_MAX_ITERATIONS, _MAX_CORNERS, _MAX_IMAGES = 30, 2000, 100
 
 
 @frozen
@@ -177,10 +177,10 @@ def _frames_error(chain: Chain, parts: Sequence[CameraCorners]) -> tuple[ImageEr
 
 
 def _thinned(item: CameraCorners) -> CameraCorners:
-    """Return images with a limited number of corners."""
-    if len(item.rows) <= _MAX_CORNERS:
+    """Return a limited number of images and corners."""
+    n_kept = min(item.n_images * _MAX_CORNERS // len(item.rows), _MAX_IMAGES)
+    if n_kept >= item.n_images:
         return item
-    n_kept = max(1, item.n_images * _MAX_CORNERS // len(item.rows))
     chosen = np.unique(np.linspace(0, item.n_images - 1, max(n_kept, 10)).astype(int))
     return item.take(np.isin(item.image, chosen))
 
