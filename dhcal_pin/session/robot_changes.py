@@ -10,7 +10,7 @@ Shapes: m samples, n joints, k moving joints, S segments.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
@@ -89,6 +89,11 @@ class RobotChanges:
     def of_frames(self) -> RobotChanges:
         """The changes of base and tool alone."""
         return RobotChanges(self.base, self.tool)
+
+    def with_motions(self, kinds: Collection[str]) -> RobotChanges:
+        """Return the changes with the motions of base and tool that are named, and no others."""
+        none = {kind: Motion() for kind in ("base", "tool") if kind not in kinds}
+        return replace(self, **none)
 
     @property
     def is_empty(self) -> bool:

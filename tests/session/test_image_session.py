@@ -28,6 +28,7 @@ from dhcal_pin.measurements.images import image_pose
 from dhcal_pin.measurements.mounting import mount_rig
 from dhcal_pin.session import Session
 from dhcal_pin.session.causes import Block, Cause, Constant, Step
+from dhcal_pin.session.robot_changes import Motion, RobotChanges
 from dhcal_pin.session.timeline import order_samples
 
 pytestmark = pytest.mark.usefixtures("untried", "ordered_axes")
@@ -110,15 +111,77 @@ def test_what_moved_is_named_and_handled(is_on_wrist, is_fixed, scale, share, re
     assert np.median(ratios) < (2.0 if is_slow else 1.0)
 
 
-def test_changes_need_images_alone_and_of_one_board():
+def test_a_motion_between_many_images_is_handled():
+    """More images than the search for a start draws, each with its conditions."""
+    nominal, truth, images, first = photograph(1, False, True, MOTION, count=60)
+    fit = calibrate(nominal, images)
+    assert fit.session is not None
+    (event,) = fit.session.events
+    assert (event.kind, event.of, event.place) == (
+        "base",
+        "camera",
+        f"between {first - 1}.png and {first}.png",
+    )
+    assert event.size == pytest.approx(5e-3, rel=0.1)
+    assert arm_error(fit.chain, truth, images) < 0.25 * arm_error(nominal, truth, images)
+
+
+def test_changes_need_images_alone():
     nominal, _, images, _ = photograph(1, True, True, MOTION, count=10)
-    two = images.with_rig(replace(images.rig, boards=images.rig.boards * 2)).replace(board=images.image % 2)
 
     def calibrated(_):
         raise AssertionError
 
-    for data in ([images, Pose(images.q, nominal.poses(images.q))], [two]):
-        assert find_image_session(nominal, data, (), calibrated, INDUSTRIAL) is None
+    data = [images, Pose(images.q, nominal.poses(images.q))]
+    assert find_image_session(nominal, data, (), calibrated, INDUSTRIAL) is None
+
+
+def in_order(images, cameras):
+    """Return images with those of each configuration in the order of these numbers of cameras."""
+    visit = np.cumsum(np.any(np.diff(images.q, axis=0, prepend=images.q[:1]) != 0, 1))
+    taken = images.take(np.lexsort([np.argsort(cameras)[images.camera], visit]))
+    return taken.replace(rows=np.arange(len(taken.rows)))
+
+
+@pytest.mark.parametrize("cameras", [(0, 1), (1, 0)])
+def test_a_zero_that_changes_is_found_in_images_of_two_cameras(cameras):
+    rng, nominal = np.random.default_rng(12), ARMS["ur10"]()
+    truth = wrong_arm(nominal, 1e-3, rng)
+    images = simulate(nominal, truth, rng, is_on_wrist=False, n_images=40, sigma=0.2, n_cameras=2).images
+    images = in_order(images, cameras)
+    first = int(np.flatnonzero(np.any(np.diff(images.q, axis=0) != 0, 1))[19]) + 1
+    size, q = np.deg2rad(1.0), images.q.copy()
+    q[:first, 4] += size
+    fit = calibrate(nominal, images.replace(q=q))
+    assert fit.session is not None
+    (event,) = fit.session.events
+    assert (event.kind, event.of) == ("joint", nominal.joint_names[4])
+    assert event.size == pytest.approx(size, rel=0.2)
+    assert event.before.line <= first <= event.after.line
+    assert arm_error(fit.chain, truth, images) < 0.4 * arm_error(nominal, truth, images)
+    assert not any(mask.any() for mask in fit.outliers)
+
+
+def test_a_motion_of_one_of_two_cameras_is_not_that_of_both():
+    rng, nominal = np.random.default_rng(12), ARMS["ur10"]()
+    images = simulate(nominal, nominal, rng, is_on_wrist=False, n_images=12, sigma=0.2, n_cameras=2).images
+    twist = np.full(6, 1e-3)
+    motion = Motion((5,), se3.exp6(np.array([twist, 0 * twist])))
+
+    def found_of(kind, images):
+        timeline = order_samples([images.image_poses()], ())
+        changes = RobotChanges(motion, Motion()) if kind == "base" else RobotChanges(Motion(), motion)
+        cause = Cause(Block(kind, "", np.arange(6), np.ones(6)), Step(5), twist, 1e-8 * np.eye(6))
+        session = Session(timeline, nominal, True, changes, (cause,))
+        result: Any = SimpleNamespace(chain=nominal, session=session)
+        found = find_image_session(nominal, [images], (), lambda _: result, INDUSTRIAL)
+        assert found is not None
+        return [(event.kind, event.of) for event in found.events], found.changes.is_empty
+
+    assert found_of("tool", images) == ([("tool", "board")], False)
+    assert found_of("base", images) == ([], True)
+    of_one = images.take(images.camera == images.camera[images.shown_poses[0][0]])
+    assert found_of("base", of_one) == ([("base", "camera")], False)
 
 
 @pytest.mark.parametrize("variance", [1e-2, 1.0, 1e2])

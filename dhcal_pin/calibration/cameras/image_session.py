@@ -70,12 +70,15 @@ def find_image_session(
     calibrated: Callable[[Sequence[Pose]], Result],
     arm: ArmType,
 ) -> Session | None:
-    """Find what happened while images of one camera and one board were taken; None if it is unknown."""
+    """Find what happened while images were taken; None if it is unknown."""
     images = select_images(data)
-    pairs = {pair for item in images for pair in zip(item.camera.tolist(), item.board.tolist(), strict=True)}
-    if len(images) < len(data) or len(pairs) != 1:
+    if len(images) < len(data):
         return None
     try:
+        # The images of the camera and board that were photographed most often show it.
+        shown = {pair for item in images for pair in _pairs(item, item.shown_poses[0])}
+        if len(shown) != 1:
+            return None
         poses = [item.image_poses() for item in images]
         result = calibrated(poses)
     except DhcalError:
@@ -84,18 +87,23 @@ def find_image_session(
     if found is None:
         return None
     base, tool = chain.base @ se3.inverse(result.chain.base), se3.inverse(chain.tool) @ result.chain.tool
-    camera_moves = images[0].rig.camera_mounts[next(iter(pairs))[0]].moves
+    camera_moves = images[0].rig.camera_mounts[next(iter(shown))[0]].moves
     fixed, moving = ("board", "camera") if camera_moves else ("camera", "board")
     blocks = {
         "base": {"of": fixed, "origin": se3.inverse(result.chain.base)[:3, 3]},
         "tool": {"of": moving, "origin": tool[:3, 3]},
     }
+    # A motion of one of several cameras or boards changes the images of the others differently.
+    pairs = {pair for item in images for pair in _pairs(item, slice(None))}
+    several = {of for i, of in enumerate(("camera", "board")) if len({pair[i] for pair in pairs}) > 1}
+    motions = {kind for kind, block in blocks.items() if block["of"] not in several}
     causes = [
         replace(cause, block=replace(cause.block, **blocks.get(cause.block.kind, {})))
         for cause in found.causes
-        if not cause.block.is_constant and (arm.shows_joint_changes or cause.block.kind in blocks)
+        if not cause.block.is_constant
+        and (cause.block.kind in motions if cause.block.kind in blocks else arm.shows_joint_changes)
     ]
-    changes = found.changes.carried_to(base, tool)
+    changes = found.changes.carried_to(base, tool).with_motions(motions)
     return replace(
         found,
         changes=changes.without_lag if arm.shows_joint_changes else changes.of_frames,
@@ -105,6 +113,11 @@ def find_image_session(
         lag=None,
         scales=(),
     ).described()
+
+
+def _pairs(item: CameraCorners, samples: Array | slice) -> set[tuple[int, int]]:
+    """Return the numbers of camera and board of samples."""
+    return set(zip(item.camera[samples].tolist(), item.board[samples].tolist(), strict=True))
 
 
 def _explains_better(fit: Fit, other: Fit) -> bool:
@@ -139,15 +152,27 @@ def _timeline_of_images(
     """Give all corners of an image its number among the images that show a pose."""
     corners = order_samples(data, holdout)
     parts = zip(data, poses, corners.numbers, strict=False)
-    first = np.sort(np.concatenate([_first_corners(item, pose, numbers) for item, pose, numbers in parts]))
+    first = np.concatenate([_first_corners(item, pose, numbers) for item, pose, numbers in parts])
+    order = np.argsort(first)
+    before = [np.searchsorted(first[order], of_item, side="right") - 1 for of_item in corners.numbers]
+    q = np.concatenate([pose.q for pose in poses])[order]
     numbers = tuple(
-        np.fmax(np.searchsorted(first, of_item, side="right") - 1, 0) for of_item in corners.numbers
+        _of_same_configuration(q, item.q, np.fmax(found, 0))
+        for item, found in zip(corners.data, before, strict=True)
     )
     if unit == "s":
         return replace(corners, numbers=numbers)
     return replace(
         corners, numbers=numbers, times=tuple(each.astype(float) for each in numbers), unit="image"
     )
+
+
+def _of_same_configuration(shown: Array, q: Array, before: Array) -> Array:
+    """Return the numbers of images with the joint positions of samples (m, n): those before, or the next."""
+    # Another camera may have photographed the same configuration before the one that shows it.
+    after = np.fmin(before + 1, len(shown) - 1)
+    is_of_next = np.all(shown[after] == q, axis=1) & np.any(shown[before] != q, axis=1)
+    return np.where(is_of_next, after, before)
 
 
 def _first_corners(item: CameraCorners, pose: Pose, numbers: Array) -> Array:

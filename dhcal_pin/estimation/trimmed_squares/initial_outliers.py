@@ -110,7 +110,7 @@ def _distances_from_majority(
     if x is None:
         return None
     full = [
-        start.replace(**{name: getattr(item, name) for name in item.sample_fields})
+        start.replace(**{name: getattr(item, name) for name in item.sample_fields}, recorded=item.recorded)
         for start, item in zip(starts, data, strict=True)
     ]
     return _distances(problem.with_data(full), x)
