@@ -145,6 +145,12 @@ class Layout:
         weights = np.where(is_observed[self.model], self.weights, 1 / HELD_SIZE)
         return replace(self, blocks=tuple(blocks), weights=weights)
 
+    def block_like(self, block: Block) -> Block:
+        """Return a block of another layout of the same robot with the columns that it has here."""
+        key = block.kind, block.index, len(block.columns)
+        own = next(each for each in self.blocks if (each.kind, each.index, len(each.columns)) == key)
+        return replace(block, columns=own.columns)
+
     @property
     def has_payload(self) -> bool:
         """Whether a payload is a possible cause."""

@@ -23,7 +23,9 @@ def refine_changes(session: Session, problem: Problem, x: Array) -> Session:
     layout, timeline, chain = Layout.of(problem), session.timeline, session.chain
     fitted = timeline.with_fitted(problem.data)
     numbers, times = timeline.fitted_numbers, timeline.fitted_times
-    causes, changes = session.causes, session.changes
+    # The columns of the causes are those of the measurements in which they were found.
+    causes = tuple(replace(cause, block=layout.block_like(cause.block)) for cause in session.causes)
+    changes = session.changes
     # The priors of the problem; those of the search are wide, for arms with large errors.
     prior = np.concatenate([np.fmax(problem.weights, layout.weights), *(1 / c.sizes for c in causes)])
     ends = np.cumsum([len(x), *(len(cause.values) for cause in causes)])

@@ -143,12 +143,12 @@ def in_order(images, cameras):
     return taken.replace(rows=np.arange(len(taken.rows)))
 
 
-@pytest.mark.parametrize("cameras", [(0, 1), (1, 0)])
-def test_a_zero_that_changes_is_found_in_images_of_two_cameras(cameras):
+@pytest.mark.parametrize("cameras", [(0,), (0, 1), (1, 0)])
+def test_a_zero_that_changes_is_found(cameras):
     rng, nominal = np.random.default_rng(12), ARMS["ur10"]()
     truth = wrong_arm(nominal, 1e-3, rng)
-    images = simulate(nominal, truth, rng, is_on_wrist=False, n_images=40, sigma=0.2, n_cameras=2).images
-    images = in_order(images, cameras)
+    setup = simulate(nominal, truth, rng, is_on_wrist=False, n_images=40, sigma=0.2, n_cameras=len(cameras))
+    images = in_order(setup.images, cameras)
     first = int(np.flatnonzero(np.any(np.diff(images.q, axis=0) != 0, 1))[19]) + 1
     size, q = np.deg2rad(1.0), images.q.copy()
     q[:first, 4] += size
@@ -156,7 +156,7 @@ def test_a_zero_that_changes_is_found_in_images_of_two_cameras(cameras):
     assert fit.session is not None
     (event,) = fit.session.events
     assert (event.kind, event.of) == ("joint", nominal.joint_names[4])
-    assert event.size == pytest.approx(size, rel=0.2)
+    assert event.size == pytest.approx(size, rel=0.02)
     assert event.before.line <= first <= event.after.line
     assert arm_error(fit.chain, truth, images) < 0.4 * arm_error(nominal, truth, images)
     assert not any(mask.any() for mask in fit.outliers)
