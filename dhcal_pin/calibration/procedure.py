@@ -59,6 +59,7 @@ from ..formatting import join_names
 from ..measurements.arguments import as_measurements, require_chain
 from ..measurements.base import Measurement, known_conditions
 from ..measurements.camera import with_shown_entries
+from ..measurements.contact import require_touched_points
 from ..parallel import SERIAL, TaskExecutor, one_blas_thread
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.drawn_samples import has_enough_rows
@@ -179,6 +180,7 @@ def calibrate(
     _check_options(options, data)
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
+    require_touched_points((*data, *holdout), known or {})
     again = partial(recalibrate, data, holdout=holdout, turned=turned)
     setup = _set_up(_at_measured_temperature(chain, data), data, holdout, turned, options, progress)
     settings: dict[str, Any] = {

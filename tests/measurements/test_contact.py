@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from robots import URDF
 
+from dhcal_pin import calibrate
 from dhcal_pin.cli.main import main
+from dhcal_pin.exceptions import UnknownNameError
 from dhcal_pin.io import measurement_text
-from dhcal_pin.measurements import Noise, PointContact
+from dhcal_pin.measurements import Noise, PointContact, PointDistance, Position
 
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
@@ -31,3 +33,12 @@ def test_distances_between_points_that_nothing_touches_are_refused(sim_6dof, tmp
     )
     arguments = ["touches.csv", "distances.csv", "--instrument", "rig.toml", "-o", "out.urdf", "--force"]
     assert main(["calibrate", "arm.urdf", *arguments]) == 0
+
+
+def test_distances_beside_positions_need_touches_in_python(sim_6dof):
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (20, 6))
+    distances = PointDistance(6, [("a", "b")], [0.4])
+    positions = Position.simulate(sim_6dof, q, Noise(1e-4), rng)
+    with pytest.raises(UnknownNameError, match="no measurement touches the point 'a'; expected .* point"):
+        calibrate(sim_6dof, [positions, distances])
