@@ -40,5 +40,5 @@ def test_distances_beside_positions_need_touches_in_python(sim_6dof):
     q = rng.uniform(-2, 2, (20, 6))
     distances = PointDistance(6, [("a", "b")], [0.4])
     positions = Position.simulate(sim_6dof, q, Noise(1e-4), rng)
-    with pytest.raises(UnknownNameError, match="no measurement touches the point 'a'; expected .* point"):
+    with pytest.raises(UnknownNameError, match="no measurement touches the point 'a'; expected"):
         calibrate(sim_6dof, [positions, distances])
