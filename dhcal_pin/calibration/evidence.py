@@ -164,7 +164,7 @@ class Evidence(FittedModel):
             lines = find_deviating_lines(
                 item.take(order), ~is_counted[order], self.n_outliers / self.n_samples, self.n_samples
             )
-            found += [(lines, item)] if lines else []
+            found += [(_with_all_samples(lines, item, is_counted), item)] if lines else []
         if not found:
             return None
         lines, item = max(found, key=lambda each: each[0].n_outliers)
@@ -554,6 +554,17 @@ def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
         if group in item.residual_groups
     }
     return item.replace(**values, has_stated_sigma=True)
+
+
+def _with_all_samples(lines: DeviatingLines, item: Measurement, is_counted: Array) -> DeviatingLines:
+    """Return lines that were found by the first sample of each configuration, with all of its samples."""
+    order = np.argsort(item.rows, kind="stable")
+    after = item.rows[order] >= lines.last
+    rows, q = item.rows[order][after], item.q[order][after]
+    is_same = np.logical_and.accumulate(np.all(q == q[0], axis=1))
+    lines = replace(lines, last=int(rows[is_same][-1]))
+    inside = lines.contains(item)
+    return replace(lines, n_outliers=int(np.sum(inside & ~is_counted)), n_fitted=int(np.sum(inside)))
 
 
 def _alternate(item: Measurement, other: Measurement) -> bool:

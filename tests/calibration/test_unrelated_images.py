@@ -146,6 +146,21 @@ def test_joint_values_are_moved_by_images_where_the_arm_returns_to_a_configurati
     np.testing.assert_array_equal(mended.rows, right.rows[place > 0])
 
 
+@pytest.mark.usefixtures("untried", "ordered_axes")
+def test_lines_of_images_that_do_not_agree_count_their_corners():
+    chain, rng = ARMS["ur10"](), np.random.default_rng(3)
+    images = simulate(chain, chain, rng, is_on_wrist=True, n_images=40, sigma=0.2).images
+    number = np.cumsum(np.any(np.diff(images.q, axis=0, prepend=images.q[:1]) != 0, 1))
+    is_wrong = (number >= 15) & (number < 23)
+    q = images.q.copy()
+    q[is_wrong] += rng.normal(0, 0.3, (40, chain.n_joints))[number[is_wrong]]
+    fit = calibrate(chain, images.replace(q=q))
+    reason = fit.verdict.reasons[0]
+    first, last = images.rows[is_wrong][[0, -1]]
+    assert reason.startswith(f"{is_wrong.sum()} outliers follow each other (lines {first} to {last}): ")
+    assert f"leave out {is_wrong.sum()} of {len(q)} fitted samples" in reason
+
+
 @pytest.mark.usefixtures("uneventful", "untried", "ordered_axes")
 def test_images_that_are_mostly_outliers_are_refused(monkeypatch):
     chain = ARMS["ur10"]()
