@@ -459,8 +459,10 @@ class Evidence(FittedModel):
         """Predicted RMS position error in the measured region with the best base and tool [m].
 
         The configurations are within the measured ranges of the joints. It contains the bias of contacts, see
-        `estimation.contacts`.
+        `estimation.contacts`. NaN if the errors of the arm are not estimated.
         """
+        if not self.errors.has_arm:
+            return float("nan")
         q, _ = self._different_configurations
         if (region := self.measured_region) is not None:
             # The errors of joints grow beyond their measured ranges, whatever is measured.

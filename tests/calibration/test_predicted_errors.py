@@ -118,3 +118,11 @@ def test_intervals_hold_on_left_out_regions_of_real_arms(series):
         error, std = position_errors(calibrate(arm, data.take(~mask), SETS), data.take(mask))
         shares.append(covered_share(error, std))
     assert 0.9 <= np.mean(shares) <= 0.98
+
+
+def test_the_error_of_an_arm_that_is_not_estimated_is_unknown():
+    _, measured, _ = simulated(3, 20, 1e-3)
+    arm = nominal_arm("ur10")
+    with_arm, without = (calibrate(arm, measured, sets, extend="none") for sets in (SETS, "base,tool"))
+    assert with_arm.position_std > 0
+    assert np.isnan(without.position_std)
