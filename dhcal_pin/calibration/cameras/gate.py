@@ -11,8 +11,9 @@ of the arm are those of greatest evidence at T, however narrow.
   which are never below the default ones.
 - r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images
   (`arm_types`).
-- r < 0.8 for the whitened rows of other instruments beside the images, such as positions of a tracker: the
-  arm is demonstrably wrong, too, whatever the images show.
+- r < 0.8 for the n whitened rows of other instruments beside the images, such as positions of a tracker, or
+  r² < 1 - 3·√(2/n), which independent rows of a right arm exceed, with the arm that is estimated at T = 1:
+  the arm is demonstrably wrong, too, whatever the images show.
 - Otherwise the nominal arm is kept, unless joint errors complete the model (`joint_errors`). Errors of
   another kind, such as periodic ones of the joints, can be imitated by errors of the links where images were
   taken, with a ratio of 0.3 to 0.5, but not elsewhere.
@@ -59,8 +60,9 @@ N_CLUSTERS = 5
 N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
-# Largest ratio of the errors of other instruments for which the arm is demonstrably wrong.
-MAX_OTHERS_RATIO = 0.8
+# Largest ratio of the errors of few rows of other instruments for which the arm is demonstrably wrong. Many
+# rows show a change of the mean square by so many standard deviations.
+MAX_OTHERS_RATIO, OTHERS_DEVIATIONS = 0.8, 3.0
 # Narrowest and widest prior with a closed gate, as a fraction of the default one.
 MIN_WIDTH, MAX_WIDTH = 1e-3, 1e2
 # Rounds of jitter and solution, and of the evidence.
@@ -81,6 +83,7 @@ class Gate:
     is_complete: bool  # Whether they share none with the estimated arm
     arm_type: ArmType = INDUSTRIAL
     others_ratio: float = float("nan")  # The same as `ratio` for other instruments; NaN if there are none
+    n_others: int = 0  # Number of rows of other instruments
 
     @property
     def is_open(self) -> bool:
@@ -90,7 +93,7 @@ class Gate:
     @property
     def _is_shown_by_others(self) -> bool:
         """Whether measurements of other instruments show that the arm is wrong."""
-        return self.others_ratio < MAX_OTHERS_RATIO
+        return self.others_ratio < max(MAX_OTHERS_RATIO, _largest_ratio(self.n_others))
 
     @property
     def max_ratio(self) -> float:
@@ -174,8 +177,8 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
         for model, factor in models
     ]
     best = min(trials, key=lambda trial: trial.error) if folds else trials[-1]
-    others_ratio = _others_ratio(best.closed, max_iterations)
-    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, others_ratio)
+    others = _others_ratio(best.model, max_iterations)
+    gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, *others)
     if not gate.is_open:
         kept = _kept_fit(nominal, is_right, folds, max_iterations)
         return GatedFit(kept, nominal, best.closed, gate, None if is_complete else shared)
@@ -253,8 +256,15 @@ def _trial(
     return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
 
 
-def _others_ratio(fit: Fit, max_iterations: int) -> float:
-    """Return the error of left-out rows of other instruments relative to the nominal arm; NaN if too few."""
+def _largest_ratio(n_rows: int) -> float:
+    """Return the largest ratio of errors that so many independent rows distinguish from 1; 0 for few rows."""
+    return float(np.sqrt(max(1 - OTHERS_DEVIATIONS * np.sqrt(2 / n_rows), 0.0))) if n_rows else 0.0
+
+
+def _others_ratio(fit: Fit, max_iterations: int) -> tuple[float, int]:
+    """Return the ratio of the errors of left-out rows of other instruments, and the number of these rows."""
+    # The ratio is NaN if the rows are too few. The arm is that at temperature 1: what the images lack is no
+    # error of other instruments.
     others = [item for item in fit.problem.data if not item.n_images]
     folds = []
     for fold in cluster_folds(others) if others else ():
@@ -263,14 +273,15 @@ def _others_ratio(fit: Fit, max_iterations: int) -> float:
             [np.zeros(len(item.rows), bool) if item.n_images else next(masks) for item in fit.problem.data]
         )
     if not folds:
-        return float("nan")
-    squares = []
+        return float("nan"), 0
+    squares, n_rows = [], 0
     for each in (fit, without_arm(fit, max_iterations)):
         problem, x = each.problem, each.solution.x
         columns = np.ones(len(x), bool)
-        systems = factor_partition(problem, x, folds)
+        systems = list(factor_partition(problem, x, folds))
         squares.append(sum(one.n_rows * one.error(problem.weights, x, columns) ** 2 for one in systems))
-    return float(np.sqrt(squares[0] / squares[1])) if squares[1] else float("nan")
+        n_rows = sum(one.n_rows for one in systems)
+    return (float(np.sqrt(squares[0] / squares[1])) if squares[1] else float("nan")), n_rows
 
 
 def _solve(fit: Fit, problem: Problem, temperature: float, max_iterations: int) -> Fit:
