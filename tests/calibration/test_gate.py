@@ -201,7 +201,8 @@ def test_the_error_of_other_instruments_is_that_of_left_out_configurations(arm_e
     problem = make_problem(errors, (images, positions), 1 / errors.priors, {})
     solution = minimize(problem, "lm", None, 40)
     fit = Fit((images, positions), problem, solution, (np.ones(len(images.rows)), np.ones(30)))
-    found = gate._others_ratio(fit, 40)
+    found, n_rows = gate._others_ratio(fit, 40)
+    assert n_rows == 3 * len(positions.rows)
     assert least < found < most
     squares = []
     for each in (fit, without_arm(fit, 40)):
@@ -213,7 +214,7 @@ def test_the_error_of_other_instruments_is_that_of_left_out_configurations(arm_e
             total += np.sum(left**2)
         squares.append(total)
     assert found == pytest.approx(np.sqrt(squares[0] / squares[1]), rel=0.1)
-    assert np.isnan(gate._others_ratio(placement_fit(0.0, 4, 0), 40))
+    assert np.isnan(gate._others_ratio(placement_fit(0.0, 4, 0), 40)[0])
 
 
 @pytest.mark.parametrize(("count", "has_folds"), [(9, False), (10, True)])
@@ -578,3 +579,13 @@ def test_predictions_of_left_out_images_have_the_uncertainty_of_the_fit_of_the_o
         squares += np.einsum("ik,ij,jk->k", left, covariance, left).tolist()
     found = held_out_prediction_std(right, k_fold(right.data, 5))
     assert found == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-4)
+
+
+def test_many_rows_of_other_instruments_show_a_small_change():
+    """The mean square of n normal values of variance 1 has the variance 2/n."""
+    for n_rows, ratio in ((0, 0.8), (100, 0.8), (900, 0.9266), (3000, 0.9605)):
+        limit = np.sqrt(max(0.64, 1 - 3 * np.sqrt(2 / n_rows))) if n_rows else 0.8
+        assert limit == pytest.approx(ratio, abs=1e-4)
+        for factor, is_open in ((0.999, True), (1.001, False)):
+            gate = Gate(1.0, 1.0, 20, True, True, others_ratio=factor * limit, n_others=n_rows)
+            assert gate.is_open == is_open

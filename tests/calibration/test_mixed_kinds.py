@@ -240,6 +240,31 @@ def test_positions_place_the_robot_for_images_that_keep_the_orientation_of_the_t
     assert camera_error(result, images) < 4 * result.hand_eye_std
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-4])
+def test_many_positions_of_a_noisy_tracker_beside_images_correct_the_arm(size):
+    """The arm is as good as with the positions alone; their noise is as large as the errors of the arm."""
+    rng, arm = np.random.default_rng(21), ARMS["panda"]()
+    truth = wrong_arm(arm, size, rng) if size else arm
+    images = simulate(arm, truth, rng, is_on_wrist=True, n_images=20, sigma=0.5).images
+    q = rng.uniform(np.maximum(arm.lower, -2.2), np.minimum(arm.upper, 2.2), (400, 7))
+    positions = KINDS["position"].simulate(placed(truth), q, Noise(3e-4), rng)
+    left_out = KINDS["position"].simulate(placed(truth), q, Noise(), rng)
+    mixed, alone = (
+        calibrate(arm, data, extend="none", session="off") for data in ([positions, images], positions)
+    )
+    if size:
+        errors = [fit.validate(left_out)["position_rms_m"] for fit in (mixed, alone)]
+        assert errors[0] < 1.2 * errors[1]
+        assert errors[0] < 0.4 * positions_error(arm, left_out)
+    assert mixed.camera_stages[-1].is_kept == bool(size)
+
+
+def positions_error(arm, left_out):
+    """Return the error of the nominal arm with fitted base and tool [m]."""
+    fit = calibrate(arm, left_out, "base,tool", extend="none", session="off")
+    return fit.validate(left_out)["position_rms_m"]
+
+
 def camera_error(result, images):
     """Return the largest error of the position of a camera whose true pose the rig states [m]."""
     pairs = zip(result.rig.cameras, images.rig.cameras, strict=True)
