@@ -561,10 +561,10 @@ def _with_noise(fit: Evidence, item: Measurement) -> Measurement:
 def _with_all_samples(lines: DeviatingLines, item: Measurement, is_counted: Array) -> DeviatingLines:
     """Return lines that were found by the first sample of each configuration, with all of its samples."""
     order = np.argsort(item.rows, kind="stable")
-    after = item.rows[order] >= lines.last
-    rows, q = item.rows[order][after], item.q[order][after]
-    is_same = np.logical_and.accumulate(np.all(q == q[0], axis=1))
-    lines = replace(lines, last=int(rows[is_same][-1]))
+    order = order[item.rows[order] >= lines.last]
+    group = configuration_groups([item])[order]
+    is_same = np.logical_and.accumulate(group == group[0])
+    lines = replace(lines, last=int(item.rows[order[is_same][-1]]))
     inside = lines.contains(item)
     return replace(lines, n_outliers=int(np.sum(inside & ~is_counted)), n_fitted=int(np.sum(inside)))
 
