@@ -248,14 +248,15 @@ def test_blocked_folds_hold_out_the_ends_of_joint_space():
 
 
 def test_contacts_with_one_thing_are_held_out_together():
-    """Points a, b are joined by a distance, as c, d are; e stands alone and i is never touched."""
+    """Points a, b are joined by a distance, as c, d are; e stands alone, and i is given and not touched."""
     names = np.array(list("abcde"))
     label = np.repeat(np.arange(5), 4)
     arm = Chain.from_dh(paper("sim_6dof"))
     q = 0.4 * label[:, None] + np.random.default_rng(0).uniform(-0.1, 0.1, (20, 6))
     contacts = PointContact(q, names[label].tolist())
     known = PointDistance(6, [("c", "d"), ("a", "b"), ("a", "i")], [0.1, 0.1, 0.1])
-    problem = calibrate(arm, [contacts, known], "dh", max_iterations=1).problem
+    place = {f"point_i.{axis}": 0.4 for axis in "xyz"}
+    problem = calibrate(arm, [contacts, known], "dh", known=place, max_iterations=1).problem
     groups = contact_groups(problem, np.zeros(len(problem.weights)))
     folds = blocked_folds(problem.data, groups=groups)
     for of_contacts, of_distances in folds:
