@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from robots import paper
 
-from dhcal_pin import Chain, read_robot, select_parameters
+from dhcal_pin import Chain, calibrate, read_robot, select_parameters
 from dhcal_pin.calibration.reweighting import Fit
 from dhcal_pin.cameras import LENSES, Board, Camera, Rig
 from dhcal_pin.estimation.error_model import ErrorModel
 from dhcal_pin.estimation.initialization import make_problem
 from dhcal_pin.estimation.solver import minimize
-from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise
+from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise, Pose
 from dhcal_pin.measurements.mounting import MountedRig, mount_rig
 from dhcal_pin.robot.inverse_kinematics import pose_task, solve_ik
 from dhcal_pin.se3 import exp3, exp6, inverse, transform
@@ -265,6 +265,13 @@ def visible_corners(truth: Chain, rig: MountedRig, q: np.ndarray) -> list[tuple[
         if found:
             out.append(tuple(np.concatenate(each) for each in zip(*found, strict=True)))
     return out
+
+
+def tool_error(chain: Chain, truth: Chain, q: np.ndarray) -> float:
+    """Return the RMS error of the tool at configurations with the best base and tool [m]."""
+    measured = Pose(q, truth.poses(q))
+    fit = calibrate(chain, measured, "base,tool", extend="none", session="off", loss="linear")
+    return float(np.sqrt(np.mean(np.sum((fit.chain.poses(q) - truth.poses(q))[:, :3, 3] ** 2, 1))))
 
 
 def wrong_arm(chain: Chain, size: float, rng: np.random.Generator) -> Chain:

@@ -657,10 +657,10 @@ def _hold_stated_poses(fit: Evidence) -> str:
     entries = [entry for entry in cameras.stated_poses(select_images(fit.data)) if f"{entry}.x" in estimated]
     if not entries or not fit.has_joint_values:
         return ""
-    held, of_entry = entries[0].split("_", 1)
-    sets = [name for name in cameras.default_sets(fit.errors.chain, fit.data).split(",") if name != held]
+    kind, entry = entries[0].split("_", 1)
+    sets = [name for name in cameras.default_sets(fit.errors.chain, fit.data).split(",") if name != kind]
     return (
-        f" The rig file states the pose of {held} {of_entry!r}: if it was measured to about 2 mm and 2 mrad, "
+        f" The rig file states the pose of {kind} {entry!r}: if it was measured to about 2 mm and 2 mrad, "
         f"hold it with --parameters {','.join(sets)}."
     )
 

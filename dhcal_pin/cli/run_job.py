@@ -51,7 +51,6 @@ from ..io.robot import read_robot
 from ..io.settings import parse_payload, read_bounds, read_priors
 from ..io.sidecar import read_instrument, robots_of_sidecar
 from ..measurements.base import Measurement
-from ..measurements.contact import require_touched_points
 from ..measurements.mounting import mount_rig
 from ..measurements.position import require_common_reference_target
 from ..parallel import TaskExecutor
@@ -347,8 +346,6 @@ def _read_data(chain: Chain, job: Job, servos: io.ServoFile | None, has_known_fr
             fit.append(_without(measured.fit, unreachable[path]))
             holdout.append((path, _without(measured.holdout, unreachable[path])))
     require_common_reference_target(by_file)
-    known = read_instrument(job.instrument) if job.instrument else {}
-    require_touched_points(list(by_file.values()), known)
     if job.holdout not in (None, REGION) and not holdout_file:
         try:
             fraction = float(job.holdout)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_setups import ARMS, placement_fit, simulate, wrong_arm
+from scipy.stats import chi2, norm
 
 from dhcal_pin import Chain, select_parameters
 from dhcal_pin.calibration.cameras import gate, jitter, joint_errors, target_points
@@ -582,10 +583,12 @@ def test_predictions_of_left_out_images_have_the_uncertainty_of_the_fit_of_the_o
 
 
 def test_many_rows_of_other_instruments_show_a_small_change():
-    """The mean square of n normal values of variance 1 has the variance 2/n."""
-    for n_rows, ratio in ((0, 0.8), (100, 0.8), (900, 0.9266), (3000, 0.9605)):
-        limit = np.sqrt(max(0.64, 1 - 3 * np.sqrt(2 / n_rows))) if n_rows else 0.8
-        assert limit == pytest.approx(ratio, abs=1e-4)
+    """The mean square of normal rows is below the limit with the probability of three standard deviations."""
+    gates = {n: Gate(1.0, 1.0, 20, True, True, n_others=n) for n in (0, 100, 900, 3000, 100000)}
+    limits = {n: each.max_others_ratio for n, each in gates.items()}
+    assert limits[0] == limits[100] == 0.8
+    for n in (900, 3000, 100000):
+        assert chi2.cdf(n * limits[n] ** 2, n) == pytest.approx(norm.sf(3), rel=0.4)
+    for n, each in gates.items():
         for factor, is_open in ((0.999, True), (1.001, False)):
-            gate = Gate(1.0, 1.0, 20, True, True, others_ratio=factor * limit, n_others=n_rows)
-            assert gate.is_open == is_open
+            assert replace(each, others_ratio=factor * limits[n]).is_open == is_open

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, simulate, visible_corners, wrong_arm
+from camera_setups import ARMS, simulate, tool_error, visible_corners, wrong_arm
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate
 from dhcal_pin.exceptions import DhcalError
-from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise, Pose
+from dhcal_pin.measurements import KINDS, CameraCorners, Measurement, Noise
 from dhcal_pin.robot import Chain
 from dhcal_pin.robot.conditions import Conditions
 from dhcal_pin.se3 import exp6
@@ -102,13 +102,6 @@ def random_case(seed, is_small):
         "priors": str(rng.choice(["", "", "", "none"])),
     }
     return arm, truth, data, holdout, {name: value for name, value in options.items() if value}
-
-
-def tool_error(chain, truth, q):
-    """Return the RMS error of the tool at configurations with the best base and tool [m]."""
-    measured = Pose(q, truth.poses(q))
-    fit = calibrate(chain, measured, "base,tool", extend="none", session="off", loss="linear")
-    return float(np.sqrt(np.mean(np.sum((fit.chain.poses(q) - truth.poses(q))[:, :3, 3] ** 2, 1))))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_setups import ARMS, random_setup, simulate, visible_corners, wrong_arm
+from camera_setups import ARMS, random_setup, simulate, tool_error, visible_corners, wrong_arm
 from paper_arms import photograph as photograph_servo_arm
 from scipy.spatial.transform import Rotation
 from slow_cases import some_slow
@@ -73,8 +73,7 @@ def arm_error(chain, truth, images):
     rng = np.random.default_rng(0)
     q = images.q[rng.integers(len(images.q), size=100)]
     q = np.clip(q + 0.1 * rng.standard_normal(q.shape), chain.lower, chain.upper)
-    fit = calibrate(chain, Pose(q, truth.poses(q)), "base,tool", extend="none", session="off", loss="linear")
-    return np.sqrt(np.mean(np.sum((fit.chain.poses(q) - truth.poses(q))[:, :3, 3] ** 2, 1)))
+    return tool_error(chain, truth, q)
 
 
 MOTION = np.array([5e-3, 0, 0, 0, 5e-3, 0])

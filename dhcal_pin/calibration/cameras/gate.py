@@ -12,8 +12,8 @@ of the arm are those of greatest evidence at T, however narrow.
 - r < 0.8 for a low-cost arm, whose zeros are wrong by degrees, and whose play and sag displace the images
   (`arm_types`).
 - r < 0.8 for the n whitened rows of other instruments beside the images, such as positions of a tracker, or
-  r² < 1 - 3·√(2/n), which independent rows of a right arm exceed, with the arm that is estimated at T = 1:
-  the arm is demonstrably wrong, too, whatever the images show.
+  r² < 1 - 3·√(2/n), if the mean square of the rows falls by three of its standard deviations: the arm is
+  demonstrably wrong, too, whatever the images show. Here it is estimated at T = 1.
 - Otherwise the nominal arm is kept, unless joint errors complete the model (`joint_errors`). Errors of
   another kind, such as periodic ones of the joints, can be imitated by errors of the links where images were
   taken, with a ratio of 0.3 to 0.5, but not elsewhere.
@@ -60,9 +60,9 @@ N_CLUSTERS = 5
 N_IMAGE_FOLDS = 5
 # Configurations per unit of the temperature with an open and with a closed gate.
 OPEN_SAMPLES, CLOSED_SAMPLES = 20, 5
-# Largest ratio of the errors of few rows of other instruments for which the arm is demonstrably wrong. Many
-# rows show a change of the mean square by so many standard deviations.
-MAX_OTHERS_RATIO, OTHERS_DEVIATIONS = 0.8, 3.0
+# Largest ratio of the errors of other instruments for which the arm is demonstrably wrong. A larger ratio is
+# enough if the mean square of the rows falls by this number of its standard deviations.
+MAX_OTHERS_RATIO, MIN_DEVIATIONS = 0.8, 3.0
 # Narrowest and widest prior with a closed gate, as a fraction of the default one.
 MIN_WIDTH, MAX_WIDTH = 1e-3, 1e2
 # Rounds of jitter and solution, and of the evidence.
@@ -93,7 +93,14 @@ class Gate:
     @property
     def _is_shown_by_others(self) -> bool:
         """Whether measurements of other instruments show that the arm is wrong."""
-        return self.others_ratio < max(MAX_OTHERS_RATIO, _largest_ratio(self.n_others))
+        return self.others_ratio < self.max_others_ratio
+
+    @property
+    def max_others_ratio(self) -> float:
+        """Largest ratio of the errors of other instruments for which the arm is demonstrably wrong."""
+        # The mean square of n normal values has a relative standard deviation of √(2/n).
+        least_fall = MIN_DEVIATIONS * np.sqrt(2 / max(self.n_others, 1))
+        return max(MAX_OTHERS_RATIO, float(np.sqrt(max(1 - least_fall, 0.0))))
 
     @property
     def max_ratio(self) -> float:
@@ -177,6 +184,7 @@ def apply_gate(fit: Fit, groups: PriorGroups, max_iterations: int, arm_type: Arm
         for model, factor in models
     ]
     best = min(trials, key=lambda trial: trial.error) if folds else trials[-1]
+    # The temperature protects from errors that images show, and other instruments do not.
     others = _others_ratio(best.model, max_iterations)
     gate = Gate(best.ratio, 1.0, n_configurations, is_right, is_complete, arm_type, *others)
     if not gate.is_open:
@@ -256,15 +264,9 @@ def _trial(
     return _Trial(model, closed, error.pixels, error.pixels / nominal.pixels)
 
 
-def _largest_ratio(n_rows: int) -> float:
-    """Return the largest ratio of errors that so many independent rows distinguish from 1; 0 for few rows."""
-    return float(np.sqrt(max(1 - OTHERS_DEVIATIONS * np.sqrt(2 / n_rows), 0.0))) if n_rows else 0.0
-
-
 def _others_ratio(fit: Fit, max_iterations: int) -> tuple[float, int]:
     """Return the ratio of the errors of left-out rows of other instruments, and the number of these rows."""
-    # The ratio is NaN if the rows are too few. The arm is that at temperature 1: what the images lack is no
-    # error of other instruments.
+    # It is the error with the arm of the fit over that with the nominal arm; NaN if the rows are too few.
     others = [item for item in fit.problem.data if not item.n_images]
     folds = []
     for fold in cluster_folds(others) if others else ():

@@ -121,11 +121,11 @@ def calibrate_images(
 ) -> Result:
     """Calibrate from images, starting from a first fit."""
     max_error = fitting.arm_type.max_error
-    has_moved = fit.solution.converged or fit.solution.iterations
-    is_stuck = not has_moved and fitted_error(fit).pixels > max_error
+    is_far = fitted_error(fit).pixels > max_error
+    is_stuck = is_far and not (fit.solution.converged or fit.solution.iterations)
     unrelated = find_unrelated_images(fit, holdout, chain, max_error)
     has_arm = fit.problem.errors.has_arm
-    if has_arm and not unrelated and fitted_error(fit).pixels > max_error:
+    if has_arm and is_far and not unrelated:
         # Further fits of an arm with wrong joint values take many iterations.
         unrelated = find_wrong_joint_values(fit)
     if is_stuck and not unrelated and stated_poses(select_images(fit.data)):
