@@ -17,12 +17,14 @@ try:
         apply_observation_matrix,
         cos_sin,
         factor_jacobian,
+        invert_triangular,
         log_rotations,
         perturb_frames,
         point_jacobian,
         propagate_frames,
         r_factor,
         r_factors,
+        reciprocal_condition,
         right_jacobian_inverse_batch,
         solve_triangular,
     )
@@ -36,19 +38,29 @@ except ImportError:
         propagate_frames,
         right_jacobian_inverse_batch,
     )
-    from .qr import append_diagonal, factor_jacobian, r_factor, r_factors, solve_triangular
+    from .qr import (
+        append_diagonal,
+        factor_jacobian,
+        invert_triangular,
+        r_factor,
+        r_factors,
+        reciprocal_condition,
+        solve_triangular,
+    )
 
 __all__ = [
     "append_diagonal",
     "apply_observation_matrix",
     "cos_sin",
     "factor_jacobian",
+    "invert_triangular",
     "log_rotations",
     "perturb_frames",
     "point_jacobian",
     "propagate_frames",
     "r_factor",
     "r_factors",
+    "reciprocal_condition",
     "right_jacobian_inverse_batch",
     "solve_triangular",
 ]

@@ -395,6 +395,21 @@ static PyObject *py_append_diagonal(PyObject *self, PyObject *args)
     return finish(a, 5, ok);
 }
 
+static PyObject *py_invert_triangular(PyObject *self, PyObject *args)
+{
+    (void)self;
+    static const ArraySpec specs[] = {{"r", 2, 'd'}, {"out", 2, 'D'}};
+    Array a[2];
+    if (!get_arrays(a, args, specs, 2))
+        return NULL;
+    const Size p = a->view.shape[0];
+    if (!has_shape(a, p, p, 0, 0) || !has_shape(a + 1, p, p, 0, 0) || !is_contiguous(a + 1))
+        return finish(a, 2, 0);
+    const double condition = invert_triangular(a->data, a->stride[0], p, a[1].data);
+    release(a, 2);
+    return PyFloat_FromDouble(condition);
+}
+
 static PyObject *py_solve_triangular(PyObject *self, PyObject *args)
 {
     (void)self;
@@ -423,6 +438,7 @@ static PyMethodDef methods[] = {
     {"r_factors", py_r_factors, METH_VARARGS, NULL},
     {"factor_jacobian", py_factor_jacobian, METH_VARARGS, NULL},
     {"append_diagonal", py_append_diagonal, METH_VARARGS, NULL},
+    {"invert_triangular", py_invert_triangular, METH_VARARGS, NULL},
     {"solve_triangular", py_solve_triangular, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };

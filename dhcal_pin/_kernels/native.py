@@ -9,9 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from .._typing import Array
-from . import _native, kinematics
+from . import _native, kinematics, qr
 from .types import JointState, ObservationMatrix
 from .work_arrays import work_array
+
+# LAPACK is faster for matrices with more rows than this, in spite of the time of its import.
+LARGE = 200
 
 
 def cos_sin(angles: Array) -> tuple[Array, Array]:
@@ -95,6 +98,22 @@ def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
     out = np.empty(r.shape)
     _native.append_diagonal(r, diagonal, target, _work_array(r.shape[1], 1, 0), out)
     return out
+
+
+def invert_triangular(r: Array) -> Array:
+    """Compute the inverse of a triangular matrix; see `qr.invert_triangular`."""
+    if len(r) > LARGE:
+        return qr.invert_triangular(r)
+    out = np.empty(r.shape)
+    _native.invert_triangular(r, out)
+    return out
+
+
+def reciprocal_condition(r: Array) -> float:
+    """Compute the reciprocal condition number of a triangular matrix; see `qr.reciprocal_condition`."""
+    if len(r) > LARGE:
+        return qr.reciprocal_condition(r)
+    return _native.invert_triangular(r, work_array("inverse", *r.shape))
 
 
 def solve_triangular(r: Array, sides: Array) -> Array:

@@ -324,6 +324,37 @@ static void append_diagonal(const double *r_in, Size p, const double *diagonal, 
     }
 }
 
+/* Compute the inverse (p, p) of R, whose rows are `row` apart; return its reciprocal condition number in the
+   1-norm, or 0 if an element of the diagonal is 0 or one of either matrix is not finite. */
+SIMD_CLONES static double invert_triangular(const double *r, Size row, Size p, double *inverse)
+{
+    double norm = 0, inverse_norm = 0, total = 0;
+    memset(inverse, 0, p * p * sizeof(double));
+    for (Size i = p; i--;) {
+        double *restrict to = inverse + i * p;
+        const double pivot = r[i * row + i];
+        if (pivot == 0)
+            return 0;
+        to[i] = 1;
+        for (Size j = i + 1; j < p; j++) {
+            const double f = r[i * row + j], *restrict from = inverse + j * p;
+            VECTORIZE (t, p - j)
+                to[j + t] -= f * from[j + t];
+        }
+        VECTORIZE (t, p - i)
+            to[i + t] /= pivot;
+    }
+    for (Size j = 0; j < p; j++) {
+        double sum = 0, inverse_sum = 0;
+        for (Size i = 0; i <= j; i++)
+            sum += fabs(r[i * row + j]), inverse_sum += fabs(inverse[i * p + j]);
+        norm = sum > norm ? sum : norm;
+        inverse_norm = inverse_sum > inverse_norm ? inverse_sum : inverse_norm;
+        total += sum + inverse_sum;
+    }
+    return total < INFINITY ? 1 / (norm * inverse_norm) : 0;
+}
+
 /* Solve R·x = y by back substitution for s right-hand sides y (p, s); rows of r are `row` apart. */
 SIMD_CLONES static void solve_triangular(const double *r, Size row, Size p, Size s, const double *y, double *x)
 {

@@ -11,9 +11,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import lapack
 
 from .._typing import Array
+from . import lapack
 from .kinematics import apply_observation_matrix, batch_point_jacobian, point_jacobian
 from .types import ObservationMatrix
 from .work_arrays import UnbufferedRows, work_array
@@ -85,6 +85,16 @@ def append_diagonal(r: Array, diagonal: Array, target: Array) -> Array:
     stacked.reshape(b, -1)[:, p + 1 : 2 * p * (p + 1) : 2 * p + 2] = diagonal
     stacked[:, p, p + 1 :] = target
     return _qr(stacked[0])[None] if b == 1 else r_factors(stacked[:, :, None])
+
+
+def invert_triangular(r: Array) -> Array:
+    """Compute the inverse of an upper triangular matrix (p, p) whose diagonal has no zeros."""
+    return lapack.dtrtri(r)[0]
+
+
+def reciprocal_condition(r: Array) -> float:
+    """Compute or estimate the reciprocal condition number of an upper triangular matrix in the 1-norm."""
+    return lapack.dtrcon(r)[0]
 
 
 def solve_triangular(r: Array, sides: Array) -> Array:

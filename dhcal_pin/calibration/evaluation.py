@@ -38,8 +38,8 @@ MIN_SAMPLES = 10
 # The error of a wrong measurement before a calibration is at least this fraction of that after it.
 MIN_RATIO_BEFORE = 0.5
 # Probability that chance makes a robot appear better that is not, of the squared errors and of their fourth
-# roots. The quantiles of Student's t with one degree of freedom are -63.7 and -15.9; others are closer to 0.
-MAX_CHANCES, MIN_T = (0.005, 0.02), -63.7
+# roots, and the quantiles of Student's t for them with 9 degrees of freedom; with more they are closer to 0.
+MAX_CHANCES, SURE_T = (0.005, 0.02), (-3.25, -2.4)
 # Samples that a comparison judges.
 Title = Literal["hold-out", "region hold-out", "cross-validated", "fitted"]
 
@@ -312,7 +312,7 @@ class PairedErrors:
         if self.ratio >= 1 or len(self.before) < 2:
             return False
         t = self.t, _student_t(self.after**0.25 - self.before**0.25)
-        if min(t) < MIN_T:
+        if len(self.before) >= MIN_SAMPLES and np.any(t < np.array(SURE_T)):
             return True
         from scipy.special import stdtrit  # lazy import: slow
 

@@ -32,7 +32,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
 
 import numpy as np
-from scipy.linalg import lstsq
 
 from .._frozen import frozen
 from .._typing import Array
@@ -110,6 +109,8 @@ def solve_columns(system: TriangularSystem, weights: Array, x: Array, columns: A
     prior = weights[columns]
     if prior.all():
         return system.select(columns).solve(prior, x[columns])
+    from scipy.linalg import lstsq  # lazy import: slow
+
     a = np.concatenate([system.r[:, columns], np.diag(prior)])
     b = np.concatenate([system.z, -prior * x[columns]])
     solution = lstsq(a, b, lapack_driver="gelsy", check_finite=False)

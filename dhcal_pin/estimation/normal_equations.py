@@ -18,8 +18,8 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import blas, lapack
 
+from .._kernels import lapack
 from .._typing import Array
 from .qr import TriangularSystem, euclidean_norm, is_well_conditioned, merge_r_factors, sum_of_squares
 from .solver_rules import EPS_MODEL
@@ -269,11 +269,11 @@ def _quotient(upper: Array, root: Array) -> Array:
     # Products of parts are faster than LAPACK, which does not use that the first matrix is triangular.
     half = len(root) // 2
     if half < _SMALL:
-        return blas.dtrsm(1.0, root, upper, side=1)
+        return lapack.dtrsm(1.0, root, upper, side=1)
     first, last = slice(None, half), slice(half, None)
     out = np.zeros_like(root)
     out[first, first] = _quotient(upper[first, first], root[first, first])
     out[last, last] = _quotient(upper[last, last], root[last, last])
-    beside = upper[first, last] - blas.dtrmm(1.0, out[first, first], root[first, last])
-    out[first, last] = blas.dtrsm(1.0, root[last, last], beside, side=1, overwrite_b=1)
+    beside = upper[first, last] - lapack.dtrmm(1.0, out[first, first], root[first, last])
+    out[first, last] = lapack.dtrsm(1.0, root[last, last], beside, side=1, overwrite_b=1)
     return out

@@ -29,7 +29,6 @@ from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from .._frozen import frozen
 from .._kernels import apply_observation_matrix, factor_jacobian
@@ -410,7 +409,13 @@ class StructuredRows:
         factor = blocked_r_factor(reduced.multiplied_out())
         rows = np.empty((len(factor) - 1, n))
         rows[:, self.columns[: c + 1]] = factor[:-1, [*range(c), -1]]
-        rows[:, self.columns[c + 1 :]] = factor[:-1, c:-1] @ block_diag(*(each for _, each in found))
+        rows[:, self.columns[c + 1 :]] = np.concatenate(
+            [
+                factor[:-1, c + block.start : c + block.stop] @ coefficients
+                for (_, block), (_, coefficients) in zip(blocks, found, strict=True)
+            ],
+            1,
+        )
         out = np.zeros((n, n))
         out[: len(rows)], out[-1, -1] = np.linalg.qr(rows, mode="r"), factor[-1, -1]
         return out

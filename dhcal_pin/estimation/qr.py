@@ -29,10 +29,16 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack, svd
 
 from .._frozen import frozen
-from .._kernels import append_diagonal, r_factor
+from .._kernels import (
+    append_diagonal,
+    invert_triangular,
+    lapack,
+    r_factor,
+    reciprocal_condition,
+    solve_triangular,
+)
 from .._typing import Array
 from .solver_rules import EPS_MODEL
 
@@ -77,6 +83,8 @@ def singular_value_decomposition(a: Array) -> tuple[Array, Array, Array]:
         return u, s, vt
     except np.linalg.LinAlgError:
         # The divide and conquer method does not converge for some matrices of a wide range of values.
+        from scipy.linalg import svd  # lazy import: slow
+
         return svd(a, lapack_driver="gesvd")
 
 
@@ -240,11 +248,11 @@ class TriangularSystem:
             return np.empty((0, 0)), np.empty((0, 0))
         full = self.with_priors(weights, 0.0).r
         if is_well_conditioned(full):
-            return lapack.dtrtri(full)[0], np.empty((len(weights), 0))
+            return invert_triangular(full), np.empty((len(weights), 0))
         # Unknowns of different units may alone cause the condition.
         scale = np.linalg.norm(full, axis=0)
         if weights.all() and is_well_conditioned(full / scale):
-            return lapack.dtrtri(full / scale)[0] / scale[:, None], np.empty((len(weights), 0))
+            return invert_triangular(full / scale) / scale[:, None], np.empty((len(weights), 0))
         _, s, vt = singular_value_decomposition(self.r)
         n_observable = int(np.sum(s > RANK_RTOL * s[0]))
         observable, unobservable = vt[:n_observable].T, vt[n_observable:].T
@@ -256,7 +264,7 @@ class TriangularSystem:
         priors = weights[:, None] * observable
         rows = np.concatenate([np.diag(s[:n_observable]), priors - left @ (left.T @ priors)])
         # LAPACK prints a complaint about an empty matrix.
-        data_root = lapack.dtrtri(np.linalg.qr(rows)[1])[0] if n_observable else np.empty((0, 0))
+        data_root = invert_triangular(np.linalg.qr(rows)[1]) if n_observable else np.empty((0, 0))
         root = np.concatenate([(observable - prior_root @ (left.T @ priors)) @ data_root, prior_root], 1)
         return root, unobservable @ np.delete(yt, np.flatnonzero(has_prior), 0).T
 
@@ -322,16 +330,21 @@ def append_rows(system: TriangularSystem, diagonal: Array, right: Array) -> Tria
 
 def is_well_conditioned(r: Array) -> bool:
     """Check that no singular value of R can be near the rank cut."""
-    return bool(r.size) and lapack.dtrcon(r)[0] > WELL_CONDITIONED
+    return bool(r.size) and reciprocal_condition(r) > WELL_CONDITIONED
 
 
 def pseudo_inverse(r: Array, z: Array) -> Array:
     """Compute the minimum-norm least-squares solution R⁺·z (p,) by the singular values above RANK_RTOL."""
     # Back substitution takes a hundredth of the time of the singular value decomposition.
     if is_well_conditioned(r):
-        return lapack.dtrtrs(r, z)[0]
+        return _substitute(r, z)
     # Unknowns of different units may alone cause the condition. None of them may count as zero.
     scale = np.linalg.norm(r, axis=0)
     if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and is_well_conditioned(r / scale):
-        return lapack.dtrtrs(r / scale, z)[0] / scale
+        return _substitute(r / scale, z) / scale
     return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]
+
+
+def _substitute(r: Array, z: Array) -> Array:
+    """Solve R·x = z, (p,)."""
+    return solve_triangular(r[None], np.ascontiguousarray(z)[None, :, None])[0, :, 0]

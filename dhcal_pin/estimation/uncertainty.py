@@ -35,10 +35,10 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import blas, lapack, solve_triangular
 
 from .. import se3
 from .._frozen import frozen
+from .._kernels import lapack
 from .._kernels.types import FrameBatch
 from .._typing import Array
 from ..robot.chain import Chain, link_frame, twists_in_bodies
@@ -300,13 +300,13 @@ def compact(known: Uncertainty) -> Information | None:
     if not exact.root.size:
         return exact
     root = np.linalg.qr(exact.root.T, mode="r").T
-    right = blas.dtrmm(1.0, root, _information_matrix(exact, known), side=1, lower=1)
-    difference = blas.dtrmm(1.0, root, right, trans_a=1, lower=1)
+    right = lapack.dtrmm(1.0, root, _information_matrix(exact, known), side=1, lower=1)
+    difference = lapack.dtrmm(1.0, root, right, trans_a=1, lower=1)
     difference.flat[:: len(root) + 1] -= 1.0
     parts = [np.empty((len(root), 0))] * 2
     if np.linalg.norm(difference) > MAX_ERROR:
         values, axes = np.linalg.eigh(difference)
-        directions = solve_triangular(root, axes * np.sqrt(np.abs(values)), trans=1, lower=True)
+        directions = lapack.dtrtrs(root, axes * np.sqrt(np.abs(values)), trans=1, lower=1)[0]
         parts = [directions[:, sign * values > MAX_ERROR].astype(np.float32) for sign in (-1, 1)]
     if 2 * sum(part.shape[1] for part in parts) > len(root):
         return None

@@ -27,9 +27,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import field
 
 import numpy as np
-from scipy.linalg import lapack
 
 from .._frozen import frozen
+from .._kernels import invert_triangular
 from .._typing import Array
 from .bin_filling import filling_cost, filling_gains
 from .criteria import Criterion
@@ -46,7 +46,7 @@ def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
     """Compute a square root of the covariance, R⁻¹ (p, p), after measurements with rows (n, k, p)."""
     p = prior_factor.shape[1]
     r = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
-    return lapack.dtrtri(r)[0]
+    return invert_triangular(r)
 
 
 @frozen(eq=False)

@@ -6,14 +6,14 @@ and slopes s_i = (q_{i+1} - q_i) / h_i, solve a tridiagonal system:
     h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i M_{i+1} = 6 (s_i - s_{i-1})
 
 The third derivative is continuous at the second and the last but one time ("not-a-knot"). `scipy.interpolate`
-has the same spline, but its import takes longer than most calibrations.
+has the same spline, but its import takes longer than most calibrations, and that of `scipy.linalg` as long as
+many.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_banded
 
 from .._frozen import frozen
 from .._typing import Array
@@ -62,8 +62,30 @@ def joint_path(times: Array, q: Array) -> JointPath:
             upper[0] -= h[0] * start
             diagonal[-1] += h[-1] * (1 + end)
             lower[-1] -= h[-1] * end
-            bands = np.array([np.roll(upper, 1), diagonal, np.roll(lower, -1)])
-            curvature[1:-1] = solve_banded((1, 1), bands, jumps)
+            lower[0] = upper[-1] = 0.0
+            curvature[1:-1] = _solve_tridiagonal(lower, diagonal, upper, jumps)
             curvature[0] = (1 + start) * curvature[1] - start * curvature[2]
             curvature[-1] = (1 + end) * curvature[-2] - end * curvature[-3]
     return JointPath(times, q, curvature)
+
+
+def _solve_tridiagonal(lower: Array, diagonal: Array, upper: Array, right: Array) -> Array:
+    """Solve the rows lower[i]·x[i-1] + diagonal[i]·x[i] + upper[i]·x[i+1] = right[i], right and x (m, n)."""
+    # Cyclic reduction: multiples of the rows i - step and i + step leave unknowns 2·step apart. It is stable
+    # as the diagonal is larger than the others together.
+    step = 1
+    while step < len(diagonal):
+        above, below = slice(step, None), slice(None, -step)
+        before, after = np.zeros_like(lower), np.zeros_like(upper)
+        before[above] = -lower[above] / diagonal[below]
+        after[below] = -upper[below] / diagonal[above]
+        next_diagonal, next_right = diagonal.copy(), right.copy()
+        next_diagonal[above] += before[above] * upper[below]
+        next_diagonal[below] += after[below] * lower[above]
+        next_right[above] += before[above, None] * right[below]
+        next_right[below] += after[below, None] * right[above]
+        before[above] *= lower[below]
+        after[below] *= upper[above]
+        lower, diagonal, upper, right = before, next_diagonal, after, next_right
+        step *= 2
+    return right / diagonal[:, None]

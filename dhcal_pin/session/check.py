@@ -37,7 +37,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from .. import se3
 from .._frozen import frozen
@@ -353,6 +352,8 @@ class _CheckModel:
                 parts.append(model)
             shared.append(np.concatenate(common, 1))
             own += list(np.concatenate(parts, 2))
+        from scipy.linalg import block_diag  # lazy import: slow
+
         return np.concatenate([np.concatenate(shared), np.asarray(block_diag(*own))], 1)
 
     def _uncertain_rows(self, item: Measurement, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -815,6 +816,8 @@ class _CheckModel:
 
 def _separable_inverse(effects: Sequence[Array]) -> tuple[Array, int]:
     """Return the inverse (c, n) of effects (n, ·) of changes without what they cancel, and its rank."""
+    from scipy.linalg import block_diag  # lazy import: slow
+
     parts = []
     for each in effects:
         u, s, vt = np.linalg.svd(each, full_matrices=False)

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._frozen import frozen
-from .._kernels import apply_observation_matrix, r_factor, solve_triangular
+from .._kernels import apply_observation_matrix, invert_triangular, r_factor
 from .._typing import Array
 from ..estimation.contacts.scale_gauge import normalize_by_scale
 from ..estimation.parameters import base, tool
@@ -253,7 +253,7 @@ def covariance_root(rows: Array, prior: Array) -> Array:
     sizes[sizes == 0] = 1.0
     # Nothing determines some directions.
     stacked.flat[len(rows) :: stacked.shape[1] + 1] = np.hypot(prior, MIN_SINGULAR_VALUE * sizes)
-    return solve_triangular(r_factor(stacked[:, None])[None], np.eye(p)[None])[0]
+    return invert_triangular(r_factor(stacked[:, None]))
 
 
 def solve_information(information: Array, right: Array) -> Array:

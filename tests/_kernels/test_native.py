@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import ROOT, random_joints, random_table
@@ -132,6 +133,29 @@ def test_triangular_systems_are_solved(kernels, sides):
     x = rng.standard_normal((4, 7, sides))
     found = kernels.solve_triangular(rows[:, :-1, :-1], rows[:, :-1, :-1] @ x)
     np.testing.assert_allclose(found, x, atol=1e-12)
+
+
+@pytest.mark.parametrize("p", [1, 2, 7, 60, 250])
+def test_inverse_and_condition_of_triangular_matrices_agree_with_lapack(p):
+    """The matrix is a part of a larger one, as in a triangular system; LAPACK's condition is an estimate."""
+    rows = np.random.default_rng(p).standard_normal((2 * p, p + 1))
+    r = np.asarray(np.linalg.qr(rows, mode="r"))[:p, :p]
+    wanted = scipy.linalg.lapack.dtrtri(r)[0]
+    for kernels in (native, qr):
+        np.testing.assert_allclose(kernels.invert_triangular(r), wanted, atol=1e-14 * abs(wanted).max())
+    estimate = qr.reciprocal_condition(r)
+    exact = 1 / np.linalg.cond(r, 1)
+    assert estimate / 3 <= exact <= estimate * (1 + 1e-9)
+    assert native.reciprocal_condition(r) == pytest.approx(exact if p <= native.LARGE else estimate)
+
+
+@pytest.mark.parametrize("kernels", [native, qr])
+@pytest.mark.parametrize("last", [0.0, 1e-20, np.nan])
+def test_a_singular_triangular_matrix_has_no_condition(kernels, last):
+    """A number that is not finite is not well-conditioned either."""
+    assert (
+        not kernels.reciprocal_condition(np.array([[1.0, 2.0, 0.5], [0.0, 3.0, 1.0], [0, 0, last]])) > 1e-15
+    )
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-100, 1e-12, 1.0, 1e100])

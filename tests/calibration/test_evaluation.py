@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 from scipy.stats import binom
 from slow_cases import some_slow
 
 from dhcal_pin.calibration import Accuracy
-from dhcal_pin.calibration.evaluation import MAX_CHANCES, PairedErrors
+from dhcal_pin.calibration.evaluation import MAX_CHANCES, MIN_SAMPLES, SURE_T, PairedErrors
 
 
 def test_standard_error_of_rms_matches_scatter_over_repeats():
@@ -83,6 +84,11 @@ def test_few_samples_show_that_a_robot_is_better(n, shape, ratio, least):
     rng, n_trials = np.random.default_rng(n), 1000
     count = sum(paired_errors(rng, n, shape, ratio).is_better for _ in range(n_trials))
     assert count >= binom.isf(1 - 1e-4, n_trials, least)
+
+
+def test_the_quantiles_that_decide_without_a_computation_hold_for_all_numbers_of_samples():
+    freedom = np.arange(MIN_SAMPLES - 1, 10_000)[:, None]
+    assert np.all(np.array(SURE_T) <= stdtrit(freedom, MAX_CHANCES))
 
 
 def test_a_robot_with_a_larger_rms_error_is_not_better():

@@ -6,12 +6,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import CALIBRATE, folder_contents, parse_json, stdout_of
+from robots import paper, random_joints
 
-from dhcal_pin import robot
+from dhcal_pin import Noise, Pose, read_robot, robot
 from dhcal_pin.calibration import model_selection
 from dhcal_pin.cli import main
+from dhcal_pin.io import measurement_text
 
 COMMANDS = tuple(main.COMMANDS)
 
@@ -46,13 +49,12 @@ def test_help_and_argument_errors_load_nothing_heavy(args):
     assert done.stderr.splitlines()[-1] == ""
 
 
-def test_a_calibration_loads_neither_searches_in_images_nor_other_commands(robot_folder):
-    script = (
-        "import sys\n"
-        "from dhcal_pin.cli.main import main\n"
-        "main(sys.argv[1:])\n"
-        "print(*(name for name in sys.modules if name.startswith('dhcal_pin.')))"
-    )
+def test_a_calibration_loads_no_searches_in_images_no_other_commands_and_no_slow_library(robot_folder):
+    chain = read_robot("arm.dh.toml")
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(chain, random_joints(rng, paper("experiment"), 100), Noise(1e-4, 1e-4), rng)
+    Path("data.csv").write_text(measurement_text(data, chain))
+    script = "import sys\nfrom dhcal_pin.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules)"
     command = [sys.executable, "-c", script, *CALIBRATE]
     loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     assert "dhcal_pin.calibration.verdict" in loaded
@@ -63,6 +65,7 @@ def test_a_calibration_loads_neither_searches_in_images_nor_other_commands(robot
         "planning",
     )
     assert not {f"dhcal_pin.{name}" for name in others} & {*loaded}
+    assert not {"matplotlib", "meshcat", "scipy.linalg", "scipy.optimize", "scipy.special"} & {*loaded}
 
 
 def test_installed_command(robot_folder):
