@@ -206,7 +206,7 @@ class Difference:
         """What the difference means."""
         if self.of_parameters is None or self.overall is None:
             return [
-                "No calibration states its uncertainty, so that nothing says how large a difference may be.",
+                "No calibration states the uncertainty of the arm, so that nothing says how large a difference may be.",
                 *self.remarks,
             ]
         texts = [
@@ -382,26 +382,32 @@ def _root(
 ) -> Array:
     """Return the root of the covariance of the displacements without base and tool, (m·n, r)."""
     # Base and tool of each calibration by themselves: measurements may leave them undetermined.
-    parts = [
-        _without_frames(c, at, lever, n, _effects(c, u, at, lever))
-        for c, u in zip((a, b), pair, strict=True)
-        if u is not None
-    ]
+    parts = [np.empty((len(at.q) * n, 0))]
+    for chain, uncertainty in zip((a, b), pair, strict=True):
+        if uncertainty is not None:
+            effects = _effects(chain, uncertainty, at, lever)
+            own = _without_frames(chain, at, lever, n, effects)
+            # A calibration of base and tool alone leaves rounding errors.
+            if np.linalg.norm(own) > EFFECT_RTOL * np.linalg.norm(effects):
+                parts.append(own)
     return np.hstack(parts)
 
 
 def _expected(a, b, pair, at: Conditions, lever: float, n: int) -> float | None:
-    """Return the RMS distance that the uncertainties explain [m]."""
-    if pair == (None, None):
+    """Return the RMS distance that the uncertainties explain [m]; None if no arm was estimated."""
+    root = _root(a, b, pair, at, lever, n)
+    if not root.shape[1]:
         return None
-    root = _root(a, b, pair, at, lever, n).reshape(len(at.q), n, -1)[:, :3]
+    root = root.reshape(len(at.q), n, -1)[:, :3]
     return float(np.sqrt(np.sum(root**2) / len(at.q)))
 
 
 def _tested(difference: Difference, pair, at: Conditions, lever: float, n: int) -> Difference:
-    """Return a difference with its chi-square, and the parts that differ."""
+    """Return a difference with its chi-square, and the parts that differ, if the arm was estimated."""
     a, b = difference.first, difference.second
     u, s, _ = np.linalg.svd(_root(a, b, pair, at, lever, n), full_matrices=False)
+    if not s.size:
+        return difference
     usual = np.median(s[s > RANK_RTOL * s[0]])
     rank = int(np.sum(s > MIN_STD_RATIO * usual))
     u, whiten = u[:, :rank], (u[:, :rank] / s[:rank]).T

@@ -78,12 +78,17 @@ class Prediction:
     @property
     def position_std(self) -> Array:
         """Expected RMS distance from the true position, shape (m,) [m]."""
-        return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2))
+        return _root_trace(self.covariance[:, :3, :3])
 
     @property
     def orientation_std(self) -> Array:
         """Expected RMS angle from the true orientation, shape (m,) [rad]."""
-        return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2))
+        return _root_trace(self.covariance[:, 3:, 3:])
+
+
+def _root_trace(covariances: Array) -> Array:
+    """Compute the roots of the traces of matrices (m, n, n), which are not negative but for rounding."""
+    return np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
 
 
 class Predictor(Protocol):

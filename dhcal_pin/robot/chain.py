@@ -667,9 +667,10 @@ class Chain:
         Returns:
             The number of the motion that each coefficient scales, see `motions`, and its factor, (m,) each.
         """
-        assert self.transmission is not None
-        terms, transmission = frames.terms, self.transmission.evaluating(entries)
-        if terms is None or transmission is not self.transmission:
+        # Coefficients that are all 0 are not stored.
+        own = self.transmission or Transmission.zero(self.loads)
+        terms, transmission = frames.terms, own.evaluating(entries)
+        if terms is None or transmission is not own:
             terms = transmission.terms(frames.conditions)
         joints, numbers, sources = (indices.tolist() for indices in transmission.locate(entries))
         return joints, [terms[term, source] for term, source in zip(numbers, sources, strict=True)]

@@ -227,6 +227,8 @@ def recheck(
         # The errors that the model of the arm lacks are in these measurements, too.
         data = [_with_least_noise(item, least) if item.has_stated_sigma else item for item in data]
     model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
+    if not model.parts:
+        return _without_answer(model)
     return _answer(model, *model.judged(), size)
 
 
@@ -478,19 +480,23 @@ class _CheckModel:
 
     # ------------------------------------------------------------------------------------------- hypotheses
     @cached_property
-    def blocks(self) -> list[Block]:
-        """Blocks of columns that may change together, without those whose changes do not show."""
+    def parts(self) -> list[Block]:
+        """Blocks of columns of single parts that may change, without those whose changes do not show."""
         found = [b for b in self.layout.blocks if b.kind in ("joint", "base", "tool")]
         effects = np.linalg.norm(self._scaled(self.rows, self.usual_noise), axis=0) * LARGEST_CHANGE
         seen = [replace(b, sizes=np.where(effects[b.columns] > MIN_EFFECT, b.sizes, 0.0)) for b in found]
-        seen = [b for b in seen if b.sizes.any()]
-        columns, sizes = (np.concatenate([getattr(b, key) for b in seen]) for key in ("columns", "sizes"))
-        return [*seen, Block("robot", "", columns, sizes)]
+        return [b for b in seen if b.sizes.any()]
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Blocks of columns that may change together: those of the parts, and of the whole robot."""
+        columns, sizes = (np.concatenate([getattr(b, key) for b in self.parts]) for key in ("columns", "sizes"))
+        return [*self.parts, Block("robot", "", columns, sizes)]
 
     @property
     def hidden_joints(self) -> list[str]:
         """Joints whose zeros do not move what is measured."""
-        seen = {block.of for block in self.blocks}
+        seen = {block.of for block in self.parts}
         return [name for name in self.chain.joint_names if name not in seen]
 
     @property
@@ -668,8 +674,7 @@ class _CheckModel:
             return bool(_log_sums(weights[:, None])[0] <= limit)
         if judge.unchanged_p_value() >= MAX_FALSE_ALARMS:
             return True
-        *parts, _ = judge.blocks
-        return stops[-1] > MIN_SAMPLES and any(judge.is_changed(block) for block in parts)
+        return stops[-1] > MIN_SAMPLES and any(map(judge.is_changed, judge.parts))
 
     @cached_property
     def _positions(self) -> tuple[Array, Array]:
@@ -849,6 +854,16 @@ def _log_means(values: Array) -> Array:
     return _log_sums(flat) - np.log(len(flat))
 
 
+def _without_answer(model: _CheckModel) -> Recheck:
+    """Say that no change of any part would show."""
+    reason = (
+        f"Changes of {1e3 * LARGEST_CHANGE:g} mm or mrad would not show beside the noise and the uncertainty of "
+        "the calibration: calibrate with more poses, or measure more accurately."
+    )
+    n_samples, rms = int(model.numbers[-1]) + 1, model.position_rms()
+    return Recheck("cannot say", (reason,), (), (), 0.0, n_samples, *rms)
+
+
 def _answer(
     model: _CheckModel, hypotheses: list[Hypothesis], total: float, limit: float, size: float
 ) -> Recheck:
@@ -915,7 +930,7 @@ def _verified(model: _CheckModel, group: list[Hypothesis], robot: Hypothesis) ->
     """Compare what a change leaves of the residuals with the noise; look for a second change if needed."""
     best, judge = group[0], model.with_known_noise()
     unverified = "changed", [_sentence(group)], tuple(group), False
-    *parts, _ = model.blocks
+    parts = model.parts
     # Changes of several parts may be those of two: an instrument that was set up anew, and another one.
     first = ("base", "") if best.kind == "robot" else (best.kind, best.of)
     block = next((each for each in parts if (each.kind, each.of) == first), None)
@@ -976,7 +991,7 @@ def _slipped(model: _CheckModel) -> Finding | None:
 def _several(model: _CheckModel, robot: Hypothesis) -> Finding | None:
     """Return the answer if the origin of a joint explains the samples, and no single part does."""
     judge = model.with_known_noise()
-    if judge is None or not judge.is_origin(np.inf) or any(map(judge.is_changed, judge.blocks[:-1])):
+    if judge is None or not judge.is_origin(np.inf) or any(map(judge.is_changed, judge.parts)):
         return None
     return "changed", [_robot_sentence(judge)], (robot,), False
 

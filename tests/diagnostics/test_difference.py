@@ -158,6 +158,26 @@ def test_distances_do_not_depend_on_base_and_tool():
     )
 
 
+def test_calibrations_of_base_and_tool_alone_do_not_say_whether_arms_differ():
+    sim = Simulation("ur10", 40, 5)
+    placed = [of(calibrate(sim.chain, sim.measure(Pose), "base,tool", session="off")) for _ in range(2)]
+    arm = calibration(sim, sim.measure(Pose))
+    for first, second in (placed, (replace(arm, uncertainty=None), placed[0])):
+        found = compare(first, second)
+        assert (found.verdict, found.of_parameters, found.everywhere.expected) == ("unknown", None, None)
+    assert compare(arm, placed[0]).verdict == "different"
+
+
+def test_joint_errors_that_are_estimated_as_zero_are_compared():
+    """A file does not hold coefficients of 0, but their uncertainty."""
+    chain = Chain.from_dh(paper("sim_6dof"))
+    q = np.random.default_rng(0).uniform(-2, 2, (60, 6))
+    fit = calibrate(chain, Pose(q, chain.poses(q), 1e-4, 1e-4), "minimal,base,tool,harmonics", extend="none")
+    found = compare(Calibrated(chain), Calibrated(chain, replace(fit.uncertainty, chain=chain)))
+    assert found.verdict == "equal"
+    assert found.everywhere.expected is not None
+
+
 def test_other_robots_are_refused(sim_6dof, sim_3dof):
     with pytest.raises(InvalidArgumentError, match="another robot: its joints"):
         compare(Calibrated(sim_6dof), Calibrated(sim_3dof))

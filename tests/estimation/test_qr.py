@@ -130,6 +130,21 @@ def test_the_step_is_exact_at_condition_1e8():
     assert np.linalg.norm(step - exact) <= 1e-6 * np.linalg.norm(exact)
 
 
+def test_the_pseudo_inverse_survives_a_decomposition_that_does_not_converge(monkeypatch):
+    """The divide and conquer method fails for some matrices whose elements differ by twenty digits."""
+    rng = np.random.default_rng(0)
+    r = np.linalg.qr(rng.normal(size=(20, 3)) @ rng.normal(size=(3, 5)), mode="r")
+    z = rng.normal(size=5)
+    wanted = np.linalg.pinv(r, rcond=qr.RANK_RTOL) @ z
+    np.testing.assert_allclose(qr.pseudo_inverse(r, z), wanted, atol=1e-12)
+
+    def fail(*_args, **_options):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(np.linalg, "svd", fail)
+    np.testing.assert_allclose(qr.pseudo_inverse(r, z), wanted, atol=1e-12)
+
+
 @pytest.mark.parametrize("rank", [3, 5])
 def test_a_batch_of_systems_agrees_with_the_single_one(rank):
     """The members that both classes share, with damping, for a full and a deficient rank."""

@@ -9,7 +9,7 @@ import pytest
 from robots import nominal_arm
 from scipy.stats import chi2, multivariate_normal
 
-from dhcal_pin import se3
+from dhcal_pin import calibrate, se3
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.uncertainty import Uncertainty
 from dhcal_pin.exceptions import InvalidArgumentError
@@ -55,6 +55,22 @@ def changes_of(model, base: Any = 0.0, tool: Any = 0.0, zeros: Any = 0.0):
     out[model._block("base").columns], out[model._block("tool").columns] = base, tool
     out[model.layout.joints] = zeros
     return out
+
+
+def test_a_calibration_with_few_poses_shows_no_change_and_one_with_more_does():
+    """The advice is followed."""
+    rng, noise = np.random.default_rng(0), Noise(2e-3, 3e-3)
+    checked = Pose.simulate(ARM, rng.uniform(-2, 2, (8, 6)), noise, rng)
+    found = []
+    for count in (3, 200):
+        data = Pose.simulate(ARM, rng.uniform(-2, 2, (count, 6)), noise, rng)
+        fit = calibrate(nominal_arm("ur10"), data, extend="none", session="off")
+        found.append(recheck(fit.chain, [checked], fit.uncertainty, size=0.05))
+    few, many = found
+    assert (few.verdict, few.hypotheses, few.changes, few.samples) == ("cannot say", (), (), 8)
+    assert "calibrate with more poses" in few.reasons[0]
+    assert few.expected_rms > 10 * many.expected_rms
+    assert many.verdict == "ok"
 
 
 def test_rows_after_changes_are_the_residuals_of_the_changed_robot():
@@ -753,7 +769,7 @@ def test_a_check_has_the_given_noise_or_at_least_that_of_the_calibration(
     """The errors that the calibration left are in the samples, too; unstated noise is estimated."""
     taken: list[Any] = []
     judged = [], 2.0, 1.0
-    model = SimpleNamespace(judged=lambda: judged)
+    model = SimpleNamespace(judged=lambda: judged, parts=[JOINT])
     monkeypatch.setattr(check, "_CheckModel", lambda *args: taken.append(args) or model)
     monkeypatch.setattr(check, "_answer", lambda *args: args)
     data = [positions(Q[:2]), positions(Q[2:4], 2e-4), positions(Q[4:], None)]
@@ -897,7 +913,8 @@ class Findings:
     def __init__(self, **values: Any):
         """Take the values that differ from those of samples that nothing but a change of a joint explains."""
         self.numbers = np.repeat(np.arange(8), 3)
-        self.blocks = [JOINT, OTHER, BASE, ROBOT]
+        self.parts = [JOINT, OTHER, BASE]
+        self.blocks = [*self.parts, ROBOT]
         self.layout = SimpleNamespace(n_columns=9)
         self.unknown_columns, self.hidden_joints = [], []
         self.has_extrapolated_payloads, self.calibrated_payloads = False, (0.0, 5.0)

@@ -43,6 +43,8 @@ from ...robot.conditions import SampleState
 _N_SAMPLES = 100
 # Smallest moment of inertia relative to the largest one.
 _MIN_INERTIA = 1e-15
+# The tool does not move if its distances from the mean are this part of those from the base, or less.
+_MIN_RADIUS = 1e-12
 
 
 @frozen(eq=False)
@@ -50,14 +52,16 @@ class ScaleGauge:
     """Size of a robot and its rates of growth and rotation."""
 
     state: SampleState  # Joint state at c configurations
-    nominal: float  # RMS distance of the nominal tool from its mean position [m]
+    nominal: float  # RMS distance of the nominal tool from its mean position [m]; 0 if it does not move
 
     @classmethod
     def from_configurations(cls, chain: Chain, q: Array) -> ScaleGauge:
         """Choose configurations by drawing each joint from the measured ones."""
         rng = np.random.default_rng(0)
         state = chain.joint_state(np.stack([rng.choice(column, _N_SAMPLES) for column in q.T], 1))
-        return cls(state, _rms_radius(_centered(chain.forward_kinematics(state).tool[3])))
+        tool = chain.forward_kinematics(state).tool[3]
+        radius = _rms_radius(_centered(tool))
+        return cls(state, radius if radius > _MIN_RADIUS * _rms_radius(tool) else 0.0)
 
     def size(self, chain: Chain) -> float:
         """Compute the size of a chain."""
