@@ -267,6 +267,8 @@ def _principal_coordinates(data: tuple[Measurement, ...], groups: Array | None) 
     merged = configurations if groups is None else _merge_groups(groups, configurations)
     label = np.unique(merged, return_inverse=True)[1]
     count = np.bincount(label[has_configuration], minlength=label.max(initial=-1) + 1)
+    if not has_configuration.any():
+        return np.empty((0, 0)), label, count > 0
     if groups is not None and np.count_nonzero(count) == 1:
         return _principal_coordinates(data, None)
     centre = np.stack(

@@ -206,7 +206,8 @@ class Difference:
         """What the difference means."""
         if self.of_parameters is None or self.overall is None:
             return [
-                "No calibration states the uncertainty of the arm, so that nothing says how large a difference may be.",
+                "No calibration states the uncertainty of the arm, so that nothing says how large a "
+                "difference may be.",
                 *self.remarks,
             ]
         texts = [

@@ -133,6 +133,8 @@ def find_part_differences(
 
 def _best(candidates: Sequence[Parameter], chosen: Sequence[Parameter], left: Array) -> Parameter | None:
     """Return the parameter that explains most beyond those that are chosen; None if no one is needed."""
+    if not candidates:
+        return None
     effects, used = _joined(candidates, left), np.linalg.qr(_joined(chosen, left))[0]
     own = effects - used @ (used.T @ effects)
     lengths = np.linalg.norm(own, axis=0)

@@ -66,7 +66,8 @@ def _factor(rows: Array) -> Array:
     for j in range(k):
         for i in range(j):
             out[j:, j] -= out[j:, i] * out[j, i]
-        np.sqrt(out[j, j], out=out[j, j])
+        # It is at least 1, but for rounding.
+        np.sqrt(np.maximum(out[j, j], 1.0), out=out[j, j])
         out[j + 1 :, j] /= out[j, j]
     return out
 

@@ -227,7 +227,7 @@ def recheck(
         # The errors that the model of the arm lacks are in these measurements, too.
         data = [_with_least_noise(item, least) if item.has_stated_sigma else item for item in data]
     model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
-    if not model.parts:
+    if not model.parts or model.position_rms()[1] > LARGEST_CHANGE:
         return _without_answer(model)
     return _answer(model, *model.judged(), size)
 
@@ -490,7 +490,9 @@ class _CheckModel:
     @cached_property
     def blocks(self) -> list[Block]:
         """Blocks of columns that may change together: those of the parts, and of the whole robot."""
-        columns, sizes = (np.concatenate([getattr(b, key) for b in self.parts]) for key in ("columns", "sizes"))
+        columns, sizes = (
+            np.concatenate([getattr(b, key) for b in self.parts]) for key in ("columns", "sizes")
+        )
         return [*self.parts, Block("robot", "", columns, sizes)]
 
     @property
@@ -855,10 +857,10 @@ def _log_means(values: Array) -> Array:
 
 
 def _without_answer(model: _CheckModel) -> Recheck:
-    """Say that no change of any part would show."""
+    """Say that no change would show."""
     reason = (
-        f"Changes of {1e3 * LARGEST_CHANGE:g} mm or mrad would not show beside the noise and the uncertainty of "
-        "the calibration: calibrate with more poses, or measure more accurately."
+        "The noise and the uncertainty of the calibration are so large that no change would show: calibrate "
+        "with more poses, or measure more accurately."
     )
     n_samples, rms = int(model.numbers[-1]) + 1, model.position_rms()
     return Recheck("cannot say", (reason,), (), (), 0.0, n_samples, *rms)

@@ -491,6 +491,8 @@ class _Search:
             inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
             return [Step(number) for number in self.numbers[inner].tolist()]
         begin, end = float(self.times[self.begin]), float(self.times[-1])
+        if begin == end:
+            return []
         if kind is FreeDrift:
             return [FreeDrift(begin, end)]
         return [Drift(begin, end, ratio * (end - begin)) for ratio in TIME_CONSTANTS]

@@ -21,7 +21,7 @@ from dhcal_pin.calibration.partition import (
     configuration_groups,
     contact_groups,
 )
-from dhcal_pin.exceptions import DhcalError, InvalidArgumentError
+from dhcal_pin.exceptions import DhcalError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import Measurement, PointContact, PointDistance, Position, RelativePose
 from dhcal_pin.measurements.configurations import CONFIGURATION_TOL, group_by_configuration
 from dhcal_pin.robot import Chain
@@ -30,6 +30,11 @@ from dhcal_pin.robot import Chain
 pytestmark = pytest.mark.usefixtures("unsuspected")
 
 N_JOINTS = 6
+
+
+def test_lengths_without_a_configuration_are_in_no_region():
+    with pytest.raises(NotObservableError, match="same joint values"):
+        blocked_folds(PointDistance(6, [("p1", "p2"), ("p2", "p3")], [0.1, 0.2]))
 
 
 def positions(q: np.ndarray) -> Position:

@@ -15,6 +15,7 @@ from dhcal_pin import Result, calibrate, se3
 from dhcal_pin.cli.main import main
 from dhcal_pin.diagnostics import Calibrated, Difference, compare
 from dhcal_pin.diagnostics.difference import STATISTICS
+from dhcal_pin.diagnostics.joint_differences import find_part_differences
 from dhcal_pin.exceptions import InvalidArgumentError
 from dhcal_pin.io import write_urdf
 from dhcal_pin.measurements import Measurement, Pose, Position
@@ -166,6 +167,12 @@ def test_calibrations_of_base_and_tool_alone_do_not_say_whether_arms_differ():
         found = compare(first, second)
         assert (found.verdict, found.of_parameters, found.everywhere.expected) == ("unknown", None, None)
     assert compare(arm, placed[0]).verdict == "different"
+
+
+def test_nothing_is_named_if_no_parameter_explains_a_difference():
+    parts, zeros = find_part_differences([], lambda zeros: np.ones(4), 6)
+    assert parts == {}
+    np.testing.assert_array_equal(zeros, np.zeros(6))
 
 
 def test_joint_errors_that_are_estimated_as_zero_are_compared():

@@ -7,6 +7,7 @@ from slow_cases import some_slow
 
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.estimation.contacts import contact_bias
+from dhcal_pin.estimation.contacts.scale_gauge import ScaleGauge
 from dhcal_pin.estimation.initialization import align, make_problem
 from dhcal_pin.estimation.solver import minimize
 from dhcal_pin.measurements import Noise, PointContact, Position, SphereContact
@@ -50,6 +51,17 @@ def test_bias_is_the_mean_error_of_many_fits(kind):
     mean, bias = np.mean(found, 0), np.mean(predicted, 0)
     assert rms(mean) > 1e-3
     assert rms(mean - bias) < 0.35 * rms(mean)
+
+
+def test_an_arm_that_is_measured_at_one_configuration_keeps_its_size():
+    """Distances from the mean position would be rounding errors."""
+    gauge = ScaleGauge.from_configurations(CHAIN, np.tile(TEST_Q[:1], (4, 1)))
+    assert gauge.nominal == 0.0
+    larger = ERRORS.at(np.full(len(ERRORS.parameters), 1e-3))
+    assert gauge.size(larger) == 1.0
+    moving = ScaleGauge.from_configurations(CHAIN, TEST_Q)
+    assert 0.9 < moving.size(larger) < 1.1
+    assert moving.size(larger) != 1.0
 
 
 def test_positions_have_no_bias():

@@ -13,7 +13,7 @@ from dhcal_pin.calibration.result import Result
 from dhcal_pin.cli.main import main
 from dhcal_pin.estimation.parameters import select_parameters
 from dhcal_pin.estimation.problem import StructuredRows
-from dhcal_pin.estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL
+from dhcal_pin.estimation.uncertainty import MAX_COLUMNS, UNBOUNDED_TOL, Prediction
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.io import measurement_text, read_measurements
 from dhcal_pin.io.dh_file import read_dh
@@ -225,6 +225,13 @@ def test_view_draws_the_uncertainty_ellipsoids_of_a_file(calibrated, tmp_path):
     squares = [np.sum(np.square(each["axes"])) for each in scene["ellipsoids"]]
     q = np.array([each["q"] for each in scene["ellipsoids"]])
     np.testing.assert_allclose(np.sqrt(squares), calibrated.predict(q).position_std, rtol=1e-3)
+
+
+def test_a_variance_below_zero_by_rounding_has_the_root_zero():
+    covariance = np.diag([1e-6, 4e-6, 4e-6, -1e-24, 0.0, 0.0])[None]
+    found = Prediction(np.eye(4)[None], np.concatenate([covariance, -1e-24 * np.eye(6)[None]]))
+    np.testing.assert_allclose(found.position_std, [3e-3, 0.0])
+    np.testing.assert_array_equal(found.orientation_std, 0.0)
 
 
 def test_rows_without_transmission_coefficients_are_their_dense_columns():

@@ -79,6 +79,13 @@ def test_gains_are_the_improvements_by_one_more_candidate():
     assert AOptimality(WEIGHTS).gains(candidates.rows, root) == pytest.approx(variance_change, rel=1e-10)
 
 
+def test_gains_of_candidates_beside_which_nothing_else_counts_are_finite():
+    """Rounding hides the 1 of the determinant beside products of 1e18."""
+    row = 1e9 * np.arange(1.0, 6.0)
+    rows = np.stack([row, row], 1)[:, :, None]
+    assert DOptimality().gains(rows, np.eye(5)) == pytest.approx(np.log1p(2 * row @ row), rel=0.03)
+
+
 def test_bias_variance_criterion_equals_its_definition():
     """Variance and bias of a fit that takes two of seven unknowns as zero, from the information matrix."""
     candidates, rng = draw_candidates(7, 2, 30), np.random.default_rng(1)

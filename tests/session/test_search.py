@@ -160,6 +160,13 @@ def test_functions_of_time_begin_and_end_with_the_samples():
     assert search._taken_steps(search.causes[0].block) == (10, 30)
 
 
+def test_samples_at_one_time_have_no_drift():
+    sim = Simulation("ur10", 20, 0)
+    search = searched(sim, (sim.measure(Pose).with_conditions(time=np.full(20, 7.0)),), n_cells=20)
+    assert search._shapes(Drift, ()) == search._shapes(FreeDrift, ()) == []
+    assert len(search._shapes(Step, ())) > 2
+
+
 def test_configurations_of_repeated_rows_count_once():
     """A scale and a lag need two rows of different configurations for each unknown."""
     simulation = Simulation("ur10", 60, 3)
