@@ -55,6 +55,7 @@ from ..estimation.solver import SolverResult
 from ..estimation.trimmed_squares import MIN_SCALE, LinearizedRows, linearize_rows, search_majorities
 from ..measurements.base import Measurement
 from ..measurements.measured_region import MIN_SPREAD
+from ..session.linear_model import inverse
 
 # Smallest number of rows per unknown, and of samples of each measurement, with which the search may be
 # skipped. The rows of one configuration count once.
@@ -282,7 +283,7 @@ def _extend(rows: LinearizedRows, is_good: Array, scales: Array, redundancy: flo
         weights = is_good[None].astype(float)
         y = rows.solve(weights, scales[None])[0]
         scales = rows.noise_scales(rows.residual_squares(y[None]), is_good[None])[0]
-        covariance = np.linalg.inv(rows.total_information(weights, scales[None])[0])
+        covariance = inverse(rows.total_information(weights, scales[None])[0])
         t = _standardized(rows, y, scales, is_good, covariance)
         previous, is_good = is_good, t <= STRICT_THRESHOLD
         if np.array_equal(previous, is_good):

@@ -342,9 +342,12 @@ def pseudo_inverse(r: Array, z: Array) -> Array:
     scale = np.linalg.norm(r, axis=0)
     if scale.min(initial=np.inf) > RANK_RTOL * scale.max(initial=0.0) and is_well_conditioned(r / scale):
         return _substitute(r / scale, z) / scale
-    u, s, vt = singular_value_decomposition(r)
-    k = len(_without_zeros(s))
-    return vt[:k].T @ ((z @ u[:, :k]) / s[:k])
+    try:
+        return np.linalg.lstsq(r, z, rcond=RANK_RTOL)[0]
+    except np.linalg.LinAlgError:
+        u, s, vt = singular_value_decomposition(r)
+        k = len(_without_zeros(s))
+        return vt[:k].T @ ((z @ u[:, :k]) / s[:k])
 
 
 def _substitute(r: Array, z: Array) -> Array:

@@ -35,6 +35,8 @@ from .._typing import Array
 
 # Exponent that makes the weighted sum of variances in the gains of `EOptimality` follow the largest one.
 _E_WEIGHT_POWER = 6
+# Part of a sum that rounding hides.
+_ROUNDING = 1e-15
 
 
 class Criterion(Protocol):
@@ -63,12 +65,14 @@ def _factor(rows: Array) -> Array:
         for j in range(i + 1):
             np.einsum("pm,pm->m", rows[:, i], rows[:, j], out=out[i, j])
         out[i, i] += 1.0
+    least = _ROUNDING * np.einsum("iim->im", out)
     for j in range(k):
         for i in range(j):
             out[j:, j] -= out[j:, i] * out[j, i]
-        # It is at least 1, but for rounding.
-        np.sqrt(np.maximum(out[j, j], 1.0), out=out[j, j])
-        out[j + 1 :, j] /= out[j, j]
+        # Rounding hides the 1 of a row that depends on others, in directions that nothing determines.
+        is_hidden = out[j, j] <= least[j]
+        out[j, j] = np.sqrt(np.where(is_hidden, 1.0, out[j, j]))
+        out[j + 1 :, j] *= ~is_hidden / out[j, j]
     return out
 
 

@@ -37,6 +37,8 @@ from ...robot.chain import Chain
 # First standard deviations of the displacement [m], [rad] and of the joints [rad], and smallest ones.
 FIRST_STD = (1e-3, 1e-3, 1e-3)
 MIN_STD = 1e-7
+# Part of the trace of a matrix that rounding can remove from its diagonal.
+_ROUNDING = 1e-14
 # Iterations, and relative change that ends them.
 _N_ITERATIONS, _RTOL = 200, 1e-3
 # Smallest noise of a detected corner, relative to the placeholder of 1 px.
@@ -151,7 +153,11 @@ def _maximize_likelihood(images: Sequence[tuple[Array, Array]], noise: float, n_
     groups = _groups(information.shape[1])
     counts = np.fmax(np.bincount(groups, minlength=3), 1)
     for _ in range(_N_ITERATIONS):
-        covariance = np.linalg.inv(np.diag(1 / std[groups] ** 2) + information)
+        # (I + B)⁻¹ in units of the standard deviations; B may be large and singular for another arm.
+        scale = np.outer(std[groups], std[groups])
+        scaled = scale * information
+        one = 1 + _ROUNDING * np.trace(scaled, axis1=1, axis2=2)
+        covariance = scale * np.linalg.inv(scaled + one[:, None, None] * np.eye(len(groups)))
         mean = (covariance @ projected[:, :, None])[:, :, 0]
         squares = np.mean(mean**2 / share + np.diagonal(covariance, axis1=1, axis2=2), 0)
         updated = np.fmax(np.sqrt(np.bincount(groups, squares, 3) / counts), MIN_STD)

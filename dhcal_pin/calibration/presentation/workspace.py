@@ -114,7 +114,9 @@ def workspace_map(
     measured_index = index[len(points) :]
     std = np.concatenate([drawn_std, measured_std])
     worst = np.zeros(len(cells))
-    np.maximum.at(worst, index, std)
+    # NaN where the noise, and with it the uncertainty, is not known.
+    with np.errstate(invalid="ignore"):
+        np.maximum.at(worst, index, std)
     return WorkspaceMap(
         centre=(cells + 0.5) * cell,
         size=cell,
