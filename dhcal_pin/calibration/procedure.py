@@ -236,8 +236,9 @@ def calibrate(
         with_families = partial(supported, begun.fit, stages, setup.families)
         result = _calibrate_samples(setup, fitted, groups, with_families)
         # The scale of one axis and a zero far off make the robot longer or shorter, too.
-        is_examined = setup.finds_session and not (found and found.scales) and not result.diagnosis.zero
-        if is_examined and (scale := find_scale(result.problem, result.x)):
+        is_examined = setup.finds_session and not (found and found.scales)
+        scale = find_scale(result.problem, result.x) if is_examined else None
+        if scale and not result.diagnosis.zero:
             found = found or Session(order_samples(setup.data, setup.holdout), setup.chain, session == "auto")
             found = replace(found, scales=(scale,))
         result = replace(result, session=found)
