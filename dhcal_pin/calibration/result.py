@@ -71,12 +71,14 @@ class Result(Evidence, ResultPlots):
         if not (self.verdict.keeps_nominal and self.shrinkage_factor):
             return self
         instruments = self.problem.instrument_start(self.nominal_instruments)
+        regions = self.region_comparison
         return replace(
             self,
             x=np.append(np.zeros(len(self.errors.parameters)), instruments),
             chain=self.nominal_refitted,
             shrinkage_factor=0.0,
             bare=None,
+            region_comparison=replace(regions, after_alone=None) if regions else None,
             is_kept_nominal=True,
             decision=replace(self.verdict, reasons=(*self.verdict.reasons, "No correction is applied.")),
         )

@@ -83,7 +83,7 @@ def compute_shrinkage_factor(problem: Problem, solution: SolverResult, groups: P
             members_of.append(np.isin(robot, group.members))
             std[members_of[-1]] = 1 / group.expected_weight
     widths = np.array([[*row, 1.0] for row in itertools.product(PRIOR_WIDTHS, repeat=len(members_of))])
-    members_of.append(~np.any(members_of, 0))
+    members_of.append(~np.any([np.zeros(len(robot), bool), *members_of], 0))
     rows, effect = rows * std, displacement.T @ change * std
     noise = max(1.0, NOISE_FLOOR * float(np.abs(rows).max()) * PRIOR_WIDTHS.max())
     rows, measured = rows / noise, measured / noise

@@ -1,6 +1,6 @@
 """Result: convergence, accuracy and uncertainty against the truth of many simulated robots."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from dhcal_pin import se3
 from dhcal_pin.calibration import accuracy, calibrate, k_fold
 from dhcal_pin.calibration.estimates import Estimate
 from dhcal_pin.calibration.summary import definition_table
+from dhcal_pin.calibration.verdict import Verdict
 from dhcal_pin.estimation import Problem, linearize_and_factor, select_parameters
 from dhcal_pin.estimation.solver import next_iterate
 from dhcal_pin.measurements import Noise, Pose, Position
@@ -32,6 +33,17 @@ def test_accuracy_before_has_refitted_frames(sim_6dof, sim_6dof_actual):
     fit = calibrate(sim_6dof, data, "minimal,base,tool", priors="none")
     assert fit.validate(data)["position_rms_m"] < 1e-9
     assert 1e-3 < accuracy(fit.nominal_refitted, [data])["position_rms_m"] < 0.05
+
+
+def test_a_nominal_robot_that_is_kept_has_no_figures_of_the_urdf_alone(sim_6dof, sim_6dof_actual):
+    rng = np.random.default_rng(0)
+    data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)
+    fit = calibrate(sim_6dof, data, "minimal,base,tool,harmonics", extend="none", holdout="region")
+    assert fit.bare
+    assert fit.region_comparison.after_alone
+    kept = replace(fit, decision=Verdict("caution", keeps_nominal=True)).accepted
+    assert kept.is_kept_nominal
+    assert [each.after_alone for each in kept.comparisons] == [None] * 3
 
 
 def test_converged_means_that_a_new_step_is_negligible(sim_6dof, sim_6dof_actual):

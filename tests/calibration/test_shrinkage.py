@@ -8,7 +8,7 @@ from robots import joint_sample, measured_arm
 from scipy.stats import norm
 from slow_cases import some_slow
 
-from dhcal_pin.calibration import calibrate, procedure
+from dhcal_pin.calibration import accuracy, calibrate, procedure
 from dhcal_pin.calibration.shrinkage import compute_shrinkage_factor
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import Noise, Pose, Position
@@ -45,6 +45,17 @@ def count_worse_than_nominal(name: str, sets: str, kind, poses, seeds) -> int:
         worse += after > before
         assert bool(fit.shrinkage_notes) == (fit.shrinkage_factor < 1)
     return worse
+
+
+def test_gear_ratios_alone_are_shrunk():
+    """No unknown is of the geometry."""
+    arm, rng = measured_arm("ur10"), np.random.default_rng(0)
+    errors = select_parameters(arm, "gain")
+    truth = errors.at(np.full(6, 1e-3))
+    data = Position.simulate(truth, rng.uniform(-2, 2, (1, 6)), Noise(POSITION_STD), rng)
+    fit = calibrate(arm, data, "gain")
+    assert 0 <= fit.shrinkage_factor <= 1
+    assert fit.validate(data)["position_rms_m"] <= accuracy(arm, [data])["position_rms_m"]
 
 
 def factor_by_definition(problem, solution, groups) -> float:
