@@ -230,7 +230,8 @@ def independent_rows(columns: Sequence[Array], groups: Array) -> int:
         first += item.shape[2]
         for label, count in zip(*np.unique(labels, return_counts=True), strict=True):
             k = item.shape[1]
-            if count > 1:
+            # Without unknowns, all rows are residuals.
+            if count > 1 and len(item):
                 same = item[..., labels == label].reshape(len(item), -1)
                 k = int(np.linalg.matrix_rank(same, SAME_ROWS * np.linalg.norm(same, 2)))
             total += k

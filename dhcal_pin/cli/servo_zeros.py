@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Ending of the names of estimated zeros.
 _ZERO = ".offset"
+# Case in which another servo file is right.
+NEW_OFFSETS = ", unless the offsets in the servos have changed"
 
 
 def move_zeros(fit: Result, servos: ServoFile) -> tuple[Result, ServoFile]:
@@ -57,12 +59,17 @@ def describe_moves(before: ServoFile, after: ServoFile) -> list[str]:
 
 def other_zeros_warning(robot: str, servos: ServoFile | None, are_fitted: bool) -> list[str]:
     """Return a warning if a calibrated robot has a servo file with other zeros than those that are stated."""
-    path = os.path.splitext(robot)[0] + SERVO_ENDING
-    if servos is None or not os.path.exists(path):
-        return []
     # The zeros of LeRobot depend on the homing offsets in the servos; those of measurements that the
     # calibration fitted are known.
-    if servos.lerobot and not are_fitted:
+    if servos is None or (servos.lerobot and not are_fitted):
+        return []
+    return other_zeros(robot, servos, "" if are_fitted else NEW_OFFSETS)
+
+
+def other_zeros(robot: str, servos: ServoFile, condition: str) -> list[str]:
+    """Say that a calibrated robot has a servo file with other zeros, and in which case that is right."""
+    path = os.path.splitext(robot)[0] + SERVO_ENDING
+    if not os.path.exists(path):
         return []
     own = {servo.joint: servo for servo in read_servos(path).servos}
     others = [
@@ -72,7 +79,6 @@ def other_zeros_warning(robot: str, servos: ServoFile | None, are_fitted: bool) 
     ]
     if not others:
         return []
-    condition = "" if are_fitted else ", unless the offsets in the servos have changed"
     return [
         f"the zeros are not those of this calibration, which are in {path} (counts: {', '.join(others)}); "
         f"state --servos {path}{condition}"

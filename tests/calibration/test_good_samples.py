@@ -545,3 +545,8 @@ def test_a_measurement_of_which_no_sample_was_drawn_has_no_blocks():
     y = rng.normal(size=(5, 2))
     expected = np.sum((items[0][2] - np.einsum("au,ukm->akm", y, items[0][:2])) ** 2, 1)
     np.testing.assert_allclose(rows.residual_squares(y), expected)
+
+
+def test_repeated_rows_without_unknowns_count_once():
+    """Joint errors alone leave no unknown of the geometry."""
+    assert good_samples.independent_rows([np.empty((0, 3, 4))], np.array([0, 0, 1, 2])) == 9

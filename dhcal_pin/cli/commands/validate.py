@@ -11,7 +11,7 @@ from ...exceptions import InvalidArgumentError
 from ...formatting import format_quantity, list_first, texts_by_file
 from .. import options, screens
 from ..output_table import Makers, Output
-from ..servo_zeros import other_zeros_warning
+from ..servo_zeros import NEW_OFFSETS, other_zeros, other_zeros_warning
 
 if TYPE_CHECKING:
     from ...measurements import MeasuredRegion, Measurement, MountedRig
@@ -323,7 +323,7 @@ def _input_warnings(
         file.source: diagnostics.fitted_warning(file.data, digests.get(file.source, ""), fitted)
         for file in given.files
     }
-    are_fitted = any(warned.values())
+    are_fitted, are_off = any(warned.values()), False
     warnings = {args.servos: other_zeros_warning(args.robot, given.servos, are_fitted)} if args.servos else {}
     for file in given.files:
         unreachable = [] if args.fit_frames else diagnostics.find_unreachable_rows(judged.chain, file)
@@ -340,11 +340,16 @@ def _input_warnings(
         warnings[args.robot] = [f"the tool of {sidecar} is that of the tip {tip}: run again with --tip {tip}"]
     elif not args.fit_frames and diagnostics.frames_differ(judged.chain, given.data, judged.known):
         warning = diagnostics.ISO_FRAMES_WARNING if args.iso9283 else diagnostics.FRAMES_WARNING
-        warnings[args.robot] = [warning]
+        warnings[args.robot], are_off = [warning], True
     elif args.fit_frames and args.iso9283:
         warnings[args.robot] = [diagnostics.ISO_FITTED_WARNING]
-    elif sidecar and not args.fit_frames and not any(warnings.values()):
-        warnings[args.robot] = _excess_warnings(given, io.read_uncertainty(sidecar, given.chain))
+    elif sidecar and not args.fit_frames:
+        excess = _excess_warnings(given, io.read_uncertainty(sidecar, given.chain))
+        are_off = bool(excess)
+        if not any(warnings.values()):
+            warnings[args.robot] = excess
+    if are_off and given.servos and not warnings[args.servos]:
+        warnings[args.servos] = other_zeros(args.robot, given.servos, NEW_OFFSETS)
     return warnings
 
 
