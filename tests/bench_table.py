@@ -98,7 +98,7 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
 
 
 def start_up(repeats: int) -> list[Row]:
-    """`dhcal calibrate` on 1,000 rows against importing what it stands on."""
+    """`dhcal calibrate` on 1,000 rows against the import of libraries for arrays, arms and linear algebra."""
     chain, sets = robots()["UR10, minimal,base,tool"]
     _, _, data = measured(chain, sets, 1000)
     with tempfile.TemporaryDirectory() as name:
@@ -126,7 +126,7 @@ def start_up(repeats: int) -> list[Row]:
                     - before.children_system
                 )
     ours, theirs = (float(np.median(times[key])) for key in ("ours", "theirs"))
-    what = "`dhcal calibrate` on 1,000 rows as a multiple of its imports"
+    what = "`dhcal calibrate` on 1,000 rows as a multiple of importing pinocchio, numpy and scipy.linalg"
     return [Row(what, ours, theirs, ours / theirs, "≤ 1.8")]
 
 
