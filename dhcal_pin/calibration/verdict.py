@@ -618,14 +618,15 @@ def _file_of_outliers(source: str, n_outliers: int, count: int) -> str:
 
 def _contradicting_files(fit: Evidence) -> list[str]:
     """Name the measurements beside images that an arm of their own fits far better than the arm of all."""
-    texts = []
+    # Points that nothing touches are instruments, too.
+    texts, instruments = [], fit.problem.instruments(fit.x)
     for item, comparison in zip(fit.inlier_problem.data, fit.file_comparisons, strict=True):
         if item.rig is not None or not comparison.after.groups:
             continue
         name, after = next(iter(comparison.after.groups.items()))
         if after.rms <= MIN_CONTRADICTION * comparison.before.groups[name].rms:
             continue
-        if item.has_stated_sigma and np.mean(residual_of(item, fit.chain, fit.instruments) ** 2) <= 1:
+        if item.has_stated_sigma and np.mean(residual_of(item, fit.chain, instruments) ** 2) <= 1:
             continue  # The stated noise explains the residuals.
         ratio = own_fit_ratio(fit.inlier_problem, fit.solution.x, item)
         if ratio < MIN_RATIO:

@@ -187,7 +187,9 @@ class PointDistance(PointMeasurement):
 
 
 def require_touched_points(data: Sequence[Measurement], known: Container[str] = ()) -> None:
-    """Raise an error if a distance is between points that no measurement touches."""
+    """Raise an error if a distance beside other measurements is between points that none of them touches."""
+    if all(isinstance(item, PointDistance) for item in data):
+        return
     touched = sorted({name for item in data if isinstance(item, PointContact) for name in item.names})
     choice = f"choose from {', '.join(touched)}" if touched else "expected measurements of kind point"
     for item in data:

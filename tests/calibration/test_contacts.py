@@ -262,3 +262,10 @@ def test_known_distances_are_not_held_out(right):
     assert held_out.title == "cross-validated"
     assert "length" not in held_out.after.groups
     assert any(item.kind == "point_distance" for item in right.data)
+
+
+def test_two_files_of_distances_alone_have_a_verdict(sim_6dof):
+    """Nothing touches their points."""
+    data = [PointDistance(6, [("p1", "p2"), ("p2", "p3")], lengths) for lengths in ([0.2, 0.3], [0.25, 0.35])]
+    fit = calibrate(sim_6dof, [item.replace(has_stated_sigma=True) for item in data])
+    assert fit.verdict.status != "ok"
