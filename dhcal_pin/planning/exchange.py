@@ -46,7 +46,7 @@ def compute_sqrt_covariance(prior_factor: Array, rows: Array) -> Array:
     """Compute a square root of the covariance, R⁻¹ (p, p), after measurements with rows (n, k, p)."""
     p = prior_factor.shape[1]
     r = np.linalg.qr(np.concatenate([prior_factor, rows.reshape(-1, p)]), mode="r")
-    return invert_triangular(r)
+    return invert_triangular(np.asarray(r))
 
 
 @frozen(eq=False)

@@ -40,6 +40,7 @@ def test_a_nominal_robot_that_is_kept_has_no_figures_of_the_urdf_alone(sim_6dof,
     data = Pose.simulate(sim_6dof_actual, rng.uniform(-3, 3, (60, 6)), Noise(1e-4, 1e-4), rng)
     fit = calibrate(sim_6dof, data, "minimal,base,tool,harmonics", extend="none", holdout="region")
     assert fit.bare
+    assert fit.region_comparison
     assert fit.region_comparison.after_alone
     kept = replace(fit, decision=Verdict("caution", keeps_nominal=True)).accepted
     assert kept.is_kept_nominal
