@@ -98,7 +98,7 @@ def against_pybotics(m: int, repeats: int) -> list[Row]:
 
 
 def start_up(repeats: int) -> list[Row]:
-    """`dhcal calibrate` on 1,000 rows against the import of libraries for arrays, arms and linear algebra."""
+    """`dhcal calibrate` on 1,000 rows against importing pinocchio, numpy and scipy.linalg."""
     chain, sets = robots()["UR10, minimal,base,tool"]
     _, _, data = measured(chain, sets, 1000)
     with tempfile.TemporaryDirectory() as name:

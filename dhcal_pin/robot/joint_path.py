@@ -6,8 +6,7 @@ and slopes s_i = (q_{i+1} - q_i) / h_i, solve a tridiagonal system:
     h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i M_{i+1} = 6 (s_i - s_{i-1})
 
 The third derivative is continuous at the second and the last but one time ("not-a-knot"). `scipy.interpolate`
-has the same spline, but its import takes longer than most calibrations, and that of `scipy.linalg` as long as
-many.
+has the same spline, and `scipy.linalg` solves such systems. Their imports take as long as many calibrations.
 """
 
 from __future__ import annotations

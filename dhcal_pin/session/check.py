@@ -226,8 +226,10 @@ def recheck(
     elif (least := _calibration_noise(uncertainty, data)) is not None:
         # The errors that the model of the arm lacks are in these measurements, too.
         data = [_with_least_noise(item, least) if item.has_stated_sigma else item for item in data]
-    model = _CheckModel(chain, tuple(data), uncertainty, known or {}, payloads)
-    if not model.parts or model.position_rms()[1] > LARGEST_CHANGE:
+    # A calibration whose noise is not known does not know its uncertainty either.
+    is_known = uncertainty is None or bool(np.isfinite(uncertainty.sqrt_covariance).all())
+    model = _CheckModel(chain, tuple(data), uncertainty if is_known else None, known or {}, payloads)
+    if not is_known or not model.parts or model.position_rms()[1] > LARGEST_CHANGE:
         return _without_answer(model)
     return _answer(model, *model.judged(), size)
 

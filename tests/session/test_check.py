@@ -57,7 +57,7 @@ def changes_of(model, base: Any = 0.0, tool: Any = 0.0, zeros: Any = 0.0):
     return out
 
 
-def test_a_calibration_with_one_pose_shows_no_change_and_one_with_more_does():
+def test_a_check_needs_a_calibration_that_determines_base_and_tool():
     """The advice is followed."""
     rng, noise = np.random.default_rng(0), Noise(2e-3, 3e-3)
     checked = Pose.simulate(ARM, rng.uniform(-2, 2, (8, 6)), noise, rng)
@@ -71,6 +71,22 @@ def test_a_calibration_with_one_pose_shows_no_change_and_one_with_more_does():
     assert "calibrate with more poses" in few.reasons[0]
     assert few.expected_rms > 10 * many.expected_rms
     assert many.verdict == "ok"
+
+
+@pytest.mark.parametrize("kind", [Pose, Position])
+def test_a_calibration_without_known_noise_answers_no_check(kind):
+    rng = np.random.default_rng(0)
+    data, checked = (
+        kind.simulate(ARM, rng.uniform(-2, 2, (count, 6)), Noise(1e-4, 1e-4), rng) for count in (1, 8)
+    )
+    fit = calibrate(nominal_arm("ur10"), data.replace(has_stated_sigma=False), extend="none", session="off")
+    assert np.isnan(fit.uncertainty.sqrt_covariance).any()
+    assert recheck(fit.chain, [checked], fit.uncertainty).verdict == "cannot say"
+
+
+def test_noise_that_hides_all_changes_answers_no_check():
+    found = recheck(ARM, [positions(Q[:4], 0.05)])
+    assert (found.verdict, found.hypotheses) == ("cannot say", ())
 
 
 def test_rows_after_changes_are_the_residuals_of_the_changed_robot():
