@@ -112,6 +112,9 @@ class Evidence(FittedModel):
     with_full_set: Callable[[], Evidence] | None = None
     #: Function that calibrates as a hand-built arm; None if this calibration did, or with chosen parameters.
     with_low_cost: Callable[[], Evidence] | None = None
+    #: Function that calibrates some of the samples of `data` by the same options, with what is known of all:
+    #: changes during the session, signs of the joints and mistakes in the measurements.
+    with_part: Callable[[Sequence[Measurement]], Evidence] | None = None
     has_default_sets: bool = False  #: Whether the parameter sets are the default ones of the robot
     #: Joints that turn the other way than in the URDF, and signs that are open; None if the signs are those
     #: of the URDF.

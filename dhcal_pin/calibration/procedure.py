@@ -61,6 +61,7 @@ from ..measurements.base import Measurement, known_conditions
 from ..measurements.camera import with_shown_entries
 from ..measurements.contact import require_touched_points
 from ..parallel import SERIAL, TaskExecutor, one_blas_thread
+from ..plausibility.diagnosis import Diagnosis
 from ..plausibility.displacement import workspace_radius
 from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import HAND_BUILT, usual_errors
@@ -171,25 +172,36 @@ def calibrate(
     options = _Options(
         parameters, method, priors, fix, free, known, loss, extend, bounds, max_iterations, session, executor
     )
-    recalibrate = partial(calibrate, chain, **vars(options))
     if isinstance(holdout, str) and holdout == "region":
-        result = recalibrate(data, turned=turned, progress=progress)
-        again = partial(recalibrate, turned=result.signs.turned if result.signs else turned)
-        return replace(result, region_comparison=leave_regions_out(result, again, progress))
+        result = _calibrate(chain, as_measurements(data), (), options, turned, progress)
+        return with_left_out_regions(result, progress)
     data, holdout = as_measurements(data), as_measurements(holdout, "holdout")
+    return _calibrate(chain, data, holdout, options, turned, progress)
+
+
+def with_left_out_regions(result: Result, progress: Progress | None) -> Result:
+    """Return a calibration with its accuracy in regions that are left out of further calibrations."""
+    assert result.with_part is not None
+    return replace(result, region_comparison=leave_regions_out(result, result.with_part, progress))
+
+
+def _calibrate(
+    chain: Chain,
+    data: tuple[Measurement, ...],
+    holdout: tuple[Measurement, ...],
+    options: _Options,
+    turned: str | Sequence[str],
+    progress: Progress | None,
+    diagnosis: Diagnosis | None = None,
+) -> Result:
+    """Identify the errors of a robot, with a diagnosis of mistakes in the measurements if it is known."""
     _check_options(options, data)
+    method, loss, max_iterations = options.method, options.loss, options.max_iterations
     for item in (*data, *holdout):
         chain.validated_q(item.configurations())
-    require_touched_points((*data, *holdout), known or {})
-    again = partial(recalibrate, data, holdout=holdout, turned=turned)
+    require_touched_points((*data, *holdout), options.known or {})
     setup = _set_up(_at_measured_temperature(chain, data), data, holdout, turned, options, progress)
-    settings: dict[str, Any] = {
-        "with_auto": None if method == "lm" and loss == "auto" else partial(again, method="lm", loss="auto"),
-        "has_default_sets": parameters is None,
-        "signs": setup.signs,
-    }
-    if parameters is None and method == "lm" and not setup.signs and not has_images(setup.data):
-        settings["with_low_cost"] = partial(again, parameters=HAND_BUILT)
+    is_ordered = options.session == "auto"
     begun = _begin(setup)
     # The confirmation of changes and the calibration itself often need the same fits.
     groups_of = partial(_prior_groups, priors=setup.priors)
@@ -216,20 +228,17 @@ def calibrate(
             ),
             usual_errors(setup.chain, setup.data),
         )
-        begun = fit_session(begun.fit, setup.data, setup.holdout, models, session == "auto", progress)
+        begun = fit_session(begun.fit, setup.data, setup.holdout, models, is_ordered, progress)
+    if diagnosis:
+        begun = replace(begun, diagnosis=diagnosis)
     groups = groups_of(begun.fit)
-    if _suggests_full_set(setup):
-        # If nothing happened during the measurement, the search for it is not repeated.
-        has_changes = begun.session is not None and not begun.session.changes.is_empty
-        search = session if has_changes else "off"
-        settings["with_full_set"] = partial(again, session=search, **_full_set(setup))
     if method != "lm":
         result = make_result(begun.fit, 1.0, begun.holdout, method)
     elif has_images(setup.data) and setup.priors != "none":
         result = _calibrate_images(setup, begun, groups)
     else:
         stages = robust.LOSSES[loss].stages
-        if session == "auto" and setup.finds_session and BACKLASH in setup.families:
+        if is_ordered and setup.finds_session and BACKLASH in setup.families:
             begun = with_directions(begun, lambda fit: supported(fit, stages, setup.families))
         found = begun.session
         fitted = replace(begun, fit=reweighted(begun.fit, stages))
@@ -239,10 +248,52 @@ def calibrate(
         is_examined = setup.finds_session and not (found and found.scales)
         scale = find_scale(result.problem, result.x) if is_examined else None
         if scale and not result.diagnosis.zero:
-            found = found or Session(order_samples(setup.data, setup.holdout), setup.chain, session == "auto")
+            found = found or Session(order_samples(setup.data, setup.holdout), setup.chain, is_ordered)
             found = replace(found, scales=(scale,))
         result = replace(result, session=found)
-    return replace(result, **settings)
+    result = replace(
+        result,
+        signs=setup.signs,
+        has_default_sets=options.parameters is None,
+        with_part=partial(_calibrate_part, chain, setup, turned, result.earlier_diagnosis),
+    )
+    again = partial(_calibrate, chain, data, holdout, turned=turned, progress=None)
+    return replace(result, **_other_calibrations(setup, begun, result, again))
+
+
+def _calibrate_part(
+    chain: Chain,
+    setup: _Setup,
+    turned: str | Sequence[str],
+    diagnosis: Diagnosis | None,
+    data: Sequence[Measurement],
+) -> Result:
+    """Calibrate some samples of a result, with what is known of all: changes, signs and mistakes."""
+    # The samples of a result contain the changes during the session.
+    options = replace(setup.options, session="off")
+    turned = setup.signs.turned if setup.signs else turned
+    return _calibrate(chain, tuple(data), (), options, turned, None, diagnosis)
+
+
+def _other_calibrations(
+    setup: _Setup, begun: SessionFit, result: Result, recalibrate: Callable[..., Result]
+) -> dict[str, Callable[[], Result]]:
+    """Return calibrations of the same samples with other options, which are made when they are needed."""
+    options, others = setup.options, {}
+    is_lm = options.method == "lm"
+    if options.parameters is None and is_lm and not setup.signs and not has_images(setup.data):
+        others["with_low_cost"] = partial(recalibrate, options=replace(options, parameters=HAND_BUILT))
+    if setup.signs:
+        recalibrate = partial(recalibrate, turned=setup.signs.turned)
+    if not (is_lm and options.loss == "auto"):
+        auto, known = replace(options, method="lm", loss="auto"), result.earlier_diagnosis
+        others["with_auto"] = partial(recalibrate, options=auto, diagnosis=known)
+    if _suggests_full_set(setup):
+        # If nothing happened during the measurement, the search for it is not repeated.
+        has_changes = begun.session is not None and not begun.session.changes.is_empty
+        full = replace(options, session=options.session if has_changes else "off", **_full_set(setup))
+        others["with_full_set"] = partial(recalibrate, options=full)
+    return others
 
 
 @frozen

@@ -27,7 +27,6 @@ from .._frozen import frozen
 from .._typing import PathLike, Progress
 from ..calibration import model_selection, partition, procedure
 from ..calibration.cameras import MIXED_SETS, default_sets, describe_configurations, has_images
-from ..calibration.cross_validation import leave_regions_out
 from ..calibration.evidence import diagnose
 from ..calibration.presentation.curves import find_lattices
 from ..calibration.result import Result
@@ -435,15 +434,7 @@ def _calibrate(
     except NotObservableError as error:
         raise NotObservableError(f"{error}{_held_out_images(data)}") from None
     if job.holdout == REGION:
-        without_holdout: dict[str, Any] = {**settings, "holdout": ()}
-        if fit.signs:
-            without_holdout["turned"] = fit.signs.turned
-        regions = leave_regions_out(
-            fit,
-            lambda part: procedure.calibrate(chain, part, job.parameters, **without_holdout),
-            progress,
-        )
-        fit = replace(fit, region_comparison=regions)
+        fit = procedure.with_left_out_regions(fit, progress)
     fit = replace(fit, earlier_diagnosis=diagnose(fit, progress))
     if progress:
         progress("accuracy and verdict", 1, 1)

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
-from robots import nominal_arm, random_joints, random_table
+from robots import nominal_arm, random_joints, random_table, with_random_frames, with_small_errors
 from slow_cases import some_slow
 
-from dhcal_pin.calibration import calibrate
+from dhcal_pin import se3
+from dhcal_pin.calibration import Accuracy, blocked_folds, calibrate, evidence
+from dhcal_pin.calibration.evaluation import compute_errors
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.exceptions import DhcalError
 from dhcal_pin.measurements import Noise, PointContact, PointDistance, Pose, Position
+from dhcal_pin.measurements.base import concatenate
+from dhcal_pin.plausibility import diagnose_mixups
 from dhcal_pin.robot import Chain, DHTable
 
 NONE = np.empty(0)
@@ -172,3 +176,35 @@ def test_missing_priors_are_named_where_they_are_needed(options):
     assert (
         calibrate(chain, data, "minimal,base,tool", **options | {"priors": "default"}).verdict.status == "ok"
     )
+
+
+@pytest.mark.parametrize("step", [0.01, pytest.param(0.0, marks=pytest.mark.slow)])
+def test_left_out_regions_keep_the_mistakes_and_changes_that_all_samples_show(step, monkeypatch):
+    """Calibrations that look for both again, in the samples of the result, give the same accuracy."""
+    arm, rng = nominal_arm("ur10"), np.random.default_rng(5)
+    truth, other = (with_random_frames(with_small_errors(arm, rng), rng) for _ in range(2))
+    moved = truth.with_base_and_tool(se3.transform(np.eye(3), [0.0, step, 0.0]) @ truth.base, truth.tool)
+    # Samples of another robot between those of the first one ask for mistakes in the measurements.
+    parts = ((truth, 30), (moved, 30)) if step else ((truth, 60), (other, 20))
+    data = concatenate(
+        [Pose.simulate(robot, rng.uniform(-1.5, 1.5, (m, 6)), Noise(1e-4, 2e-4), rng) for robot, m in parts]
+    )
+    count = len(data.rows)
+    data = data.replace(rows=np.arange(count) if step else rng.permutation(count))
+    diagnosed = []
+    monkeypatch.setattr(
+        evidence, "diagnose_mixups", lambda *args: diagnosed.append(args) or diagnose_mixups(*args)
+    )
+    fit = calibrate(arm, data, "minimal,base,tool", holdout="region")
+    assert len(diagnosed) <= 1
+    assert fit.session is not None
+    assert fit.session.changes.base.is_identity is not (step > 0)
+    assert fit.n_outliers == count - 60
+    (fitted,), (is_counted,) = fit.data, fit.is_counted
+    errors = []
+    for (mask,) in blocked_folds(fitted):
+        part = calibrate(arm, fitted.take(~mask), "minimal,base,tool")
+        errors += compute_errors(part.chain, [fitted.take(mask & is_counted)], {})
+    assert len(diagnosed) > 5
+    after, expected = fit.comparisons[0].after, Accuracy.from_errors(errors)
+    assert after["position_rms_m"] == pytest.approx(expected["position_rms_m"], rel=1e-9)
