@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import plausibility
+from .. import plausibility, se3
 from .._frozen import frozen
 from .._typing import Array, Progress
 from ..estimation.contacts import contact_bias
@@ -66,6 +66,8 @@ N_FOLDS = 5
 MAX_LEAVE_ONE_OUT = 10
 # Configurations of the measured region at which errors are predicted.
 N_PREDICTED = 300
+# Distance of other points of the tool from the measured one [m], a usual size of tools.
+BESIDE = 0.1
 # Of more configurations, each counts as one sample.
 MAX_EXAMINED = 1000
 # Held-out samples beside deviating lines belong to them if their errors exceed the largest one of the fitted
@@ -464,17 +466,33 @@ class Evidence(FittedModel):
         The configurations are within the measured ranges of the joints. It contains the bias of contacts, see
         `estimation.contacts`. NaN if the errors of the arm are not estimated.
         """
+        return self._predicted_position_std((0.0, 0.0, 0.0))
+
+    @cached_property
+    def position_std_beside(self) -> float:
+        """The same at `BESIDE` from the measured point, the largest along the axes of the tool."""
+        return max(self._predicted_position_std(offset) for offset in BESIDE * np.eye(3))
+
+    def _predicted_position_std(self, offset: Sequence[float] | Array) -> float:
+        """Predict the RMS position error of a point of the tool at an offset from the measured one [m]."""
         if not self.errors.has_arm:
             return float("nan")
+        parts = [self._complete_uncertainty]
+        if any(item.is_contact for item in self.data):
+            parts.append(self._contact_bias)
+        chain = parts[0].chain
+        chain = chain.with_base_and_tool(chain.base, chain.tool @ se3.transform(np.eye(3), offset))
+        q = self._predicted_configurations
+        return float(np.linalg.norm([best_frames_std(replace(part, chain=chain), q) for part in parts]))
+
+    @cached_property
+    def _predicted_configurations(self) -> Array:
+        """Configurations in the measured region at which errors are predicted, (m, n)."""
         q, _ = self._different_configurations
         if (region := self.measured_region) is not None:
             # The errors of joints grow beyond their measured ranges, whatever is measured.
             q = np.clip(region.draw(np.random.default_rng(0), N_PREDICTED), region.lower, region.upper)
-        q = q[:: -(-len(q) // N_PREDICTED) or 1]
-        parts = [self._complete_uncertainty]
-        if any(item.is_contact for item in self.data):
-            parts.append(self._contact_bias)
-        return float(np.linalg.norm([best_frames_std(part, q) for part in parts]))
+        return q[:: -(-len(q) // N_PREDICTED) or 1]
 
     @property
     def _contact_bias(self) -> Uncertainty:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,18 +16,20 @@ from .._frozen import frozen
 from .._typing import Array
 from ..estimation.parameters import fold_harmonics
 from ..estimation.qr import TriangularSystem
-from ..formatting import SMALL_UNITS, Quantity, Table, format_count
+from ..formatting import SMALL_UNITS, Quantity, Table, format_count, format_quantity
 from ..identifiability import label_unobservable
 from ..measurements.groups import ERROR_GROUPS
 from .cross_validation import Generalization
 from .estimates import Estimate
 from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
-
-if TYPE_CHECKING:
-    from .evidence import Evidence
+from .evidence import BESIDE, Evidence
 
 # Smaller shares of the joint space are shown as "under 1 %", and larger ones than the rest as "over 99 %".
 MIN_SHOWN_SHARE = 0.01
+# Errors beside the measured point of a tool are stated if they are larger than those at it by this factor.
+MIN_BESIDE_RATIO = 2.0
+# Smaller distances from the axis of the last joint are the reason for them, and those of a point on it [m].
+MAX_ON_AXIS, MIN_OFF_AXIS = 0.05, 1e-3
 
 # Option that excludes outliers, by the method of the calibration that kept them.
 AUTO_OPTIONS = {"lm": "--loss auto", "gn": "--method lm"}
@@ -113,6 +114,37 @@ def position_error_notes(fit: Evidence) -> list[str]:
         return []
     size = Quantity.error(error, "m")
     return [f"Tool in the measured region: position error of about {size} with the best base and tool."]
+
+
+def position_error_beside(fit: Evidence) -> float | None:
+    """Return the predicted error [m] beside the measured point of a tool if it is far larger, else None."""
+    groups = fit.comparisons[0].after.groups.values()
+    errors = [group.rms for group in groups if group.unit == "m"]
+    is_point = bool(errors) and len(errors) == len(groups) and fit.has_joint_values
+    if not (is_point and fit.errors.has_arm and fit.shrinkage_factor):
+        return None
+    beside = fit.position_std_beside
+    return beside if beside > MIN_BESIDE_RATIO * max(fit.position_std, *errors) else None
+
+
+def beside_notes(fit: Evidence) -> list[str]:
+    """Return sentences on the error beside the measured point of a tool, and what to measure."""
+    error = position_error_beside(fit)
+    if error is None:
+        return []
+    size = f"about {format_quantity(error, 'm', 0.1 * error)}" if np.isfinite(error) else "not known"
+    distance = f"{1e3 * BESIDE:.0f} mm"
+    text = f"{distance} beside the measured point of the tool, the expected error is {size}."
+    chain = fit.chain
+    last = chain.joint_jacobian(chain.forward_kinematics(np.zeros((1, chain.n_joints))))[-1, :, 0]
+    off_axis, turn = np.linalg.norm(last[:3]), np.linalg.norm(last[3:])
+    if off_axis >= MAX_ON_AXIS * turn:
+        return [f"{text} Measure the orientation of the tool, too, or several points of it."]
+    place = f"{1e3 * off_axis / turn:.0f} mm from" if off_axis >= MIN_OFF_AXIS * turn else "on"
+    return [
+        f"{text} The point is {place} the axis of {chain.joint_names[-1]} and hardly shows the direction of "
+        f"this axis. Measure a point at least {distance} from the axis."
+    ]
 
 
 def largest_corrections(estimates: Sequence[Estimate], x: Array, system: TriangularSystem) -> list[Estimate]:

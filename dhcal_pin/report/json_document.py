@@ -16,7 +16,7 @@ from ..calibration.cross_validation import Generalization
 from ..calibration.evaluation import Accuracy, Comparison
 from ..calibration.presentation.budget import UncertaintyBudget
 from ..calibration.result import Result
-from ..calibration.summary import position_error_of_images
+from ..calibration.summary import position_error_beside, position_error_of_images
 from ..calibration.verdict import Verdict
 from ..measurements.base import Measurement
 from ..session import Session
@@ -85,6 +85,7 @@ def result_to_dict(
         "hand_eye": fit.hand_eye.to_dict() if fit.hand_eye else None,
         "hand_eye_std_m": fit.hand_eye_std,
         "position_error_of_images_m": position_error_of_images(fit),
+        "position_error_beside_m": position_error_beside(fit),
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "rounding_notes": fit.rounding_notes,
