@@ -506,7 +506,9 @@ def write_targets(poses):
 
 
 def joint_values(chain, unit="rad"):
-    return np.array([[float(row[f"{name}[{unit}]"]) for name in chain.joint_names] for row in rows()])
+    return np.array(
+        [[float(row[f"{name}[{unit}]"] or "nan") for name in chain.joint_names] for row in rows()]
+    )
 
 
 def test_targets_are_poses_of_the_tip_in_the_base_frame(place, run):
@@ -518,7 +520,7 @@ def test_targets_are_poses_of_the_tip_in_the_base_frame(place, run):
     said = stderr_of(run(*BASE))
     assert "targets: the tip tool0 in the root link world" in said
     assert "12 of 12 ok" in said
-    assert "--frame" not in said
+    assert "add --frame" not in said
     q = joint_values(nominal)
     np.testing.assert_allclose(arm.poses(q), targets, atol=1e-9)
     sent = np.array([[float(row[f"{axis}[mm]"]) for axis in "xyz"] for row in rows()]) / 1e3
@@ -526,6 +528,37 @@ def test_targets_are_poses_of_the_tip_in_the_base_frame(place, run):
     # The corrections are those of errors of a few millimetres and degrees.
     assert 1e-3 < np.linalg.norm(sent - targets[:, :3, 3], axis=1).min()
     assert np.linalg.norm(sent - targets[:, :3, 3], axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("estimated", ["base and the tool", "base", "tool", ""])
+def test_errors_that_unknown_frames_leave_are_stated(estimated, tmp_path, monkeypatch, run):
+    """Targets in the root link are missed where base or tool were estimated, others are not."""
+    monkeypatch.chdir(tmp_path)
+    rng, nominal = np.random.default_rng(7), ROBOTS["ur5"]()
+    Path("ur5.urdf").write_bytes(nominal.urdf.data)
+    names = [name for name in ("base", "tool") if name in estimated]
+    base, tool = (
+        se3.exp6(0.2 * rng.normal(size=6)) if name in names else np.eye(4) for name in ("base", "tool")
+    )
+    errors = select_parameters(nominal, "placement")
+    size = np.array([1e-3 if p.unit == "m" else 3e-3 for p in errors.parameters])
+    true = errors.at(size * rng.normal(size=len(size))).with_base_and_tool(base, tool)
+    data = Pose.simulate(true, draw(nominal, 100, rng), Noise(2e-5, 2e-5), rng)
+    write_urdf(calibrate(nominal, data, ["placement", *names], extend="none").chain, "true.urdf")
+    missed = {}
+    for frame, arm in (("base", true.with_base_and_tool(np.eye(4), np.eye(4))), ("measuring", true)):
+        targets = arm.poses(0.8 * draw(nominal, 20, rng))
+        write_targets(targets)
+        said = " ".join(stderr_of(run(*BASE, "--frame", frame, "--verbose")).split())
+        assert ("larger than it states" in said) == bool(names and frame == "base")
+        assert (f"estimated the {estimated}, and does not show" in said) == bool(names and frame == "base")
+        is_reached = [row["status"] != "out of reach" for row in rows()]
+        assert sum(is_reached) >= 18
+        q = joint_values(nominal)[is_reached]
+        distances = np.linalg.norm(arm.poses(q)[:, :3, 3] - targets[is_reached, :3, 3], axis=1)
+        missed[frame] = np.sqrt(np.mean(distances**2))
+    assert missed["measuring"] < 5e-5
+    assert (missed["base"] > 20 * missed["measuring"]) == bool(names)
 
 
 @pytest.mark.parametrize(("name", "root"), [("ur5", "world"), ("sim_6dof", "base_link")])

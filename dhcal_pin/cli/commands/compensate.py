@@ -69,7 +69,8 @@ def run(args: Namespace) -> int:
         "json": Output(),
     }
     checked_files(args, table, inputs)
-    nominal, calibrated = read_robots(args)
+    chains = read_robots(args)
+    nominal, calibrated = in_frame_of_targets(args, *chains)
     targets = io.read_targets(args.targets, calibrated)
     with screens.progress_bar("compensating", len(targets.values)) as progress:
         result = compensate(nominal, calibrated, targets.values, targets.near, progress, targets.conditions)
@@ -77,7 +78,13 @@ def run(args: Namespace) -> int:
     for path in args.export:
         contents[path] = program_text(_program(result, nominal), path)
     frame = f"the root link {nominal.root}" if args.frame == BASE else "the measuring frame"
-    notes = [f"{targets.source}: {text}" for text in _unstated_conditions(args, calibrated, targets)]
+    notes = [
+        f"{targets.source}: {text}"
+        for text in (
+            *([] if args.frame == MEASURING else _frame_notes(*chains)),
+            *_unstated_conditions(args, calibrated, targets),
+        )
+    ]
     warning = robots_warning(args.nominal, args.calibrated, nominal, calibrated)
     warnings = {args.nominal: [warning]} if warning else {}
     write_with_json(
@@ -105,14 +112,7 @@ def run(args: Namespace) -> int:
 
 
 def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
-    """Read both robots, with the base and the tool that the targets refer to."""
-    from dataclasses import replace  # lazy import, as the following: they are slow to load
-
-    import numpy as np
-
-    from ... import se3
-    from ...compensation import nominal_root_pose
-
+    """Read both robots, which must have the same tip."""
     calibrated = read_robot_or_table(args.calibrated, args)
     nominal = read_robot_or_table(args.nominal, args, calibrated.tip)
     if nominal.tip != calibrated.tip and args.tip is None:
@@ -120,6 +120,45 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
             f"{args.calibrated}: its tip is {calibrated.tip!r}; expected {nominal.tip!r}, the tip of "
             f"{args.nominal}"
         )
+    return nominal, calibrated
+
+
+def _frame_notes(nominal: robot.Chain, calibrated: robot.Chain) -> list[str]:
+    """Say which errors of poses of the tip in the root link a calibration with unknown frames leaves."""
+    import numpy as np  # lazy import, as the following: they are slow to load
+
+    from ...compensation import nominal_root_pose
+
+    estimated = {
+        "base": (calibrated.base @ nominal_root_pose(nominal, calibrated), nominal.base),
+        "tool": (calibrated.tool, nominal.tool),
+    }
+    hidden = {
+        "base": f"how the first axis lies in {nominal.root}",
+        "tool": f"how {nominal.tip} lies behind the last axis",
+    }
+    names = [name for name, poses in estimated.items() if not np.allclose(*poses, rtol=0, atol=1e-12)]
+    if not names:
+        return []
+    unknown = " and ".join(hidden[name] for name in names)
+    return [
+        f"the calibration estimated the {' and the '.join(names)}, and does not show {unknown}: the error at "
+        f"these targets can be larger than it states; targets of the measured point in the measuring frame "
+        "do not have this error: --frame measuring"
+    ]
+
+
+def in_frame_of_targets(
+    args: Namespace, nominal: robot.Chain, calibrated: robot.Chain
+) -> tuple[robot.Chain, robot.Chain]:
+    """Return both robots with the base and the tool that the targets refer to."""
+    from dataclasses import replace  # lazy import, as the following: they are slow to load
+
+    import numpy as np
+
+    from ... import se3
+    from ...compensation import nominal_root_pose
+
     chains = nominal, calibrated
     if args.frame == BASE:
         bases = np.eye(4), se3.inverse(nominal_root_pose(nominal, calibrated))
