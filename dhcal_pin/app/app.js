@@ -53,6 +53,7 @@ function showError(id, text) {
 const CONTROLS = {
   "--skip-bad-rows": "“Skip rows that lack a number, a name or a rotation”", "--tip": "“Tip link”", "--columns": "a column map among the files",
   "--rig": "a rig file among the files", "--robot": "a robot among the files", "--servos": "a servo file among the files", "--parameters": "“Errors to estimate”", "--holdout": "“Judge the accuracy on”", "--sheet": "“Sheet of Excel files”", "--force": "“Write the robot all the same”",
+  "--mend": "the applied change",
 };
 
 // A message of the command, in the words of the page.
@@ -88,7 +89,7 @@ function setRole(name, role) {
 }
 
 // The use of a file follows from its name and content, or is given.
-async function addFiles(added, role = null) {
+async function addFiles(added, role = null, isMade = false) {
   added = [...added];
   const total = [...files.values()].reduce((sum, { file }) => sum + file.size, 0);
   const size = added.reduce((sum, file) => sum + file.size, total);
@@ -103,7 +104,7 @@ async function addFiles(added, role = null) {
   showError("file-error", "");
   const roles = await Promise.all(added.map(file => role ?? roleOf(file)));
   added.forEach((file, i) => {
-    files.set(file.name, { file, role: "beside" });
+    files.set(file.name, { file, role: "beside", isMade });
     setRole(file.name, roles[i]);
   });
   filesChanged();
@@ -371,7 +372,7 @@ const short = value => value === null || value === undefined ? "" : String(Numbe
 function proposedMap(lines) {
   const text = element("textarea", { rows: 5, value: `${lines.join("\n")}\n`, spellcheck: false, id: "map-text" });
   const use = element("button", { type: "button" }, "Use this column map");
-  use.onclick = () => addFiles([new File([text.value], "columns.toml", { type: "text/plain" })]);
+  use.onclick = () => addFiles([new File([text.value], "columns.toml", { type: "text/plain" })], null, true);
   return [element("label", { htmlFor: "map-text" }, "Proposed column map. Check the units and the order of the joints."), text, use];
 }
 
@@ -491,7 +492,7 @@ function showResult({ result, status, screen, files: outputs }) {
   if (isRefused && rows.length) parts.push(element("details", {}, element("summary", {}, "Errors of the refused fit"), ...tables));
   else if (rows.length) parts.push(...tables, ...jointSpace(result));
   if (result.warnings.length) parts.push(element("div", { className: "card warning" }, element("h3", {}, "Warnings"), list(result.warnings.map(spoken))));
-  parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem)));
+  parts.push(element("h3", {}, "Files"), element("ul", { id: "downloads" }, ...outputs.map(downloadItem), ...madeItems()));
   parts.push(element("details", {}, element("summary", {}, "The same on the command line"),
     element("pre", { tabIndex: 0 }, `${result.command} -o ${outputName(outputs)}`), element("pre", { tabIndex: 0 }, screen)));
   $("result").replaceChildren(...parts);
@@ -530,11 +531,20 @@ function forceButton() {
 function downloadItem({ name, label, use, content }) {
   const bytes = Uint8Array.from(atob(content), char => char.charCodeAt(0));
   const type = name.endsWith(".html") ? "text/html" : "application/octet-stream";
-  const href = URL.createObjectURL(new Blob([bytes], { type }));
+  return fileItem(name, label, use, new Blob([bytes], { type }));
+}
+
+// Input files that only this page has.
+function madeItems() {
+  return [...files].filter(([, entry]) => entry.isMade).map(([name, { file }]) => fileItem(name, "Input", "made in this page; the command line below needs it", file));
+}
+
+function fileItem(name, label, use, blob) {
+  const href = URL.createObjectURL(blob);
   links.push(href);
   const out = element("li", {}, element("span", { className: "label" }, label, element("small", {}, use)),
     element("a", { href, download: name, ariaLabel: `Download ${name}` }, name));
-  if (type === "text/html") out.append(element("a", { href, target: "_blank", ariaLabel: `Open ${name} in a new tab` }, "Open"));
+  if (blob.type === "text/html") out.append(element("a", { href, target: "_blank", ariaLabel: `Open ${name} in a new tab` }, "Open"));
   return out;
 }
 
@@ -558,7 +568,7 @@ $("rig-save").onclick = async () => {
 };
 $("rig-use").onclick = async () => {
   showError("rig-error", "");
-  await addFiles([rigFile()], "rig");
+  await addFiles([rigFile()], "rig", true);
   $("rig-status").textContent = "rig.toml is among the files.";
 };
 writeRig();
@@ -568,7 +578,7 @@ $("example").onclick = async () => {
     const example = await (await fetch("example")).json();
     files.clear();
     $("tip").value = example.tip;
-    await addFiles(Object.entries(example.files).map(([name, text]) => new File([text], name)));
+    await addFiles(Object.entries(example.files).map(([name, text]) => new File([text], name)), null, true);
   } catch (error) {
     showError("file-error", failure(error));
   }

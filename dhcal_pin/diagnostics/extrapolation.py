@@ -65,18 +65,19 @@ class Extrapolation:
                 format_quantity(side.rms, side.unit, side.rms_std, small=True) for side in (inside, outside)
             ]
             out.append(f"RMS {ERROR_GROUPS[group].label}: {texts[0]} inside, {texts[1]} outside.")
-        exceeding = [
-            f"{name} by {1e3 * value:.0f} mm"
-            if self.is_prismatic[name]
-            else f"{name} by {np.rad2deg(value):.0f}°"
-            for name, value in self.max_excess.items()
-        ]
+        exceeding = [f"{name} by {self._describe_excess(name)}" for name in self.max_excess]
         if not exceeding:
             text = (
                 "No joint is beyond its measured range, but the combinations of joint values are new or rare."
             )
             return [*out, text]
         return [*out, f"Beyond the measured range: {list_first(exceeding, _MAX_JOINTS, 'joint')}."]
+
+    def _describe_excess(self, name: str) -> str:
+        """Return how far a joint is beyond its measured range, in mm or degrees."""
+        value, is_prismatic = self.max_excess[name], self.is_prismatic[name]
+        size, unit = (1e3 * value, " mm") if is_prismatic else (np.rad2deg(value), "°")
+        return f"{size:.0f}{unit}" if size >= 1 else f"under 1{unit}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for the JSON document."""

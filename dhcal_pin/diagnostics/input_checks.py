@@ -94,7 +94,7 @@ def fitted_warning(item: Measurement, digest: str, fitted: Fitted) -> list[str]:
         n_rows = len(item.rows)
         rows = f"row{'' if n_rows == 1 else 's'} {'was' if count == 1 else 'were'}"
         return [f"{count} of {n_rows} {rows} fitted {_FITTED_WARNING}"]
-    return [f"was fitted, all of it or a part, {_FITTED_WARNING}"] if digest in fitted.files else []
+    return [f"this file or a part of it was fitted {_FITTED_WARNING}"] if digest in fitted.files else []
 
 
 def find_unstated_conditions(

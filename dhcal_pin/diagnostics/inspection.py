@@ -109,7 +109,8 @@ def inspect_file(
         inspection = _inspect_table(_below_titles(table, chain), chain)
         if file_columns.needs_column_map(table, chain):
             lines = tuple(propose_map(table, chain))
-            return replace(inspection, problem=header_problem(table, chain), column_map=lines)
+            way = ", or use the column map below" if lines else ""
+            return replace(inspection, problem=f"{header_problem(table, chain)}{way}", column_map=lines)
         return replace(inspection, problem=str(error))
     inspection, notes = _inspect_table(table, chain), []
     warnings = [*find_input_warnings(chain, file), *find_payload_warnings(chain, file)]

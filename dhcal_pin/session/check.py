@@ -1077,7 +1077,9 @@ def _unchanged(model: _CheckModel, hypotheses: list[Hypothesis], size: float) ->
     moved = format_quantity(largest, "m", largest / 10)
     reasons = [f"Nothing changed that moves the measured point by more than {moved}."]
     if joints := model.hidden_joints:
-        reasons.append(f"Zeros of {', '.join(joints)} do not move it; measure a point off their axes.")
+        what, axes = ("The zero", "its axis") if len(joints) == 1 else ("Zeros", "their axes")
+        verb = "does" if len(joints) == 1 else "do"
+        reasons.append(f"{what} of {', '.join(joints)} {verb} not move it; measure a point off {axes}.")
     return "ok", reasons
 
 

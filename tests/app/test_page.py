@@ -262,6 +262,11 @@ def test_a_proposed_column_map_is_used(page, example):
     page.wait_for_selector("#result:not([hidden])")
     assert "Verdict: ok" in page.inner_text("#result")
     assert "--columns columns.toml" in page.text_content("#result pre")
+    # The command needs the map, which only the page has.
+    with page.expect_download() as download:
+        page.click("#downloads a[download='columns.toml']")
+    assert "A1" in download.value.path().read_text()
+    assert page.locator("#downloads a[download='tracker.csv']").count() == 0
 
 
 def test_a_sheet_of_an_excel_file_is_chosen(page, example, tmp_path):

@@ -201,7 +201,7 @@ def test_a_file_that_was_fitted_is_named(run, robot_folder):
     sidecar.write_text(re.sub(r"(?s)fitted_rows = (\W{3}).*?\1\n", "", sidecar.read_text()))
     assert "fitted_rows" not in sidecar.read_text()
     Path("other.csv").write_text(Path("data.csv").read_text() + "\n")
-    warned = "was fitted, all of it or a part, by the calibration"
+    warned = "this file or a part of it was fitted by the calibration"
     assert [len(fitted_warnings(run, name, warned)) for name in ("data.csv", "other.csv")] == [1, 0]
 
 
