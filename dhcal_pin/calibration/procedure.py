@@ -98,7 +98,6 @@ AUTO = robust.LOSSES["auto"].stages
 SessionOption = Literal["auto", "unordered", "off"]
 
 
-@one_blas_thread()
 def calibrate(
     chain: Chain,
     data: Measurement | Sequence[Measurement],
@@ -185,6 +184,7 @@ def with_left_out_regions(result: Result, progress: Progress | None) -> Result:
     return replace(result, region_comparison=leave_regions_out(result, result.with_part, progress))
 
 
+@one_blas_thread()
 def _calibrate(
     chain: Chain,
     data: tuple[Measurement, ...],

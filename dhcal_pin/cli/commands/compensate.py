@@ -143,7 +143,7 @@ def _frame_notes(nominal: robot.Chain, calibrated: robot.Chain) -> list[str]:
     unknown = " and ".join(hidden[name] for name in names)
     return [
         f"the calibration estimated the {' and the '.join(names)}, and does not show {unknown}: the error at "
-        f"these targets can be larger than it states; targets of the measured point in the measuring frame "
+        "these targets can be larger than it states; targets of the measured point in the measuring frame "
         "do not have this error: --frame measuring"
     ]
 
