@@ -33,7 +33,7 @@ from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_dig
 from ..measurements.base import Measurement, residual_of
 from ..measurements.camera import select_images
 from ..measurements.contact import PointContact
-from ..measurements.groups import ERROR_GROUPS
+from ..measurements.groups import ERROR_GROUPS, error_group
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
 from ..plausibility.diagnosis import Diagnosis, is_suspicious
@@ -769,10 +769,26 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
     max_ratio = MAX_HIDDEN_IMAGE_RATIO if _has_only_images(fit) else MAX_HIDDEN_RATIO
     if unknown is None and not std > max_ratio * shown:
         return []
-    statement, advice = unknown or _hidden_cause(fit)
+    statement, advice = unknown or _wrong_sigmas(fit, max_ratio) or _hidden_cause(fit)
     size = f"of about {format_quantity(std, 'm', 0.1 * std)}" if np.isfinite(std) else "of unknown size"
     text = f"{capitalized(statement)}: errors of positions {size} do not show in the residuals."
     return [Finding("caution", f"{text} {capitalized(advice)}.")]
+
+
+def _wrong_sigmas(fit: Evidence, max_ratio: float) -> tuple[str, str] | None:
+    """Name stated standard deviations as the reason if estimated ones do not hide the errors of positions."""
+    stated = {name: ratio for (_, is_stated, name), ratio in fit.noise_factors.items() if is_stated}
+    if fit.with_part is None or max(stated.values(), default=0.0) < MIN_SIGMA_RATIO:
+        return None
+    other = fit.with_part([item.replace(has_stated_sigma=False) for item in fit.data])
+    if other.position_std > max_ratio * _shown_position_error(other):
+        return None
+    name = max(stated, key=lambda name: stated[name])
+    errors = f"{ERROR_GROUPS[error_group(name)].label}s"
+    return (
+        f"the {errors} are {stated[name]:.0f} times as large as their stated standard deviations",
+        "leave the sigma columns out, or correct them",
+    )
 
 
 def _hidden_cause(fit: Evidence) -> tuple[str, str]:

@@ -10,7 +10,7 @@ import pytest
 from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
-from dhcal_pin import calibrate, read_robot
+from dhcal_pin import calibrate, read_robot, se3
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import (
     Inclination,
@@ -84,6 +84,28 @@ def true_error(simulation, fit):
     simulation.end_model, simulation.end_zeros = simulation.model, 0.0
     simulation.test_q = fit.measured_region.draw(np.random.default_rng(1), 200)
     return simulation.true_error(fit.chain)
+
+
+@pytest.mark.parametrize("seed", some_slow(range(8), {0}))
+def test_far_too_small_stated_deviations_of_rotations_are_named(seed):
+    """Following the advice reduces the true error, and the caution ends."""
+    simulation, noise = Simulation("ur10", 80, seed), np.deg2rad(0.1)
+    poses = np.array([(pose * simulation.tool).homogeneous for pose in simulation.poses(simulation.q)])
+    turns = simulation.rng.normal(0, noise, (80, 3))
+    poses[:, :3, :3] = poses[:, :3, :3] @ se3.exp3(turns)
+    poses[:, :3, 3] += simulation.rng.normal(0, NOISE, (80, 3))
+    fits = [
+        calibrate(simulation.chain, Pose(simulation.q, poses, *sigmas), extend="none", session="off")
+        for sigmas in ((NOISE, 0.01 * noise), (None, None), (NOISE, noise))
+    ]
+    (reason,) = fits[0].verdict.reasons
+    ratio = re.match(r"The orientation errors are (\d+) times as large as their stated standard dev", reason)
+    assert ratio
+    assert 70 < float(ratio[1]) < 140
+    assert reason.endswith("Leave the sigma columns out, or correct them.")
+    true = [true_error(simulation, fit) for fit in fits]
+    assert [fit.verdict.status for fit in fits] == ["caution", "ok", "ok"]
+    assert max(true[1:]) < true[0] / 3
 
 
 @pytest.mark.slow
