@@ -245,7 +245,7 @@ def _calibrate(
         with_families = partial(supported, begun.fit, stages, setup.families)
         result = _calibrate_samples(setup, fitted, groups, with_families)
         # The scale of one axis and a zero far off make the robot longer or shorter, too.
-        is_examined = setup.finds_session and not (found and found.scales)
+        is_examined = setup.finds_session and not (found and found.wrong_lengths)
         scale = find_scale(result.problem, result.x) if is_examined else None
         if scale and not result.diagnosis.zero:
             found = found or Session(order_samples(setup.data, setup.holdout), setup.chain, is_ordered)

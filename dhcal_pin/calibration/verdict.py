@@ -745,8 +745,8 @@ def _plausible_cause(fit: Evidence) -> str:
         return f"{zero.sentence} {zero.remedy}"
     if fit.input_warnings:
         return f"{fit.input_warnings[0]}."
-    if fit.session and fit.session.scales:
-        return fit.session.scales[0].finding
+    if fit.session and fit.session.wrong_lengths:
+        return fit.session.wrong_lengths[0].finding
     if fit.diagnosis.fits_separately:
         return "Each file fits this robot by itself: base or tool differ between the files."
     if _is_hand_built(fit):

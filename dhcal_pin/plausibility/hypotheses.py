@@ -36,7 +36,7 @@ from ..measurements.position import MultiTargetPosition, PointMeasurement, Posit
 from ..robot.chain import Chain
 from ..robot.inverse_kinematics import MAX_POSE_DIFFERENCE, reach_poses, tool_pose_and_jacobian
 from ..robot.joint_path import joint_path
-from ..session.facts import MAX_SCALE_CHANGE
+from ..session.facts import MAX_RANGE_ERROR, MAX_SCALE_CHANGE
 from ..units import ANGLES, LENGTHS
 
 QuaternionNotation = Literal["xyzw", "wxyz"]
@@ -57,6 +57,8 @@ N_PLACES = 6
 _MIN_MOTION = 1e-3
 # Largest lag that can be undone [rows or s].
 MAX_LAG = 100.0
+# Smaller distances from the origin are rounding [m].
+_MIN_DISTANCE = 1e-9
 # Share of touches from which on a shift of the rows renames the touched points: the others have wrong names.
 _MIN_RENAMED_SHARE = 0.75
 # Largest rotation vector [rad] of which a smaller unit can be undone: longer ones have lost whole turns.
@@ -184,6 +186,20 @@ class AxisScale:
         factors = np.ones(3)
         factors[self.axis] = 1 / self.factor
         return _with_positions(item, item.positions() * factors)
+
+
+@frozen
+class RangeChange:
+    """Constant error of measured distances from the origin of the measuring frame."""
+
+    error: float  # Measured less true distance [m]
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements with shorter distances."""
+        if not isinstance(item, Pose | Position | MultiTargetPosition):
+            return None
+        distances = np.maximum(np.linalg.norm(item.positions(), axis=1), _MIN_DISTANCE)
+        return _with_positions(item, item.positions() * (1 - self.error / distances)[:, None])
 
 
 @frozen
@@ -534,7 +550,8 @@ def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Meas
                 if first in by_key or _change_of_joint(chain, first):
                     return mend_files(chain, mend_files(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
-            kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), "ratio", "lag", "scale"])
+            sizes = "ratio", "lag", "scale", "range"
+            kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), *sizes])
             raise UnknownNameError(
                 f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}; kinds of changes are "
                 f"{', '.join(kinds)}"
@@ -565,22 +582,25 @@ def mend_lines(
 
 
 def _change_of_size(key: str) -> Change | None:
-    """Return the change `lag:TIME`, `scale:FACTOR` or `scale:AXIS:FACTOR`; None for other keys."""
-    found = re.fullmatch(r"(?:(lag)|scale(?::([xyz]))?):([-+0-9.e]+)", key)
-    if found is None:
+    """Return the change `lag:TIME`, `range:LENGTH`, `scale:FACTOR` or `scale:AXIS:FACTOR`, or None."""
+    found = re.fullmatch(r"(lag|range|scale)(?::([xyz]))?:([-+0-9.e]+)", key)
+    if found is None or (found[2] and found[1] != "scale"):
         return None
-    is_lag, axis, number = found.groups()
+    kind, axis, number = found.groups()
+    middle, limit, what = {
+        "lag": (0.0, MAX_LAG, "a time"),
+        "range": (0.0, MAX_RANGE_ERROR, "a length in m"),
+        "scale": (1.0, MAX_SCALE_CHANGE, "a factor"),
+    }[kind]
     with suppress(ValueError):
         value = float(number)
-        if is_lag and abs(value) <= MAX_LAG:
-            return LagChange(value)
-        if not is_lag and abs(value - 1) <= MAX_SCALE_CHANGE:
+        if abs(value - middle) <= limit:
+            if kind == "lag":
+                return LagChange(value)
+            if kind == "range":
+                return RangeChange(value)
             return AxisScale("xyz".index(axis), value) if axis else LengthChange(1 / value)
-    expected = (
-        f"a time from -{MAX_LAG:g} to {MAX_LAG:g}"
-        if is_lag
-        else f"a factor from {1 - MAX_SCALE_CHANGE:g} to {1 + MAX_SCALE_CHANGE:g}"
-    )
+    expected = f"{what} from {middle - limit:g} to {middle + limit:g}"
     raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
 
 

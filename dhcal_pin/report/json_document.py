@@ -102,7 +102,7 @@ def result_to_dict(
 def session_to_dict(session: Session | None) -> dict[str, Any]:
     """Return what happened during the measurement; empty if this was not examined."""
     if session is None:
-        return {"events": [], "drift": [], "lag": None, "scale": None, "unordered": False}
+        return {"events": [], "drift": [], "lag": None, "scale": None, "range": None, "unordered": False}
     return session.to_dict()
 
 

@@ -31,7 +31,7 @@ HELD_SIZE = 1e-12
 # Number of functions of a free drift.
 N_FUNCTIONS = 8
 
-Kind = Literal["base", "tool", "joint", "links", "payload", "robot", "lag", "scale"]
+Kind = Literal["base", "tool", "joint", "links", "payload", "robot", "lag", "scale", "range"]
 
 
 @frozen(eq=False)

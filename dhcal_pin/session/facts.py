@@ -24,6 +24,8 @@ from .timeline import Place, Timeline
 MIN_ANGLE_RATIO = 10.0
 # Largest change of a scale that is stated and can be undone: beyond it another mistake imitates a scale.
 MAX_SCALE_CHANGE = 0.5
+# Largest error of measured distances that is stated and can be undone [m].
+MAX_RANGE_ERROR = 0.1
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
 # Smallest lag that is stated, in standard deviations.
@@ -255,6 +257,29 @@ class Scale:
         )
 
 
+@frozen
+class RangeError:
+    """Constant error of measured distances from the origin of the measuring frame, the tracker."""
+
+    value: float  # Measured less true distance [m]
+    std: float  # Standard deviation [m]
+
+    @property
+    def finding(self) -> str:
+        """What was found."""
+        word = "long" if self.value > 0 else "short"
+        size = format_quantity(abs(self.value), "m", self.std)
+        return f"Measured distances from the origin of the measuring frame are {size} too {word}."
+
+    @property
+    def consequence(self) -> str:
+        """What to do."""
+        return (
+            "Check the radius of the reflector and the home position of the tracker, or add "
+            f"--mend range:{self.value:.6f}."
+        )
+
+
 @frozen(eq=False)
 class Session:
     """What happened during a session."""
@@ -268,6 +293,7 @@ class Session:
     drifts: tuple[SlowChange, ...] = ()  # Slow changes
     lag: Lag | None = None  # Delay of the joint values; None if there is none
     scales: tuple[Scale, ...] = ()  # Wrong scales of the instrument
+    range_error: RangeError | None = None  # Wrong distances from the instrument; None if they are right
 
     def applied(
         self, data: tuple[Measurement, ...], holdout: tuple[Measurement, ...]
@@ -289,23 +315,29 @@ class Session:
         return any(event.kind == "robot" for event in self.events)
 
     @property
-    def found(self) -> tuple[Event | SlowChange | Lag | Scale, ...]:
+    def found(self) -> tuple[Event | SlowChange | Lag | Scale | RangeError, ...]:
         """Everything that was found."""
-        return (*self.events, *self.drifts, *([self.lag] if self.lag else []), *self.scales)
+        return (*self.events, *self.drifts, *([self.lag] if self.lag else []), *self.wrong_lengths)
 
     @property
     def sentences(self) -> list[str]:
         """Each finding with its consequence."""
         return [f"{item.finding} {item.consequence}" for item in self.found]
 
+    @property
+    def wrong_lengths(self) -> tuple[RangeError | Scale, ...]:
+        """Wrong lengths of the instrument."""
+        return (*([self.range_error] if self.range_error else []), *self.scales)
+
     def to_dict(self) -> dict[str, Any]:
         """Return what happened for the JSON document."""
-        lag, scale = self.lag, next(iter(self.scales), None)
+        lag, scale, distance = self.lag, next(iter(self.scales), None), self.range_error
         return {
             "events": [event.to_dict() for event in self.events],
             "drift": [drift.to_dict() for drift in self.drifts],
             "lag": lag.to_dict() if lag else None,
             "scale": {"factor": scale.factor, "std": scale.std, "axis": scale.axis} if scale else None,
+            "range": {"value": distance.value, "std": distance.std} if distance else None,
             "unordered": not self.is_ordered,
         }
 

@@ -1,7 +1,8 @@
 """Linear model of a session: whitened rows of the samples by all unknowns and by all possible causes.
 
 The columns are those of the parameters of the robot and of the instruments, then of base and tool, of the
-joint zeros, of the growth of each link, of scales of the instrument, of a payload and of a lag, and last the
+joint zeros, of the growth of each link, of scales of the instrument, of a constant error of its distances
+from the origin of the measuring frame, of a payload and of a lag, and last the
 residual r. A payload turns each joint by its compliance times the gravity torque of the payload. The column
 of a joint is its motion per kilogram and unit of compliance.
 
@@ -36,6 +37,8 @@ MAX_UNEXPLAINED = 1e-3
 MIN_INFORMATION = 1e-12
 # The same for the singular values of rows with columns of unit length.
 MIN_SINGULAR_VALUE = 1e-9
+# Smallest distance from the origin of the measuring frame at which its error has a direction [m].
+MIN_RANGE = 0.1
 # Axes of a scale; empty for all axes.
 SCALE_AXES = ("", "x", "y", "z")
 
@@ -56,6 +59,7 @@ class Layout:
     joints: Array  # Columns of the joint zeros, (n,)
     links: Array  # Columns of the growth of each link, (k+1,)
     scale: int  # Column of a scale of all axes
+    range: int  # Column of a constant error of distances from the origin of the measuring frame
     payload: Array  # Columns of the motions of the joints by a payload, (n,)
     lag: int  # Column of the lag
     n_columns: int  # Number of columns, the residual included
@@ -78,7 +82,8 @@ class Layout:
         links = joints[-1] + 1 + np.arange(n_links)
         all_links = int(links[-1]) + 1
         scales = all_links + 1 + np.arange(len(SCALE_AXES))
-        payload = int(scales[-1]) + 1 + np.arange(n)
+        range_error = int(scales[-1]) + 1
+        payload = range_error + 1 + np.arange(n)
         lag = int(payload[-1]) + 1
         grows = growing_links(chain.link_vectors)
         # A robot without lengths only turns.
@@ -102,11 +107,13 @@ class Layout:
         if has_joints and torque.any():
             unit = 1 / (size * torque.max())
             blocks.append(Block("payload", "", payload, np.where(torque > MIN_TORQUE, unit, HELD_SIZE)))
-        blocks += [
-            Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_constant=True)
-            for i, axis in enumerate(SCALE_AXES)
-            if axis and measures_positions(problem.data)  # the size of the robot imitates a scale of all axes
-        ]
+        if measures_positions(problem.data):
+            blocks += [
+                Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_constant=True)
+                for i, axis in enumerate(SCALE_AXES)
+                if axis  # the size of the robot imitates a scale of all axes
+            ]
+            blocks.append(Block("range", "", np.array([range_error]), np.array([1.0]), is_constant=True))
         blocks.append(Block("lag", "", np.array([lag]), np.array([1.0]), is_constant=True))
         return cls(
             replace(problem, errors=extended),
@@ -116,6 +123,7 @@ class Layout:
             joints,
             links,
             int(scales[0]),
+            range_error,
             payload,
             lag,
             lag + 2,
@@ -197,6 +205,7 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
                 growth,
                 growth.sum(0, keepdims=True),
                 _scale_motions(frames.tool[3]),
+                _range_motion(frames.tool[3]),
                 by_joint * torque[:, None],
             ]
         )
@@ -231,6 +240,14 @@ def _scale_motions(points: Array) -> Array:
     out[0, :3] = centred
     for axis in range(3):
         out[1 + axis, axis] = centred[axis]
+    return out
+
+
+def _range_motion(points: Array) -> Array:
+    """Return the twist of the tool point per metre of an error of its distance from the origin, (1, 6, m)."""
+    distances = np.linalg.norm(points, axis=0)
+    out = np.zeros((1, 6, points.shape[1]))
+    out[0, :3] = points / np.maximum(distances, MIN_RANGE)
     return out
 
 

@@ -41,7 +41,7 @@ from ..measurements.base import Measurement, residual_of
 from ..measurements.configurations import group_by_configuration
 from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import MAX_SCALE_CHANGE, Event, Scale, Session, describe_lag
+from .facts import MAX_RANGE_ERROR, MAX_SCALE_CHANGE, Event, RangeError, Scale, Session, describe_lag
 from .linear_model import Layout, covariance_root, inverse, solve_information, whitened_rows
 from .part_frames import place_parts, starts_of_parts
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
@@ -1025,6 +1025,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         for cause in causes
         if isinstance(cause.shape, Constant)
     ]
+    ranges = [
+        RangeError(value, std)
+        for kind, value, std, _ in constants
+        if kind == "range" and abs(value) <= MAX_RANGE_ERROR
+    ]
     return Session(
         timeline,
         search.chain,
@@ -1038,6 +1043,7 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
             for kind, value, std, axis in constants
             if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
         ),
+        range_error=next(iter(ranges), None),
     ).described()
 
 

@@ -17,6 +17,7 @@ from dhcal_pin.session.facts import (
     Event,
     Lag,
     LagPart,
+    RangeError,
     Scale,
     Session,
     SlowChange,
@@ -524,6 +525,13 @@ def test_a_scale_says_what_is_too_long(scale, finding):
     assert scale.finding == finding
 
 
+def test_an_error_of_distances_says_what_undoes_it():
+    too_short = RangeError(-2e-3, 1e-5)
+    assert too_short.finding.endswith("from the origin of the measuring frame are 2.000 mm too short.")
+    assert too_short.consequence.endswith("or add --mend range:-0.002000.")
+    assert RangeError(2e-3, 1e-5).finding.endswith("too long.")
+
+
 @pytest.mark.parametrize(
     ("factor", "is_possible"), [(1.09, True), (0.91, True), (1.11, False), (0.89, False), (2.0, False)]
 )
@@ -621,15 +629,26 @@ def test_a_session_lists_what_was_found():
     lag, scale = Lag(0.2, 0.01, "s"), Scale(1.003, 1e-4, "z")
     empty = Session(TIMELINE, CHAIN, True)
     assert empty.found == ()
-    assert empty.to_dict() == {"events": [], "drift": [], "lag": None, "scale": None, "unordered": False}
-    full = replace(empty, events=(event,), drifts=(drift,), lag=lag, scales=(scale,), is_ordered=False)
-    assert full.found == (event, drift, lag, scale)
+    nothing = {"events": [], "drift": [], "lag": None, "scale": None, "range": None, "unordered": False}
+    assert empty.to_dict() == nothing
+    distance = RangeError(-2e-3, 1e-5)
+    full = replace(
+        empty,
+        events=(event,),
+        drifts=(drift,),
+        lag=lag,
+        scales=(scale,),
+        range_error=distance,
+        is_ordered=False,
+    )
+    assert full.found == (event, drift, lag, distance, scale)
     assert full.sentences == [f"{each.finding} {each.consequence}" for each in full.found]
     assert full.to_dict() == {
         "events": [event.to_dict()],
         "drift": [drift.to_dict()],
         "lag": lag.to_dict(),
         "scale": {"factor": 1.003, "std": 1e-4, "axis": "z"},
+        "range": {"value": -2e-3, "std": 1e-5},
         "unordered": True,
     }
     # Two robots stay, and what belongs to one of them is no event.

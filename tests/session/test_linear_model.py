@@ -53,7 +53,7 @@ def test_only_what_has_a_constant_error_changes(sets, kinds, joints):
     blocks = layout.restricted_to(rows).blocks
     assert {b.kind for b in blocks if not b.is_constant} == {"joint", "payload", *kinds}
     assert [b.index for b in blocks if b.kind == "joint"] == list(joints)
-    assert {b.kind for b in blocks if b.is_constant} == {"scale", "lag"}
+    assert {b.kind for b in blocks if b.is_constant} == {"scale", "range", "lag"}
 
 
 def test_torques_of_an_unstated_payload_are_the_largest_ones():

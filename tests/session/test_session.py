@@ -105,13 +105,19 @@ def test_columns_of_causes_agree_with_finite_differences(kind):
             changes = by_kind["links"] if len(block.columns) > 1 else [{"growth": np.full((4, n + 1), step)}]
             if len(block.columns) > 1:
                 changes = [changes[c - layout.links[0]] for c in block.columns]
-        elif block.kind == "scale":
+        elif block.kind in ("scale", "range"):
             continue
         else:
             changes = by_kind[block.kind]
         for column, change in zip(block.columns, changes, strict=True):
             # The rows are the derivative of the model, the residual is measured minus modelled.
             np.testing.assert_allclose(rows[..., column], -moved(**change) / step, atol=2e-3, rtol=1e-4)
+    # Longer modelled distances have the effect of shorter measured ones.
+    shorter = exact.copy()
+    shorter[:, :3, 3] *= 1 - step / np.linalg.norm(exact[:, :3, 3], axis=1)[:, None]
+    changed = Pose(q, shorter) if kind is Pose else Position(q, shorter[:, :3, 3])
+    of_range = -changed.residual(chain.forward_kinematics(q), np.array([])).T / step
+    np.testing.assert_allclose(rows[..., layout.range], of_range, atol=2e-3, rtol=1e-4)
 
 
 def log_evidence_of(search, cause, noise, applied, others=()):
@@ -864,7 +870,7 @@ def test_commands_state_what_happened(tmp_path, capsys, undrawn):
     assert json.loads((tmp_path / "out.json").read_text())["session"]["events"] == []
 
 
-@pytest.mark.parametrize("key", ["lag:1e9", "lag:-", "scale:0", "scale:z:7"])
+@pytest.mark.parametrize("key", ["lag:1e9", "lag:-", "scale:0", "scale:z:7", "range:0.2", "range:x:0.01"])
 def test_impossible_changes_are_refused(tmp_path, capsys, key):
     simulation = Simulation("ur10", 20, 9)
     file = tmp_path / "data.csv"

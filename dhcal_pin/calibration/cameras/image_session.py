@@ -112,6 +112,7 @@ def find_image_session(
         causes=tuple(_carried_cause(cause, tool) for cause in causes),
         lag=None,
         scales=(),
+        range_error=None,
     ).described()
 
 
