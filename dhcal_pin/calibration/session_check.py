@@ -260,7 +260,11 @@ class _Search:
         if session is None or not _has_changes(found) or session.has_two_robots:
             return found
         fit = self.models.reweighted(found.fit)
-        if _keeps_all_parts(found, fit) and _confirm_changes(session, self.fit, fit, self.models.extended):
+        # Joint errors that a fit lacks can make half of the samples outliers.
+        is_kept = _keeps_all_parts(found, fit) or (
+            bool(self.families) and _keeps_all_parts(found, self.refitted(found))
+        )
+        if is_kept and _confirm_changes(session, self.fit, fit, self.models.extended):
             return found
         return SessionFit(self.fit, self.holdout, without_changes(session))
 
