@@ -470,7 +470,7 @@ class Evidence(FittedModel):
 
     @cached_property
     def position_std_beside(self) -> float:
-        """The same at `BESIDE` from the measured point, the largest along the axes of the tool."""
+        """Largest `position_std` at points `BESIDE` from the measured one along the tool axes [m]."""
         return max(self._predicted_position_std(offset) for offset in BESIDE * np.eye(3))
 
     def _predicted_position_std(self, offset: Sequence[float] | Array) -> float:

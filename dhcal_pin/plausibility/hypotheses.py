@@ -195,7 +195,7 @@ class RangeChange:
     error: float  # Measured less true distance [m]
 
     def apply(self, item: Measurement) -> Measurement | None:
-        """Return the measurements with shorter distances."""
+        """Return the measurements without this error."""
         if not isinstance(item, Pose | Position | MultiTargetPosition):
             return None
         distances = np.maximum(np.linalg.norm(item.positions(), axis=1), _MIN_DISTANCE)

@@ -1077,9 +1077,10 @@ def _unchanged(model: _CheckModel, hypotheses: list[Hypothesis], size: float) ->
     moved = format_quantity(largest, "m", largest / 10)
     reasons = [f"Nothing changed that moves the measured point by more than {moved}."]
     if joints := model.hidden_joints:
-        what, axes = ("The zero", "its axis") if len(joints) == 1 else ("Zeros", "their axes")
-        verb = "does" if len(joints) == 1 else "do"
-        reasons.append(f"{what} of {', '.join(joints)} {verb} not move it; measure a point off {axes}.")
+        names, is_one = ", ".join(joints), len(joints) == 1
+        text = f"The zero of {names} does" if is_one else f"Zeros of {names} do"
+        axes = "its axis" if is_one else "their axes"
+        reasons.append(f"{text} not move it; measure a point off {axes}.")
     return "ok", reasons
 
 

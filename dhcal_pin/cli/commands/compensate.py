@@ -124,7 +124,7 @@ def read_robots(args: Namespace) -> tuple[robot.Chain, robot.Chain]:
 
 
 def _frame_notes(nominal: robot.Chain, calibrated: robot.Chain) -> list[str]:
-    """Say which errors of poses of the tip in the root link a calibration with unknown frames leaves."""
+    """Say that poses in the root link are less accurate if the calibration estimated base or tool."""
     import numpy as np  # lazy import, as the following: they are slow to load
 
     from ...compensation import nominal_root_pose
