@@ -18,7 +18,9 @@ from ..estimation.parameters import fold_harmonics
 from ..estimation.qr import TriangularSystem
 from ..formatting import SMALL_UNITS, Quantity, Table, format_count, format_quantity
 from ..identifiability import label_unobservable
+from ..measurements.contact import SphereContact
 from ..measurements.groups import ERROR_GROUPS
+from ..plausibility.displacement import workspace_radius
 from .cross_validation import Generalization
 from .estimates import Estimate
 from .evaluation import MIN_SAMPLES, Comparison, ErrorStatistics
@@ -30,6 +32,8 @@ MIN_SHOWN_SHARE = 0.01
 MIN_BESIDE_RATIO = 2.0
 # Smaller distances from the axis of the last joint are the reason for them, and those of a point on it [m].
 MAX_ON_AXIS, MIN_OFF_AXIS = 0.05, 1e-3
+# Error of the radius of touched spheres whose effect is stated [m].
+RADIUS_ERROR = 1e-4
 
 # Option that excludes outliers, by the method of the calibration that kept them.
 AUTO_OPTIONS = {"lm": "--loss auto", "gn": "--method lm"}
@@ -127,6 +131,11 @@ def position_error_beside(fit: Evidence) -> float | None:
     return beside if beside > MIN_BESIDE_RATIO * max(fit.position_std, *errors) else None
 
 
+def unshown_error_notes(fit: Evidence) -> list[str]:
+    """Return sentences on errors of positions that the stated accuracy does not contain."""
+    return [*beside_notes(fit), *size_notes(fit)]
+
+
 def beside_notes(fit: Evidence) -> list[str]:
     """Return sentences on the error beside the measured point of a tool, and what to measure."""
     error = position_error_beside(fit)
@@ -144,6 +153,20 @@ def beside_notes(fit: Evidence) -> list[str]:
     return [
         f"{text} The point is {place} the axis of {chain.joint_names[-1]} and hardly shows the direction of "
         f"this axis. Measure a point at least {distance} from the axis."
+    ]
+
+
+def size_notes(fit: Evidence) -> list[str]:
+    """Return a sentence on the error by a wrong radius of touched spheres, if only it shows the size."""
+    lengths = [item for item in fit.data if item.has_length_scale]
+    radii = [item.values for item in lengths if isinstance(item, SphereContact)]
+    if not (radii and len(radii) == len(lengths) and fit.errors.has_arm and fit.shrinkage_factor):
+        return []
+    size = workspace_radius(fit.chain) / np.sqrt(np.mean(np.concatenate(radii) ** 2))
+    error = format_quantity(RADIUS_ERROR * size, "m", 0.1 * RADIUS_ERROR * size)
+    return [
+        f"Only the stated radius shows the size of the robot: if it is wrong by {1e3 * RADIUS_ERROR:g} mm, "
+        f"positions are wrong by about {error}."
     ]
 
 

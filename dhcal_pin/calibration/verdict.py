@@ -32,7 +32,7 @@ from ..identifiability.null_space import ObservabilityProbe
 from ..io.measurement_files.fitted_rows import count_fitted_rows, fitted_row_digests
 from ..measurements.base import Measurement, residual_of
 from ..measurements.camera import select_images
-from ..measurements.contact import PointContact
+from ..measurements.contact import PointContact, SphereContact
 from ..measurements.groups import ERROR_GROUPS, error_group
 from ..measurements.images.names import list_images
 from ..plausibility.contradictions import MIN_RATIO, own_fit_ratio
@@ -44,7 +44,7 @@ from ..plausibility.robot_files import LARGEST_ARM, length_of_links
 from ..robot.chain import BASE_FRAME
 from ..robot.error_families import BACKLASH
 from . import cameras
-from .evaluation import MIN_SAMPLES, Accuracy, accuracy, fit_nominal
+from .evaluation import MIN_SAMPLES, Accuracy, accuracy, compute_errors, fit_nominal
 from .evidence import Evidence, count_geometric_directions, diagnose_joint_values
 from .model_selection import FULL_SET
 from .partition import configuration_groups
@@ -118,6 +118,9 @@ MAX_CONTINUED = 500
 MIN_WORSE_T, MIN_WORSE_RATIO = 3.0, 2.0
 # RMS error of the nominal robot, as a fraction of the workspace, of values that were computed, not measured.
 MAX_COMPUTED_ERROR = 2e-5
+# Residuals of touched spheres, relative to their radius, that diameters in place of radii may leave, and the
+# smallest factor by which other radii then reduce them.
+MAX_RADIUS_ERROR, MIN_RADIUS_GAIN = 0.005, 3.0
 # Residuals this many times as large as the stated standard deviations may be the cause of a large correction.
 MIN_SIGMA_RATIO = 10.0
 # Smallest residuals of a second fit, with the residuals of the first one as standard deviations. If they are
@@ -206,6 +209,7 @@ def judge(fit: Evidence) -> Verdict:
             *(_mixups(fit.diagnosis) or _impossible_size(fit)),
             *_wrong_joint_values(fit),
             *_board_size(fit),
+            *_diameters(fit),
             *_signs(fit),
             *_large_zeros(fit),
             *_reversed_directions(fit),
@@ -411,6 +415,36 @@ def _board_size(fit: Evidence) -> list[Finding]:
     return [Finding("refused" if fit.board_size.is_decisive else "caution", fit.board_size.sentence)]
 
 
+def _diameters(fit: Evidence) -> list[Finding]:
+    """Refuse spheres that fit far better if the stated radius is a diameter."""
+    radii = [item.values for item in fit.data if isinstance(item, SphereContact)]
+    if not radii or fit.with_part is None:
+        return []
+    error = _radius_error(fit)
+    limit = MAX_RADIUS_ERROR * np.sqrt(np.mean(np.concatenate(radii) ** 2))
+    is_impossible = measure_correction(fit.errors, fit.chain).ratio > MAX_DISPLACEMENT
+    if error < limit and not is_impossible:
+        return []
+    other = fit.with_part([_with_halved_radius(item) for item in fit.data])
+    is_better = is_impossible or _radius_error(other) * MIN_RADIUS_GAIN < error
+    if not is_better or measure_correction(other.errors, other.chain).ratio > MAX_USUAL_DISPLACEMENT:
+        return []
+    text = "The column radius probably has the diameters of the spheres: half of these values fit this robot."
+    return [Finding("refused", f"{text} State the radii.")]
+
+
+def _radius_error(fit: Evidence) -> float:
+    """Return the median size of the residuals of touched spheres [m]."""
+    spheres = [item for item in fit.data if isinstance(item, SphereContact)]
+    errors = compute_errors(fit.chain, spheres, fit.instruments)
+    return float(np.median(np.abs(np.concatenate([next(iter(each.values())) for each in errors]))))
+
+
+def _with_halved_radius(item: Measurement) -> Measurement:
+    """Return measurements in which the stated radius of spheres is a diameter."""
+    return item.replace(values=item.values / 2) if isinstance(item, SphereContact) else item
+
+
 def _two_robots(fit: Evidence) -> list[Finding]:
     """Refuse samples of two robots."""
     events = [event for event in (fit.session.events if fit.session else ()) if event.kind == "robot"]
@@ -418,8 +452,11 @@ def _two_robots(fit: Evidence) -> list[Finding]:
 
 
 def _session(fit: Evidence) -> list[Finding]:
-    """Advise caution if something happened during the measurement."""
-    return [Finding("caution", sentence) for sentence in (fit.session.sentences if fit.session else [])]
+    """Advise caution if something happened during the measurement; refuse a robot of an impossible size."""
+    if fit.session is None:
+        return []
+    is_refused = any(scale.is_impossible for scale in fit.session.scales)
+    return [Finding("refused" if is_refused else "caution", text) for text in fit.session.sentences]
 
 
 def _convergence(fit: Evidence, causes: Sequence[Finding]) -> list[Finding]:

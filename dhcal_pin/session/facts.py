@@ -28,6 +28,8 @@ MAX_SCALE_CHANGE = 0.5
 MAX_RANGE_ERROR = 0.1
 # Larger scales of all axes are those of another robot.
 MAX_INSTRUMENT_SCALE = 0.1
+# Manufacturing does not change the size of a robot by more than this part: printed parts shrink by 1 % or so.
+MAX_SIZE_CHANGE = 0.03
 # Smallest lag that is stated, in standard deviations.
 MIN_STATED_LAG = 4.0
 # What a robot touches: its motion has the effect of one of the base.
@@ -222,7 +224,7 @@ class Scale:
     std: float  # Standard deviation of the factor
     axis: str  # "x", "y" or "z" of the measuring frame; empty for all
     files: tuple[str, ...] = ()  # Measurement files with this scale; empty for all
-    is_of_distances: bool = False  # Whether stated distances between points are the only lengths
+    stated: str = ""  # Stated lengths, which nobody measured with the robot, if there are no others
 
     @property
     def finding(self) -> str:
@@ -238,14 +240,19 @@ class Scale:
         return f"The correction makes the whole robot {percent} {word}."
 
     @property
+    def is_impossible(self) -> bool:
+        """Whether stated lengths make the robot larger or smaller than any manufacturing error."""
+        return bool(self.stated) and abs(self.factor - 1) > MAX_SIZE_CHANGE
+
+    @property
     def consequence(self) -> str:
         """What to do."""
         if self.axis:
             return f"Check the instrument, or add --mend scale:{self.axis}:{self.factor:.6g}."
-        if self.is_of_distances:
+        if self.stated:
             return (
-                "Check the stated distances between the points: nothing else shows the size of the robot. If "
-                f"they are wrong, correct them, or add --mend scale:{self.factor:.6g}."
+                f"Check the stated {self.stated}: nothing else shows the size of the robot. If it is wrong, "
+                f"correct it, or add --mend scale:{self.factor:.6g}."
             )
         if abs(self.factor - 1) > MAX_INSTRUMENT_SCALE:
             return "No instrument is so wrong: the robot file is probably that of a robot of another size."

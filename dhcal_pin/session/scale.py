@@ -32,6 +32,11 @@ from ..robot.error_families import FAMILIES, GAIN
 from .facts import MAX_SCALE_CHANGE, Scale
 from .linear_model import Layout, inverse, whitened_rows
 
+# Lengths that are stated and not measured with the robot, by the kind of measurement.
+STATED_LENGTHS = {
+    "point_distance": "length between the points",
+    "sphere": "radius of the spheres, which includes that of the ball on the tool",
+}
 # Smallest RMS correction of lengths in prior standard deviations, and relative error of the scale.
 MIN_CORRECTION, MIN_CHANGE = 0.5, 1e-3
 # Smallest number of lengths that the measurements determine, and largest share of the largest factors.
@@ -100,9 +105,10 @@ def find_scale(problem: Problem, x: Array) -> Scale | None:
     if chance > MAX_CHANCE:
         return None
     variance = float(np.sum(weights * (1 / information + (changes - change) ** 2)))
-    is_of_distances = all(item.kind == "point_distance" for item in with_lengths)
+    kinds = {item.kind for item in with_lengths}
+    stated = " and ".join(STATED_LENGTHS[kind] for kind in STATED_LENGTHS if kind in kinds)
     std = factor**2 * float(np.sqrt(variance))
-    return Scale(factor, std, "", is_of_distances=is_of_distances)
+    return Scale(factor, std, "", stated=stated if kinds <= STATED_LENGTHS.keys() else "")
 
 
 def _slide_gains(errors: ErrorModel) -> list[ErrorParameter]:

@@ -501,9 +501,9 @@ def test_a_lag_is_stated_with_its_parts_and_what_corrects_it(lag, finding, conse
     ("scale", "consequence"),
     [
         (Scale(1.003, 1e-4, "z"), "Check the instrument, or add --mend scale:z:1.003."),
-        (Scale(0.985, 1e-4, "", ("a.csv",), is_of_distances=True), "Check the stated distances between the "
-         "points: nothing else shows the size of the robot. If they are wrong, correct them, or add --mend "
-         "scale:0.985."),
+        (Scale(0.985, 1e-4, "", ("a.csv",), stated="length between the points"), "Check the stated length "
+         "between the points: nothing else shows the size of the robot. If it is wrong, correct it, or add "
+         "--mend scale:0.985."),
         (Scale(0.985, 1e-4, ""), "Check the scale of the instrument: measurements alone do not distinguish "
          "it from the size of the robot. If the instrument is wrong, add --mend scale:0.985."),
     ],
@@ -544,7 +544,7 @@ def test_an_instrument_is_wrong_by_a_tenth_at_most(factor, is_possible):
             "No instrument is so wrong: the robot file is probably that of a robot of another size."
         )
     # Known lengths, or a single axis, may be wrong by more.
-    for other in (Scale(factor, 1e-4, "", is_of_distances=True), Scale(factor, 1e-4, "x")):
+    for other in (Scale(factor, 1e-4, "", stated="length"), Scale(factor, 1e-4, "x")):
         assert "--mend scale:" in other.consequence
 
 

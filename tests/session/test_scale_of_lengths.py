@@ -120,7 +120,7 @@ def test_a_scale_is_stated_from_a_thousandth_to_a_half(problem, monkeypatch, cha
     assert (found is not None) == is_found
     if found is not None:
         assert 1 - 1 / found.factor == pytest.approx(change, abs=3e-5)
-        assert (found.axis, found.is_of_distances) == ("", False)
+        assert (found.axis, found.stated) == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -161,13 +161,13 @@ def test_measurements_without_lengths_show_no_scale(problem, monkeypatch):
     contacts = PointContact(problem.data[0].q, ["a", "b"] * 10)
     (positions,) = problem.data
     distances = PointDistance(6, [("a", "b")], [1.0])
-    for data, is_found, is_of_distances in (
-        ([contacts], False, None),
-        ([contacts, positions], True, False),
-        ([contacts, distances], True, True),
-        ([positions, distances], True, False),
+    for data, is_found, stated in (
+        ([contacts], False, ""),
+        ([contacts, positions], True, ""),
+        ([contacts, distances], True, "length between the points"),
+        ([positions, distances], True, ""),
     ):
         found = find_scale(replace(problem, data=tuple(data)), x)
         assert (found is not None) == is_found
         if found is not None:
-            assert found.is_of_distances == is_of_distances
+            assert found.stated == stated
