@@ -19,7 +19,7 @@ from ..estimation.qr import TriangularSystem
 from ..formatting import SMALL_UNITS, Quantity, Table, format_count, format_quantity
 from ..identifiability import label_unobservable
 from ..measurements.contact import SphereContact
-from ..measurements.groups import ERROR_GROUPS
+from ..measurements.groups import ERROR_GROUPS, error_group
 from ..plausibility.displacement import workspace_radius
 from .cross_validation import Generalization
 from .estimates import Estimate
@@ -32,6 +32,9 @@ MIN_SHOWN_SHARE = 0.01
 MIN_BESIDE_RATIO = 2.0
 # Smaller distances from the axis of the last joint are the reason for them, and those of a point on it [m].
 MAX_ON_AXIS, MIN_OFF_AXIS = 0.05, 1e-3
+# Errors are far smaller than their stated standard deviations below this share of them. At 0.13 a calibration
+# with estimated noise reduced the true error by 20 % in simulations, and at 0.2 by 5 %.
+MAX_SIGMA_SHARE = 0.15
 # Error of the radius of touched spheres whose effect is stated [m].
 RADIUS_ERROR = 1e-4
 
@@ -131,9 +134,9 @@ def position_error_beside(fit: Evidence) -> float | None:
     return beside if beside > MIN_BESIDE_RATIO * max(fit.position_std, *errors) else None
 
 
-def unshown_error_notes(fit: Evidence) -> list[str]:
-    """Return sentences on errors of positions that the stated accuracy does not contain."""
-    return [*beside_notes(fit), *size_notes(fit)]
+def accuracy_notes(fit: Evidence) -> list[str]:
+    """Return sentences on errors that the stated accuracy does not contain, and on what would reduce it."""
+    return [*beside_notes(fit), *size_notes(fit), *sigma_notes(fit)]
 
 
 def beside_notes(fit: Evidence) -> list[str]:
@@ -167,6 +170,19 @@ def size_notes(fit: Evidence) -> list[str]:
     return [
         f"Only the stated radius shows the size of the robot: if it is wrong by {1e3 * RADIUS_ERROR:g} mm, "
         f"positions are wrong by about {error}."
+    ]
+
+
+def sigma_notes(fit: Evidence) -> list[str]:
+    """Return a sentence on stated standard deviations that are far larger than the residuals."""
+    stated = {name: ratio for (_, is_stated, name), ratio in fit.noise_factors.items() if is_stated}
+    ratio = min(stated.values(), default=1.0)
+    if ratio > MAX_SIGMA_SHARE or not fit.errors.has_arm:
+        return []
+    label = ERROR_GROUPS[error_group(min(stated, key=lambda name: stated[name]))].label
+    return [
+        f"The stated standard deviations are {1 / max(ratio, 1e-3):.0f} times as large as the {label}s, so "
+        "that the measurements count too little. Leave the sigma columns out, or correct them."
     ]
 
 

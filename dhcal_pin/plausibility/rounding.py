@@ -68,7 +68,8 @@ class Rounding:
             f"The joint values{names} are multiples of {join_names(self.steps)}. The RMS {errors.label} that "
             f"the fit leaves ({found}) is about that of values that are wrong by up to half a step "
             f"({expected}). If they are rounded, or commanded and not quite reached, measured values with "
-            "two more digits make the calibration more accurate."
+            "two more digits make the calibration more accurate. If digits were cut off, not rounded, the "
+            "zeros of the joints are wrong by half a step, too."
         )
 
 

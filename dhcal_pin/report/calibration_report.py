@@ -69,7 +69,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
         change = "smaller" if head.percent_reduction >= 0 else "larger"
         values.append(("", change, f"{abs(head.percent_reduction):.0f} %"))
     regions = summary.generalization_lines(context.fit.generalization, context.comparisons)
-    unshown = [] if verdict.is_refused else summary.unshown_error_notes(context.fit)
+    unshown = [] if verdict.is_refused else summary.accuracy_notes(context.fit)
     title = f"Calibration of {context.robot_name}"
     return Document(
         title=title,

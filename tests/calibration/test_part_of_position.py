@@ -11,6 +11,7 @@ from sessions import ANGLE_NOISE, NOISE, Simulation
 from slow_cases import some_slow
 
 from dhcal_pin import calibrate, read_robot, se3
+from dhcal_pin.calibration.summary import sigma_notes
 from dhcal_pin.estimation import select_parameters
 from dhcal_pin.measurements import (
     Inclination,
@@ -106,6 +107,26 @@ def test_far_too_small_stated_deviations_of_rotations_are_named(seed):
     true = [true_error(simulation, fit) for fit in fits]
     assert [fit.verdict.status for fit in fits] == ["caution", "ok", "ok"]
     assert max(true[1:]) < true[0] / 3
+
+
+@pytest.mark.parametrize("seed", some_slow(range(8), {0}))
+def test_far_too_large_stated_deviations_are_named(seed):
+    """The measurements count too little beside the priors: following the advice reduces the true error."""
+    simulation = Simulation("ur10", 80, seed)
+    positions = points(simulation, simulation.q) + simulation.rng.normal(0, NOISE, (80, 3))
+    fits = [
+        calibrate(simulation.chain, Position(simulation.q, positions, sigma), extend="none", session="off")
+        for sigma in (30 * NOISE, None, 2 * NOISE)
+    ]
+    notes = [sigma_notes(fit) for fit in fits]
+    assert [len(each) for each in notes] == [1, 0, 0]
+    assert notes[0][0].endswith("Leave the sigma columns out, or correct them.")
+    found = re.search(r"deviations are (\d+) times as large as the position errors", notes[0][0])
+    # The fit leaves more than the noise, as the priors hold it back.
+    assert found
+    assert 7 <= float(found[1]) <= 30
+    true = [true_error(simulation, fit) for fit in fits]
+    assert true[1] < 0.3 * true[0]
 
 
 @pytest.mark.slow

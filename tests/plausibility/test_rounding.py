@@ -78,6 +78,24 @@ def test_rounded_values_are_named_and_two_more_digits_help(name, kind, m, step, 
         assert true_error(finer, true, rng) < 0.5 * error
 
 
+@pytest.mark.parametrize("seed", some_slow([0, 2, 3, 4, 5], {0}))
+def test_values_that_are_cut_off_leave_zeros_that_are_wrong_by_half_a_step(seed):
+    step = 0.1 * DEG
+    nominal, true, q, rng = draw("ur5", 80, seed)
+    exact = Position.simulate(true, q, NOISE, rng).replace(has_stated_sigma=False)
+    fit = calibrate(nominal, exact.resample(np.floor(exact.q / step) * step), session="off")
+    (note,) = fit.rounding_notes
+    assert note.endswith(
+        "If digits were cut off, not rounded, the zeros of the joints are wrong by half a step, too."
+    )
+    q = rng.uniform(-2.5, 2.5, (300, 6))
+    errors = [
+        np.sqrt(np.mean(np.sum((fit.chain.poses(values)[:, :3, 3] - true.poses(q)[:, :3, 3]) ** 2, 1)))
+        for values in (q, q - step / 2)
+    ]
+    assert errors[1] < 0.6 * errors[0]
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "seed"),
     some_slow(

@@ -218,7 +218,7 @@ def _accuracy_blocks(fit: Result) -> list[Block]:
         Block(sentences),
         Block(summary.position_notes(fit.hand_eye_std)),
         Block(summary.position_error_notes(fit)),
-        Block([] if fit.verdict.is_refused else summary.unshown_error_notes(fit), "yellow"),
+        Block([] if fit.verdict.is_refused else summary.accuracy_notes(fit), "yellow"),
         Block(summary.regressions(fit, fit.comparisons), "yellow"),
     ]
 
