@@ -87,6 +87,21 @@ def count_geometric_directions(fit: FittedModel, r: Array) -> int:
     return max(rank(r[:, _is_geometric(fit)]), 1)
 
 
+def _rows_of_visits(data: Sequence[Measurement], groups: Array) -> int:
+    """Count the rows of one visit of each configuration: an error that all visits share does not show."""
+    total, first = 0, 0
+    for item in data:
+        labels, first = groups[first : first + len(item.rows)], first + len(item.rows)
+        _, group, counts = np.unique(labels, return_inverse=True, return_counts=True)
+        n_visits = np.ones(len(counts))
+        if item.configurations_per_row:
+            # Several targets are measured at equal joint values; visits by hand guiding differ a little.
+            q = np.concatenate(np.split(item.configurations(), item.configurations_per_row), axis=1)
+            n_visits = np.bincount(np.unique(np.column_stack([group, q]), axis=0)[:, 0].astype(int))
+        total += item.residual_dim * int(np.sum(np.ceil(counts / n_visits)))
+    return total
+
+
 @frozen(eq=False)
 class Evidence(FittedModel):
     """Fitted model with what the measurements say of its accuracy."""
@@ -148,7 +163,7 @@ class Evidence(FittedModel):
                 for _ in range(0, len(item.rows), CHUNK_SIZE)
             ]
             columns.append(np.concatenate([np.empty((root.shape[1], item.residual_dim, 0)), *parts], 2))
-        return independent_rows(columns, groups) / directions
+        return min(independent_rows(columns, groups), _rows_of_visits(self.data, groups)) / directions
 
     @cached_property
     def hidden_majority(self) -> tuple[int, float] | None:

@@ -2,7 +2,9 @@
 
 The joint values of a taught pose that the robot visits again differ by the resolution of its encoders and the
 error of its controller. Such visits are one configuration: they show the noise, but not the model errors at
-other joint values. Neighbouring samples of a path are different configurations.
+other joint values. Neighbouring samples of a path are different configurations. Poses to which a person
+guides the robot again differ by some tenths of a degree. The samples show by their groups that they are
+visits of few poses.
 
 Shapes: m rows of joint values of n joints.
 """
@@ -24,6 +26,14 @@ VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
 VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
 # Largest number of pairs of rows that are compared for visits.
 MAX_COMPARED = 1_000_000
+# Visits of poses to which a person guides the robot again differ by more. They are groups of rows that are
+# connected by such differences [rad or m], at most this fraction of the range of the joint values, ...
+GUIDED_TOL, GUIDED_FRACTION = 5e-2, 2e-2
+# ... whose extent is at most this multiple of them, and whose distances are at least this multiple of the
+# largest extent. There are at least so many visits of a pose on the mean.
+GUIDED_EXTENT, GUIDED_DISTANCE, MIN_GUIDED_VISITS = 4.0, 3.0, 3
+# Number of rows by which it is checked whether most rows have such neighbours, and largest number of rows.
+GUIDED_CHECKED, MAX_GUIDED = 10, 5000
 
 
 def group_by_configuration(q: Array) -> Array:
@@ -62,6 +72,42 @@ def group_by_configuration(q: Array) -> Array:
     labels = np.empty(m, int)
     labels[order] = np.where(is_visited[visits], visits, len(rows) + equal)[np.cumsum(is_new) - 1]
     return label_by_appearance(labels)
+
+
+def merge_guided_visits(q: Array, labels: Array) -> Array:
+    """Merge the labels (m,) of joint values (m, n) that belong to visits of few poses by hand guiding.
+
+    >>> poses = np.repeat([[0.0, 1.0], [2.0, -1.0]], 3, axis=0)
+    >>> scattered = poses + 1e-2 * np.array([[0, 1], [1, 0], [1, 1], [0, 1], [1, 0], [1, 1]])
+    >>> merge_guided_visits(scattered, np.arange(6))
+    array([0, 0, 0, 1, 1, 1])
+    """
+    m = len(q)
+    if not MIN_GUIDED_VISITS < m <= MAX_GUIDED:
+        return labels
+    order = order_of_rows(q)
+    checked = q[order[:: -(-m // GUIDED_CHECKED)]]
+    tol = min(GUIDED_TOL, GUIDED_FRACTION * float(np.ptp(q, axis=0).max()))
+    n_near = np.count_nonzero(np.max(np.abs(q - checked[:, None]), axis=-1) <= tol, axis=1)
+    if np.median(n_near) < MIN_GUIDED_VISITS:
+        return labels
+    projection = q.mean(axis=1)
+    order = np.argsort(projection, kind="stable")
+    rows = q[order]
+    visits = connect_nodes(m, *_links(rows, projection[order], tol, m))
+    by_visit = np.argsort(visits, kind="stable")
+    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
+    largest, smallest = (bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum))
+    extent = float(np.max(largest - smallest))
+    if m < MIN_GUIDED_VISITS * len(starts) or extent > GUIDED_EXTENT * tol:
+        return labels
+    centres = (largest + smallest) / 2
+    distances = np.max(np.abs(centres - centres[:, None]), axis=-1) + np.diag(np.full(len(starts), np.inf))
+    if distances.min() < GUIDED_DISTANCE * extent:
+        return labels
+    merged = np.empty(m, int)
+    merged[order] = visits
+    return label_by_appearance(merged)
 
 
 def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple[Array, Array]:
@@ -115,7 +161,8 @@ def label_samples(data: Sequence[Any]) -> Array:
         rows = [np.concatenate(np.split(np.asarray(data[i].configurations()), width), axis=1) for i in chosen]
         samples = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in chosen])
         # The label of a group is the number of its first sample.
-        groups = group_by_configuration(np.concatenate(rows))
+        q = np.concatenate(rows)
+        groups = merge_guided_visits(q, group_by_configuration(q))
         is_first = np.diff(np.maximum.accumulate(groups), prepend=-1) > 0
         labels[samples] = samples[np.flatnonzero(is_first)[groups]]
     if len(labels):

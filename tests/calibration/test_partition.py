@@ -23,7 +23,11 @@ from dhcal_pin.calibration.partition import (
 )
 from dhcal_pin.exceptions import DhcalError, InvalidArgumentError, NotObservableError
 from dhcal_pin.measurements import Measurement, PointContact, PointDistance, Position, RelativePose
-from dhcal_pin.measurements.configurations import CONFIGURATION_TOL, group_by_configuration
+from dhcal_pin.measurements.configurations import (
+    CONFIGURATION_TOL,
+    group_by_configuration,
+    merge_guided_visits,
+)
 from dhcal_pin.robot import Chain
 
 # Calibrations of arms with large errors, of which nothing asks for mistakes.
@@ -181,12 +185,13 @@ def test_groups_match_a_comparison_of_all_pairs(seed):
     np.testing.assert_array_equal(groups[:, None] == groups[None], linked)
 
 
-@pytest.mark.parametrize("jitter", [1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("jitter", [1e-5, 1e-4, 1e-3, 1e-2])
 def test_visits_of_taught_poses_are_one_configuration(jitter):
     rng = np.random.default_rng(0)
     poses = rng.uniform(-3, 3, (8, N_JOINTS))
     number = rng.permutation(np.repeat(np.arange(8), 20))
-    groups = group_by_configuration(poses[number] + jitter * rng.standard_normal((160, N_JOINTS)))
+    q = poses[number] + jitter * rng.standard_normal((160, N_JOINTS))
+    groups = merge_guided_visits(q, group_by_configuration(q))
     np.testing.assert_array_equal(groups[:, None] == groups[None], number[:, None] == number[None])
 
 
@@ -196,6 +201,20 @@ def test_samples_of_a_path_and_random_ones_are_different_configurations(step):
     path = np.cumsum(step * rng.uniform(0.3, 1, (400, N_JOINTS)), 0)
     for q in (path, rng.uniform(-2, 2, (400, N_JOINTS)), np.linspace(0, 2, 400)[:, None]):
         np.testing.assert_array_equal(group_by_configuration(q), np.arange(400))
+        np.testing.assert_array_equal(merge_guided_visits(q, np.arange(400)), np.arange(400))
+
+
+@pytest.mark.parametrize(
+    ("n_poses", "n_visits", "distance", "is_merged"),
+    [(8, 6, 1.0, True), (20, 2, 1.0, False), (8, 6, 0.05, False), (8, 1000, 1.0, False)],
+)
+def test_only_far_groups_of_several_visits_are_merged(n_poses, n_visits, distance, is_merged):
+    rng = np.random.default_rng(0)
+    poses = distance * np.array([[i % 5, i // 5, 0.0] for i in range(n_poses)])
+    q = np.repeat(poses, n_visits, axis=0) + 5e-3 * rng.standard_normal((n_poses * n_visits, 3))
+    labels = np.arange(len(q))
+    expected = np.repeat(np.arange(n_poses), n_visits) if is_merged else labels
+    np.testing.assert_array_equal(merge_guided_visits(q, labels), expected)
 
 
 def test_a_sample_of_two_configurations_is_compared_by_both():
