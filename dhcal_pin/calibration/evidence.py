@@ -53,7 +53,7 @@ from .evaluation import (
 )
 from .fitted import FittedModel, take_samples
 from .good_samples import find_hidden_majority, independent_rows
-from .partition import configuration_groups, count_held_out, is_same_file, k_fold, of_same_files
+from .partition import configuration_groups, count_held_out, is_same_file, k_fold, of_same_files, path_folds
 
 if TYPE_CHECKING:
     from ..session.check import Recheck
@@ -364,7 +364,8 @@ class Evidence(FittedModel):
         if n_configurations < 2:
             return None
         n_folds = N_FOLDS if n_configurations > MAX_LEAVE_ONE_OUT else n_configurations
-        folds = k_fold(inliers, n_folds)
+        is_correlated = self.problem.temperature > 1
+        folds = (path_folds(inliers, n_folds) if is_correlated else None) or k_fold(inliers, n_folds)
         return compare_folds(self, folds, "cross-validated")
 
     @cached_property

@@ -16,6 +16,8 @@ questions are asked.
      w² = Σ x_i² / Σ γ_i and s² = ‖r‖² / (m - Σ γ_i) (MacKay 1992), but w is never above the expected one;
    - the squared error of random folds falls by more than the rule of the family says. Folds are random,
      not regions of joint space, as fast periodic errors are visible between neighbouring configurations only.
+     Neighbours on a recorded path can share noise: if the residuals with families are correlated there, the
+     families must not increase the error of left-out regions.
 
    Correction curves of high order are tried only on top of those of low order. The screening of the lines
    of the residuals spares most trials of curves that are not there.
@@ -102,6 +104,7 @@ from .partition import (
     contact_groups,
     different_configurations,
     k_fold,
+    path_folds,
     quadrant_folds,
 )
 from .reweighting import Fit, leverages, reweight, with_sigma_scales
@@ -606,6 +609,9 @@ def extend(fit: Fit, families: Sequence[str], max_iterations: int, progress: Pro
     geometry = _region_errors(judged.problem, core.solution.x, _noise(judged), 1.0)
     if errors and geometry:
         region_ratio = errors.rms / geometry.rms
+        # Neighbours on a path share noise, so that random folds do not show whether families adapt to it.
+        if is_extended and temperature > 1 and region_ratio > 1 and path_folds(judged.data, N_FOLDS):
+            return extend(fit, (), max_iterations, progress)
         if temperature > 1:
             scale = float(np.clip(errors.prediction_scale, MIN_PREDICTION_SCALE, MAX_PREDICTION_SCALE))
     extension = Extension(trials, temperature, n_configurations, scale, selection.random_ratio, region_ratio)

@@ -31,6 +31,7 @@ from ..exceptions import InvalidArgumentError, NotObservableError
 from ..measurements.arguments import as_measurements
 from ..measurements.base import Measurement
 from ..measurements.configurations import (
+    CONFIGURATION_TOL,
     connect_nodes,
     group_by_configuration,
     label_samples,
@@ -39,6 +40,14 @@ from ..measurements.configurations import (
 
 # Fraction of the samples that a blocked fold holds out at either end of a principal direction.
 BLOCK_FRACTION = 0.25
+# Number of parts that a recorded path is divided into, and numbers of samples of which paths are recognized.
+_N_PATH_PARTS, _MIN_PATH_SAMPLES, _MAX_PATH_SAMPLES = 25, 100, 100_000
+# Largest cosine of the angle between the directions to the two neighbours on a path, smallest share of such
+# samples, and number of samples that are checked. The share is above 0.75 on paths, at most 0.3 of random
+# samples of two joints, and 0.1 of more.
+_MAX_COSINE, _MIN_BETWEEN, _N_CHECKED = -0.8, 0.6, 40
+# Largest distance of neighbours on a path that share noise [rad or m].
+_MAX_STEP = 0.15
 # Principal directions whose spread is below this fraction of the largest one's are ignored.
 _MIN_RELATIVE_SPREAD = 1e-6
 
@@ -152,6 +161,49 @@ def k_fold(data: Measurement | Sequence[Measurement], count: int, seed: int = 0)
     # The last entry is that of label -1.
     fold_of = np.append(np.random.default_rng(seed).permutation(n_configurations) % count, -1)
     return tuple(_by_measurement(data, fold_of[labels] == fold) for fold in range(count))
+
+
+def path_folds(data: Sequence[Measurement], count: int) -> tuple[Fold, ...] | None:
+    """Divide the samples of a recorded path into folds; None for other samples.
+
+    Neighbours on a path share vibrations and slow noise of the instrument: a random fold would be judged by
+    the neighbours of its samples. Each fold therefore holds out several parts of joint space.
+    """
+    if any(item.configurations_per_row != 1 for item in data):
+        return None
+    q = np.concatenate([item.configurations() for item in data])
+    if not _MIN_PATH_SAMPLES <= len(q) <= _MAX_PATH_SAMPLES:
+        return None
+    ordered = q[order_of_rows(q)]
+    if not _is_dense_path(ordered):
+        return None
+    fold_of = np.random.default_rng(0).permutation(_N_PATH_PARTS) % count
+    parts = _parts(q, ordered[0])
+    return tuple(_by_measurement(data, fold_of[parts] == fold) for fold in range(count))
+
+
+def _is_dense_path(q: Array) -> bool:
+    """Return whether most joint values (m, n) lie between two near neighbours."""
+    is_between, steps = [], []
+    for row in q[:: -(-len(q) // _N_CHECKED)]:
+        sides = q - row
+        distances = np.linalg.norm(sides, axis=1)
+        distances[distances < CONFIGURATION_TOL] = np.inf
+        i, j = np.argpartition(distances, 2)[:2]
+        product = distances[i] * distances[j]
+        is_between.append(np.isfinite(product) and sides[i] @ sides[j] < _MAX_COSINE * product)
+        steps.append(min(distances[i], distances[j]))
+    return bool(np.mean(is_between) > _MIN_BETWEEN and np.median(steps) < _MAX_STEP)
+
+
+def _parts(q: Array, first: Array) -> Array:
+    """Divide joint values (m, n) into parts around rows that are far from each other, from the first on."""
+    nearest, parts = np.linalg.norm(q - first, axis=1), np.zeros(len(q), int)
+    for part in range(1, _N_PATH_PARTS):
+        distances = np.linalg.norm(q - q[np.argmax(nearest)], axis=1)
+        parts[distances < nearest] = part
+        nearest = np.minimum(nearest, distances)
+    return parts
 
 
 def count_held_out(data: Sequence[Measurement]) -> int:
