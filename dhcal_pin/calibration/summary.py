@@ -177,7 +177,7 @@ def sigma_notes(fit: Evidence) -> list[str]:
     """Return a sentence on stated standard deviations that are far larger than the residuals."""
     stated = {name: ratio for (_, is_stated, name), ratio in fit.noise_factors.items() if is_stated}
     ratio = min(stated.values(), default=1.0)
-    if ratio > MAX_SIGMA_SHARE or not fit.errors.has_arm:
+    if ratio > MAX_SIGMA_SHARE or fit.camera_stages or not fit.errors.has_arm:
         return []
     label = ERROR_GROUPS[error_group(min(stated, key=lambda name: stated[name]))].label
     return [

@@ -69,7 +69,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
         change = "smaller" if head.percent_reduction >= 0 else "larger"
         values.append(("", change, f"{abs(head.percent_reduction):.0f} %"))
     regions = summary.generalization_lines(context.fit.generalization, context.comparisons)
-    unshown = [] if verdict.is_refused else summary.accuracy_notes(context.fit)
+    notes = [] if verdict.is_refused else summary.accuracy_notes(context.fit)
     title = f"Calibration of {context.robot_name}"
     return Document(
         title=title,
@@ -81,7 +81,7 @@ def calibration_document(context: ReportContext, rendering: Rendering) -> Docume
         headline=head.text,
         values=values,
         details=_details(head),
-        remarks=[*context.source.remarks, *regions, *unshown, *context.fit.rounding_notes],
+        remarks=[*context.source.remarks, *regions, *notes, *context.fit.rounding_notes],
         note=note,
         warnings=_warnings(context),
         samples=lambda: context.samples.page_data(),
