@@ -84,6 +84,7 @@ def test_only_dense_paths_are_divided_into_parts():
     for q, is_path in (
         (path(rng, 1000, 25), True),
         (path(rng, 100, 25), False),
+        (path(rng, 130, 10), False),  # smooth, but with steps of 0.3 rad
         (path(rng, 60, 3), False),
         (rng.uniform(-2, 2, (1000, 6)), False),
         (rng.uniform(-2, 2, (1000, 2)), False),
