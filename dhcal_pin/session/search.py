@@ -38,7 +38,6 @@ from .._typing import Array
 from ..estimation.problem import Problem
 from ..estimation.robust import MAD_TO_STD
 from ..measurements.base import Measurement, residual_of
-from ..measurements.configurations import group_by_configuration
 from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
 from .facts import MAX_RANGE_ERROR, MAX_SCALE_CHANGE, Event, RangeError, Scale, Session, describe_lag
@@ -182,7 +181,7 @@ class _Search:
         self.paths = JointPaths(timeline) if can_lag else None
         # Repetitions show a change over time, but not one that is the same for all samples.
         n_different = sum(
-            item.residual_dim * len(np.unique(group_by_configuration(item.q))) for item in self.part.data
+            item.residual_dim * len(np.unique(item.configuration_groups)) for item in self.part.data
         )
         self.has_different_rows = n_different >= MIN_DIFFERENT_ROWS_PER_UNKNOWN * len(problem.weights)
         self.rows = self.linearize()
