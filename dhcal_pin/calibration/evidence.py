@@ -393,6 +393,11 @@ class Evidence(FittedModel):
         squares = _mean_squares(self, self.counted)
         return {key: float(np.sqrt(per_freedom * square)) for key, square in squares.items()}
 
+    @property
+    def stated_noise_factors(self) -> dict[str, float]:
+        """Noise over stated standard deviations, by residual group."""
+        return {name: ratio for (_, is_stated, name), ratio in self.noise_factors.items() if is_stated}
+
     @cached_property
     def holdout_chi_square(self) -> tuple[float, float] | None:
         """Reduced chi-square of the hold-out samples, and the probability of one at least as large by chance.

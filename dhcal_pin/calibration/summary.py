@@ -175,7 +175,7 @@ def size_notes(fit: Evidence) -> list[str]:
 
 def sigma_notes(fit: Evidence) -> list[str]:
     """Return a sentence on stated standard deviations that are far larger than the residuals."""
-    stated = {name: ratio for (_, is_stated, name), ratio in fit.noise_factors.items() if is_stated}
+    stated = fit.stated_noise_factors
     ratio = min(stated.values(), default=1.0)
     if ratio > MAX_SIGMA_SHARE or fit.camera_stages or not fit.errors.has_arm:
         return []

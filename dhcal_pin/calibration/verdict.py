@@ -814,7 +814,7 @@ def _hidden_position_errors(fit: Evidence) -> list[Finding]:
 
 def _wrong_sigmas(fit: Evidence, max_ratio: float) -> tuple[str, str] | None:
     """Name stated standard deviations as the reason if estimated ones do not hide the errors of positions."""
-    stated = {name: ratio for (_, is_stated, name), ratio in fit.noise_factors.items() if is_stated}
+    stated = fit.stated_noise_factors
     if fit.with_part is None or max(stated.values(), default=0.0) < MIN_SIGMA_RATIO:
         return None
     other = fit.with_part([item.replace(has_stated_sigma=False) for item in fit.data])

@@ -26,13 +26,13 @@ VISIT_TOL, VISIT_EXTENT = 5e-3, 2e-2
 VISIT_FRACTION, EXTENT_FRACTION = 5e-3, 2e-2
 # Largest number of pairs of rows that are compared for visits.
 MAX_COMPARED = 1_000_000
-# Visits of poses to which a person guides the robot again differ by more. They are groups of rows that are
-# connected by such differences [rad or m], at most this fraction of the range of the joint values, ...
+# Joint values of poses to which a person guides the robot again differ by more. Rows are visits of one pose
+# if their joint values differ by less than this [rad or m], at most this fraction of the range of the values.
 GUIDED_TOL, GUIDED_FRACTION = 5e-2, 2e-2
-# ... whose extent is at most this multiple of them, and whose distances are at least this multiple of the
-# largest extent. There are at least so many visits of a pose on the mean.
+# Largest range of the visits of one pose, as a multiple of that difference; smallest distance of two poses,
+# as a multiple of the largest range; and smallest mean number of visits of a pose.
 GUIDED_EXTENT, GUIDED_DISTANCE, MIN_GUIDED_VISITS = 4.0, 3.0, 3
-# Number of rows by which it is checked whether most rows have such neighbours, and largest number of rows.
+# Number of rows of which it is checked first whether they have such neighbours, and largest number of rows.
 GUIDED_CHECKED, MAX_GUIDED = 10, 5000
 
 
@@ -65,10 +65,8 @@ def group_by_configuration(q: Array) -> Array:
         return np.arange(m)
     visits = connect_nodes(len(rows), *map(np.concatenate, zip(near, same, strict=True)))
     equal = connect_nodes(len(rows), *same)
-    by_visit = np.argsort(visits, kind="stable")
-    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
-    extents = [bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum)]
-    is_visited = np.max(extents[0] - extents[1], axis=1) <= extent
+    largest, smallest = _bounds(rows, visits)
+    is_visited = np.max(largest - smallest, axis=1) <= extent
     labels = np.empty(m, int)
     labels[order] = np.where(is_visited[visits], visits, len(rows) + equal)[np.cumsum(is_new) - 1]
     return label_by_appearance(labels)
@@ -95,19 +93,24 @@ def merge_guided_visits(q: Array, labels: Array) -> Array:
     order = np.argsort(projection, kind="stable")
     rows = q[order]
     visits = connect_nodes(m, *_links(rows, projection[order], tol, m))
-    by_visit = np.argsort(visits, kind="stable")
-    starts = np.flatnonzero(np.diff(visits[by_visit], prepend=-1))
-    largest, smallest = (bound.reduceat(rows[by_visit], starts) for bound in (np.maximum, np.minimum))
-    extent = float(np.max(largest - smallest))
-    if m < MIN_GUIDED_VISITS * len(starts) or extent > GUIDED_EXTENT * tol:
+    largest, smallest = _bounds(rows, visits)
+    n_poses, extent = len(largest), float(np.max(largest - smallest))
+    if m < MIN_GUIDED_VISITS * n_poses or extent > GUIDED_EXTENT * tol:
         return labels
     centres = (largest + smallest) / 2
-    distances = np.max(np.abs(centres - centres[:, None]), axis=-1) + np.diag(np.full(len(starts), np.inf))
+    distances = np.max(np.abs(centres - centres[:, None]), axis=-1) + np.diag(np.full(n_poses, np.inf))
     if distances.min() < GUIDED_DISTANCE * extent:
         return labels
     merged = np.empty(m, int)
     merged[order] = visits
     return label_by_appearance(merged)
+
+
+def _bounds(rows: Array, labels: Array) -> tuple[Array, Array]:
+    """Return the largest and the smallest joint values (k, n) of the rows of each of k labels."""
+    order = np.argsort(labels, kind="stable")
+    starts = np.flatnonzero(np.diff(labels[order], prepend=-1))
+    return np.maximum.reduceat(rows[order], starts), np.minimum.reduceat(rows[order], starts)
 
 
 def _links(rows: Array, projection: Array, tol: float, max_offset: int) -> tuple[Array, Array]:
