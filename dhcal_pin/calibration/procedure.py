@@ -204,7 +204,7 @@ def _calibrate(
     is_ordered = options.session == "auto"
     begun = _begin(setup)
     # The confirmation of changes and the calibration itself often need the same fits.
-    groups_of = partial(_prior_groups, priors=setup.priors)
+    groups_of = cache(partial(_prior_groups, priors=setup.priors))
     reweighted = cache(lambda fit, stages: reweight(fit, stages, groups_of(fit), max_iterations, progress))
     extended = cache(lambda fit, names: model_selection.extend(fit, names, max_iterations, progress))
 

@@ -9,9 +9,11 @@ and for a pose also a rotation R_i:
 1. For a fixed offset t, the base has a closed form: the rigid motion that aligns the points F_i·t with the
    p_i in the least-squares sense, from the singular value decomposition of their covariance (Kabsch 1976;
    Arun, Huang and Blostein 1987).
-2. If t is unknown, it is tried on a grid of 27 points around the tip, and the best candidates are kept.
+2. If t is unknown, it is first tried at the tip, then on a grid of 26 points around it, from which the best
+   candidates are kept.
 3. The tool rotation is the mean of R_Fiᵀ·R_Bᵀ·R_i, projected on the rotations.
-4. Each candidate is refined by a nonlinear fit of the frames alone, and the best one is kept.
+4. The first candidate that agrees with the positions is kept. All others are refined by a nonlinear fit of
+   the frames alone, and the best one is kept.
 5. If even the best candidate disagrees with the positions, some of them may be gross mistakes, which ruin any
    least-squares start. Samples that disagree with a majority are left out then, and steps 1 to 4 repeated.
 
@@ -99,11 +101,16 @@ def align(source: Array, target: Array) -> tuple[Array, Array]:
 
 def subsample(item: Measurement) -> Measurement:
     """Take at most 100 samples or whole images, drawn at random from the order of their joint values."""
-    labels = item.sample_groups if item.n_images else np.arange(len(item.rows))
     order = np.lexsort(item.q.T[::-1])
-    names, first = np.unique(labels[order], return_index=True)
-    drawn = names[np.argsort(first)][np.random.default_rng(0).permutation(len(names))[:_MAX_SAMPLES]]
-    return item.take(np.flatnonzero(np.isin(labels, drawn)))
+    if not item.n_images:
+        return item.take(np.sort(_drawn(order)))
+    names, first = np.unique(item.sample_groups[order], return_index=True)
+    return item.take(np.flatnonzero(np.isin(item.sample_groups, _drawn(names[np.argsort(first)]))))
+
+
+def _drawn(numbers: Array) -> Array:
+    """Return at most 100 numbers (m,), drawn at random."""
+    return numbers[np.random.default_rng(0).permutation(len(numbers))[:_MAX_SAMPLES]]
 
 
 def measured_at_end(item: Measurement) -> tuple[Array, Array]:
@@ -133,18 +140,7 @@ def candidate_frames(
     tip = np.concatenate(tips)
     positions, measured_rotations = zip(*map(measured_at_end, with_positions), strict=True)
     measured = np.concatenate(positions)
-    if not is_base_unknown:
-        # With a known base the target is measured directly in the tip frame.
-        local = se3.inverse(chain.base @ tip)
-        offset = np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
-        best = [(chain.base, offset)]
-    else:
-        offsets = _offset_grid() if is_tool_unknown else chain.tool[None, :3, 3]
-        points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
-        motions, distances = align(points, measured)
-        order = np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]
-        best = [(motions[k], offsets[k]) for k in order]
-    for base, offset in best:
+    for base, offset in _aligned_frames(chain, tip, measured, is_base_unknown, is_tool_unknown):
         rotation = chain.tool[:3, :3]
         rotations = [
             np.swapaxes((base @ pose)[:, :3, :3], 1, 2) @ each
@@ -154,6 +150,24 @@ def candidate_frames(
         if is_tool_unknown and rotations:
             rotation = nearest_rotation(np.concatenate(rotations).sum(0))
         yield chain.with_base_and_tool(base, se3.transform(rotation, offset))
+
+
+def _aligned_frames(
+    chain: Chain, tip: Array, measured: Array, is_base_unknown: bool, is_tool_unknown: bool
+) -> Iterator[tuple[Array, Array]]:
+    """Generate base frames (4, 4) and tool offsets (3,) that align the tip poses (m, 4, 4) with positions."""
+    if not is_base_unknown:
+        # With a known base the target is measured directly in the tip frame.
+        local = se3.inverse(chain.base @ tip)
+        yield chain.base, np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
+        return
+    grid = _offset_grid() if is_tool_unknown else chain.tool[None, :3, 3]
+    # A target near the tip is the usual one; the other offsets are rarely needed.
+    for offsets in (grid[:1], grid[1:]):
+        points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
+        motions, distances = align(points, measured)
+        for k in np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]:
+            yield motions[k], offsets[k]
 
 
 def _offset_grid() -> Array:
@@ -288,13 +302,12 @@ def initialize_frames(
     is_unknown = BASE_FRAME in unknown_frames, errors.chain.tool_frame_index in unknown_frames
     drawn = tuple(subsample(item) for item in data)
     best = _best_frames(frames, drawn, known, max_iterations, is_unknown)
-    if best and relative_misfit(best[1], drawn) >= GOOD_RELATIVE_MISFIT:
+    if best and best[0] >= GOOD_RELATIVE_MISFIT:
         kept = agreeing_samples(errors.chain, drawn, *is_unknown)
         if not all(each.all() for each in kept):
             drawn = tuple(item.take(each) for item, each in zip(drawn, kept, strict=True))
             best = _best_frames(frames, drawn, known, max_iterations, is_unknown) or best
-    best = best or _fit_frames(frames, data, known, max_iterations)
-    return replace(errors, chain=best[1])
+    return replace(errors, chain=(best or _fit_frames(frames, data, known, max_iterations))[1])
 
 
 def _best_frames(
@@ -304,14 +317,18 @@ def _best_frames(
     max_iterations: int,
     is_unknown: tuple[bool, bool],
 ) -> tuple[float, Chain] | None:
-    """Return the cost and the chain of the best candidate, see `candidate_frames`; None if there is none."""
-    best: tuple[float, Chain] | None = None
+    """Return the relative misfit and the chain of the best candidate; None if there is none."""
+    fits: list[tuple[float, float, Chain]] = []
     for start in candidate_frames(frames.chain, data, *is_unknown):
-        fitted = _fit_frames(replace(frames, chain=start), data, known, max_iterations)
-        best = fitted if best is None else min(best, fitted, key=lambda each: each[0])
-        if relative_misfit(best[1], data) < GOOD_RELATIVE_MISFIT:
-            break
-    return best
+        misfit = relative_misfit(start, data)
+        if misfit < GOOD_RELATIVE_MISFIT:
+            return misfit, start
+        cost, fitted = _fit_frames(replace(frames, chain=start), data, known, max_iterations)
+        fits.append((cost, relative_misfit(fitted, data), fitted))
+        cost, misfit, fitted = min(fits, key=lambda each: each[0])
+        if misfit < GOOD_RELATIVE_MISFIT:
+            return misfit, fitted
+    return min(fits, key=lambda each: each[0])[1:] if fits else None
 
 
 def compare_tools(
