@@ -375,7 +375,7 @@ def _confirm_changes(session: Session, without: Fit, fit: Fit, extended: Extend)
     """Return whether changes explain measurements beside all families of joint errors, in first fits."""
     # Joint errors do not imitate changes that are far larger than what they leave. Others are fitted with the
     # families that the measurements support without the changes.
-    changes = [cause for cause in session.causes if not cause.block.is_constant]
+    changes = [cause for cause in session.causes if not cause.block.is_of_recording]
     timeline = session.timeline
     share = min([1.0, *(timeline.shorter_side(c.shape.number) for c in changes if isinstance(c.shape, Step))])
     # Half of the samples on the shorter side of a step have larger residuals.
@@ -445,7 +445,7 @@ def _turns_far(session: Session) -> bool:
 
 def without_changes(session: Session) -> Session:
     """Return a session in which nothing changed, and whose lag is not corrected."""
-    kept = tuple(cause for cause in session.causes if cause.block.is_constant)
+    kept = tuple(cause for cause in session.causes if cause.block.is_of_recording)
     lag = replace(session.lag, is_corrected=False) if session.lag else None
     return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=(), lag=lag)
 

@@ -6,8 +6,10 @@ A cause is a block of columns of the linear model, such as the six of the base, 
 - a drift: f rises from -1 at the beginning to 0 at the end, linearly or as 1 - exp(-t/τ);
 - a free drift: the first functions of the Karhunen-Loève expansion of a random walk that ends at 0,
   f = √2·sin(ω·(1 - s))/ω with ω = (i - ½)·π, for i = 1, 2, ... and the time s from 0 to 1;
-- a constant: f = 1, for a lag of the joint values and a scale of the instrument; and for a payload that was
-  never stated, beside a step of the payload.
+- a constant: f = 1, for a lag of the joint values and a scale of one axis of the instrument; and for a
+  payload that was never stated, beside a step of the payload.
+
+A scale of all axes is a step between two measurement files.
 
 Every f but the constant is 0 at the end, so that the robot of the fit is that at the end of the session.
 
@@ -43,11 +45,16 @@ class Block:
     columns: Array  # Indices of the columns, (c,)
     sizes: Array  # Change of each column that moves the tool by about 1 m, (c,)
     index: int = 0  # Number of the joint or of the axis of a scale; 0 for other blocks
-    is_constant: bool = False  # Whether it is the same for all samples
+    is_of_recording: bool = False  # Whether it is an error of the recording, not a change of the robot
     # Point whose motion is stated, in the frame of base or tool, (3,) [m].
     origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
     # Touched points in the frame of the base, (k, 3) [m], whose motion is stated in place of that of a point.
     touched: Array | None = None
+
+    @property
+    def changes_between_files(self) -> bool:
+        """Whether it is a scale of all axes, which shows only where it differs between files."""
+        return self.kind == "scale" and not self.of
 
     @property
     def levers(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from .. import se3
 from .._frozen import frozen
 from .._typing import Array
-from ..formatting import format_fixed, format_quantity, significant_decimals
+from ..formatting import format_fixed, format_quantity, join_names, significant_decimals
 from ..measurements.base import Measurement
 from ..robot.chain import Chain
 from ..robot.error_families import growing_links
@@ -225,6 +225,7 @@ class Scale:
     axis: str  # "x", "y" or "z" of the measuring frame; empty for all
     files: tuple[str, ...] = ()  # Measurement files with this scale; empty for all
     stated: str = ""  # Stated lengths, which nobody measured with the robot, if there are no others
+    others: tuple[str, ...] = ()  # Files with which these files are compared; empty for the nominal robot
 
     @property
     def finding(self) -> str:
@@ -237,6 +238,9 @@ class Scale:
         word = "longer" if self.factor > 1 else "shorter"
         decimals = significant_decimals(std)
         percent = f"{format_fixed(change, decimals)} ± {format_fixed(std, decimals)} %"
+        if self.others:
+            files, others = join_names(self.files), join_names(self.others)
+            return f"Measured lengths are {percent} {word} in {files} than in {others}."
         return f"The correction makes the whole robot {percent} {word}."
 
     @property
@@ -254,14 +258,25 @@ class Scale:
                 f"Check the stated {self.stated}: nothing else shows the size of the robot. If it is wrong, "
                 f"correct it, or add --mend scale:{self.factor:.6g}."
             )
+        if self.others:
+            return (
+                "The scale of the instrument changed, or the temperature of the robot: check both. "
+                "Measurements alone do not show which size is right. "
+                f"Add {_mends(self.factor, self.files)} if it is that in {join_names(self.others)}, or "
+                f"{_mends(1 / self.factor, self.others)} if it is that in {join_names(self.files)}."
+            )
         if abs(self.factor - 1) > MAX_INSTRUMENT_SCALE:
             return "No instrument is so wrong: the robot file is probably that of a robot of another size."
-        key = f"--mend scale:{self.factor:.6g}"
-        mends = " ".join(f"{key}@{file}" for file in self.files) or key
         return (
             "Check the scale of the instrument: measurements alone do not distinguish it from the size of "
-            f"the robot. If the instrument is wrong, add {mends}."
+            f"the robot. If the instrument is wrong, add {_mends(self.factor, self.files)}."
         )
+
+
+def _mends(factor: float, files: Sequence[str]) -> str:
+    """Return the options that undo a scale of some files, or of all."""
+    key = f"--mend scale:{factor:.6g}"
+    return " ".join(f"{key}@{file}" for file in files) or key
 
 
 @frozen
@@ -369,7 +384,7 @@ def histories(session: Session) -> Iterator[History]:
     by_number = np.argsort(np.concatenate(session.timeline.numbers))[begin:]
     numbers = np.concatenate(session.timeline.numbers)[by_number]
     times = np.concatenate(session.timeline.times)[by_number]
-    changes = [cause for cause in session.causes if not cause.block.is_constant]
+    changes = [cause for cause in session.causes if not cause.block.is_of_recording]
     for of in dict.fromkeys(cause.block.of or cause.block.kind for cause in changes):
         causes = [cause for cause in changes if (cause.block.of or cause.block.kind) == of]
         values, variance, unit = np.zeros(len(numbers)), np.zeros(len(numbers)), "m"
@@ -391,7 +406,7 @@ def describe_events(
     causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> tuple[Event, ...]:
     """Describe the sudden changes, in the order of measurement."""
-    steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step) and c.block.kind != "lag"]
+    steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step) and not c.block.is_of_recording]
     events = []
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
@@ -459,6 +474,25 @@ def _largest_change(cause: Cause, timeline: Timeline) -> tuple[Array, Array]:
     values = peak @ cause.amplitudes
     by_values = np.kron(peak[None], np.eye(len(values)))
     return values, by_values @ cause.covariance @ by_values.T
+
+
+def describe_scales_of_files(causes: tuple[Cause, ...], timeline: Timeline) -> list[Scale]:
+    """Describe the scales of files, compared with that of the last ones."""
+    own = [(c, c.shape.number) for c in causes if c.block.changes_between_files and isinstance(c.shape, Step)]
+    starts = sorted({number for _, number in own})
+    files: list[tuple[str, ...]] = []
+    for first, end in pairwise([timeline.begin, *starts, sum(map(len, timeline.numbers))]):
+        items = zip(timeline.data, timeline.numbers, strict=True)
+        inside = [item.source for item, numbers in items if ((first <= numbers) & (numbers < end)).any()]
+        files.append(tuple(dict.fromkeys(inside)))
+    scales = []
+    for start, names in zip(starts, files[:-1], strict=True):
+        later = [cause for cause, number in own if number >= start]
+        change = sum(float(cause.values[0]) for cause in later)
+        std = float(np.sqrt(sum(cause.covariance[0, 0] for cause in later)))
+        if abs(change) <= MAX_SCALE_CHANGE:
+            scales.append(Scale(1 - change, std, "", names, others=files[-1]))
+    return scales
 
 
 def describe_lag(causes: tuple[Cause, ...], changes: RobotChanges, timeline: Timeline) -> Lag | None:

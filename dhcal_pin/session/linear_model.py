@@ -58,7 +58,7 @@ class Layout:
     blocks: tuple[Block, ...]  # Possible causes
     joints: Array  # Columns of the joint zeros, (n,)
     links: Array  # Columns of the growth of each link, (k+1,)
-    scale: int  # Column of a scale of all axes
+    scale: int  # Column of a scale of all axes about the mean point
     range: int  # Column of a constant error of distances from the origin of the measuring frame
     payload: Array  # Columns of the motions of the joints by a payload, (n,)
     lag: int  # Column of the lag
@@ -81,7 +81,7 @@ class Layout:
         joints = p + s + np.arange(n)
         links = joints[-1] + 1 + np.arange(n_links)
         all_links = int(links[-1]) + 1
-        scales = all_links + 1 + np.arange(len(SCALE_AXES))
+        scales = all_links + 1 + np.arange(len(SCALE_AXES) + 1)
         range_error = int(scales[-1]) + 1
         payload = range_error + 1 + np.arange(n)
         lag = int(payload[-1]) + 1
@@ -109,12 +109,14 @@ class Layout:
             blocks.append(Block("payload", "", payload, np.where(torque > MIN_TORQUE, unit, HELD_SIZE)))
         if measures_positions(problem.data):
             blocks += [
-                Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_constant=True)
+                Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_of_recording=True)
                 for i, axis in enumerate(SCALE_AXES)
-                if axis  # the size of the robot imitates a scale of all axes
+                if axis  # the size of the robot imitates a scale of all axes in all files
             ]
-            blocks.append(Block("range", "", np.array([range_error]), np.array([1.0]), is_constant=True))
-        blocks.append(Block("lag", "", np.array([lag]), np.array([1.0]), is_constant=True))
+            if len(problem.data) > 1:
+                blocks.append(Block("scale", "", scales[-1:], np.array([1 / size]), is_of_recording=True))
+            blocks.append(Block("range", "", np.array([range_error]), np.array([1.0]), is_of_recording=True))
+        blocks.append(Block("lag", "", np.array([lag]), np.array([1.0]), is_of_recording=True))
         return cls(
             replace(problem, errors=extended),
             model,
@@ -136,7 +138,7 @@ class Layout:
         largest = np.abs(rows).max((0, 1))
         is_observed = largest > MIN_OBSERVED * largest[[b.columns[0] for b in self.blocks]].max()
         # The search itself adds a constant payload beside a step of it.
-        can_change = [b.columns for b in self.blocks if not (b.is_constant or b.kind == "payload")]
+        can_change = [b.columns for b in self.blocks if not (b.is_of_recording or b.kind == "payload")]
         changing = np.unique(np.concatenate(can_change))
         products = np.tensordot(rows, rows, ((0, 1), (0, 1)))
         of_model = products[np.ix_(self.model, changing)]
@@ -147,7 +149,7 @@ class Layout:
         blocks = [
             replace(block, sizes=np.where(is_observed[block.columns], block.sizes, HELD_SIZE))
             for block in self.blocks
-            if block.is_constant or not constant_only.intersection(block.columns.tolist())
+            if block.is_of_recording or not constant_only.intersection(block.columns.tolist())
         ]
         # The rotation of a tool of which only a point is measured would turn with the direction of its steps.
         weights = np.where(is_observed[self.model], self.weights, 1 / HELD_SIZE)
@@ -234,10 +236,13 @@ def _largest_torques(problem: Problem) -> Array:
 
 
 def _scale_motions(points: Array) -> Array:
-    """Return the twists of the tool point per unit of each scale, (4, 6, m), about the mean point."""
+    """Return the twists of the tool point per unit of each scale about the mean point, (5, 6, m).
+
+    The last one is about the origin of the measuring frame.
+    """
     centred = points - points.mean(1, keepdims=True)
-    out = np.zeros((len(SCALE_AXES), 6, points.shape[1]))
-    out[0, :3] = centred
+    out = np.zeros((len(SCALE_AXES) + 1, 6, points.shape[1]))
+    out[0, :3], out[-1, :3] = centred, points
     for axis in range(3):
         out[1 + axis, axis] = centred[axis]
     return out

@@ -40,7 +40,16 @@ from ..estimation.robust import MAD_TO_STD
 from ..measurements.base import Measurement, residual_of
 from ..robot.chain import Chain
 from .causes import Block, Cause, Constant, Drift, FreeDrift, Shape, Step
-from .facts import MAX_RANGE_ERROR, MAX_SCALE_CHANGE, Event, RangeError, Scale, Session, describe_lag
+from .facts import (
+    MAX_RANGE_ERROR,
+    MAX_SCALE_CHANGE,
+    Event,
+    RangeError,
+    Scale,
+    Session,
+    describe_lag,
+    describe_scales_of_files,
+)
 from .linear_model import Layout, covariance_root, inverse, solve_information, whitened_rows
 from .part_frames import place_parts, starts_of_parts
 from .robot_changes import JointPaths, RobotChanges, apply_changes, update
@@ -253,8 +262,9 @@ class _Search:
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
         for cause in causes:
             # A constant payload is part of the model, and changes nothing over time.
-            if isinstance(cause.shape, Constant) and cause.block.kind != "lag":
-                rows[..., -1] -= rows[..., cause.block.columns] @ cause.values
+            is_constant = isinstance(cause.shape, Constant) and cause.block.kind != "lag"
+            if is_constant or cause.block.changes_between_files:
+                rows[..., -1] -= cause.columns_of(rows, self.numbers, self.times) @ cause.values
         return rows
 
     def _columns(self, rows: Array, causes: Sequence[Cause], *others: Array) -> Array:
@@ -381,13 +391,14 @@ class _Search:
         """Yield the causes that are not in a fit, the function of time of greatest evidence of each."""
         products = self._products(fit)
         # Blocks with the same number of columns and the same functions of time are tested at once.
-        alike: dict[tuple[type[Shape], int, tuple[int, ...]], list[Block]] = {}
+        alike: dict[tuple[type[Shape], int, tuple[int, ...], bool], list[Block]] = {}
         for block in self.layout.blocks:
             for kind in self._kinds(block):
                 taken = self._taken_steps(block) if kind is Step else ()
-                alike.setdefault((kind, len(block.columns), taken), []).append(block)
-        for (kind, _, taken), blocks in alike.items():
-            if shapes := self._shapes(kind, taken):
+                key = kind, len(block.columns), taken, block.changes_between_files
+                alike.setdefault(key, []).append(block)
+        for (kind, _, taken, is_between_files), blocks in alike.items():
+            if shapes := self._shapes(kind, taken, is_between_files):
                 yield from self._scores(fit, blocks, shapes, products)
 
     def _follows_configuration(self, i: int) -> bool:
@@ -405,7 +416,7 @@ class _Search:
             names = ("rows", "columns", "residual", "weights", "noise")
             ordered = replace(fit, **{name: getattr(fit, name)[order] for name in names})
             vars(ordered)["test_root"] = root
-            return [cause for cause in without._candidates(ordered) if not cause.block.is_constant]
+            return [cause for cause in without._candidates(ordered) if not cause.block.is_of_recording]
 
         q = np.concatenate([item.q for item in self.part.data])[self.order]
         frames = [self.chain.forward_kinematics(item.conditions()) for item in self.part.data]
@@ -460,9 +471,11 @@ class _Search:
 
     def _kinds(self, block: Block) -> list[type[Shape]]:
         """Return the types of functions of time that are tested for a block."""
-        if block.is_constant:
+        if block.is_of_recording:
             is_shown = self.has_different_rows and (block.kind != "lag" or self.paths is not None)
             kinds: list[type[Shape]] = [Constant] if is_shown else []
+            if block.changes_between_files:
+                kinds = [Step] if is_shown and self.timeline.has_consecutive_files else []
             if is_shown and any(cause.block is block for cause in self.causes) and block.kind == "lag":
                 kinds = [Step, Drift]
         else:
@@ -478,13 +491,13 @@ class _Search:
         """Return the numbers of the samples at which a block has steps."""
         return tuple(c.shape.number for c in self.causes if c.block is block and isinstance(c.shape, Step))
 
-    def _shapes(self, kind: type[Shape], taken: Sequence[int]) -> list[Shape]:
+    def _shapes(self, kind: type[Shape], taken: Sequence[int], is_between_files: bool = False) -> list[Shape]:
         """Return the functions of time of a type, which are equally likely, without steps near others."""
         if kind is Constant:
             return [Constant()]
         if kind is Step:
             inner = self.edges
-            if not self.is_ordered:
+            if is_between_files or not self.is_ordered:
                 inner = np.searchsorted(self.numbers, self.timeline.file_starts)
             others = [self.begin, len(self.numbers), *np.searchsorted(self.numbers, taken).tolist()]
             inner = inner[np.abs(inner[:, None] - others).min(1) >= MIN_SIDE]
@@ -694,7 +707,7 @@ class _Search:
         """Move each step to where the samples before and after it fit best; return whether one moved."""
         has_moved = False
         for i, cause in enumerate(self.causes):
-            if not isinstance(cause.shape, Step):
+            if not isinstance(cause.shape, Step) or cause.block.changes_between_files:
                 continue
             change = fit.rows[..., cause.block.columns] @ cause.values / fit.noise
             old, number = cause.shape.number, self._best_place(fit, change, cause.shape.number)
@@ -729,7 +742,7 @@ class _Search:
             worst = min(judged_ones, key=lambda i: judged[i].log_evidence)
             if judged[worst].log_evidence >= MIN_LOG_EVIDENCE:
                 self.causes = judged
-                changes = (i for i in judged_ones if not judged[i].block.is_constant)
+                changes = (i for i in judged_ones if not judged[i].block.is_of_recording)
                 imitated = next((i for i in changes if self._follows_configuration(i)), None)
                 if imitated is None:
                     break
@@ -815,7 +828,7 @@ class _Search:
         values = self.layout.problem.instruments(self.layout.errors_at(self.x))
         held_out = timeline.numbers[timeline.n_fitted :]
         for i, cause in enumerate(self.causes):
-            if not isinstance(cause.shape, Step):
+            if not isinstance(cause.shape, Step) or cause.block.changes_between_files:
                 continue
             old = cause.shape.number
             last = self.numbers[self.numbers < old].max(initial=-1)
@@ -867,7 +880,7 @@ class _Search:
 
     def _steps_of_all(self, number: int) -> list[Cause]:
         """Return steps of base, tool, payload and the zeros of all joints at a sample."""
-        blocks = [b for b in self.layout.blocks if not b.is_constant and b.kind != "links"]
+        blocks = [b for b in self.layout.blocks if not b.is_of_recording and b.kind != "links"]
         return [Cause(b, Step(number), np.zeros(len(b.sizes)), np.empty((0, 0))) for b in blocks]
 
     def _gain_of_side(self, one: LinearFit, two: LinearFit, number: int, n_unknowns: int) -> float:
@@ -1037,10 +1050,13 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         causes,
         (other_robot,) if other_robot else (),
         lag=describe_lag(causes, search.changes, timeline),
-        scales=tuple(
-            Scale(1 + value, std, axis)
-            for kind, value, std, axis in constants
-            if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
+        scales=(
+            *(
+                Scale(1 + value, std, axis)
+                for kind, value, std, axis in constants
+                if kind == "scale" and abs(value) <= MAX_SCALE_CHANGE
+            ),
+            *describe_scales_of_files(causes, timeline),
         ),
         range_error=next(iter(ranges), None),
     ).described()

@@ -66,6 +66,12 @@ class Timeline:
         return np.concatenate([item.q for item in self.of_robot])
 
     @property
+    def has_consecutive_files(self) -> bool:
+        """Whether each file of the robot was measured before the next one began."""
+        files = {item.source or i for i, item in enumerate(self.of_robot)}
+        return len(self.file_starts) == len(files) - 1
+
+    @property
     def is_of_contacts(self) -> bool:
         """Whether all samples of the robot are contacts with points."""
         return all(isinstance(item, PointContact) for item in self.of_robot)

@@ -222,7 +222,7 @@ def test_rails_before_the_first_revolute_joint_move_the_arm_as_the_base_does():
 
 
 def test_a_lag_is_no_event_and_no_drift():
-    block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    block = Block("lag", "", np.array([0]), np.ones(1), is_of_recording=True)
     parts = RobotChanges(), rail(), order_samples(files_of(9), ())
     for shape in (Step(3), Drift(0.0, 8.0)):
         cause = Cause(block, shape, np.ones(1), np.ones((1, 1)))
@@ -260,7 +260,7 @@ def test_histories_are_the_changes_from_the_end_with_their_uncertainty():
     """A step and a drift of one joint add up; another joint and a lag are apart."""
     timeline = order_samples(files_of(6, 5), ())
     drift = replace(joint_step(0, 0, size=1e-3, std=3e-4), shape=Drift(0.0, 10.0))
-    block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    block = Block("lag", "", np.array([0]), np.ones(1), is_of_recording=True)
     lag = Cause(block, Constant(), np.ones(1), np.ones((1, 1)))
     causes = (joint_step(0, 4), lag, drift, joint_step(1, 6))
     first, second = histories(Session(timeline, rail(), True, causes=causes))
@@ -335,7 +335,7 @@ def test_a_lag_begins_with_the_first_sample_of_the_robot():
 
 def lag_of(shapes, timeline):
     """Return the description of a lag with amplitudes by function of time, each 1 % uncertain at most."""
-    block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    block = Block("lag", "", np.array([0]), np.ones(1), is_of_recording=True)
     causes = [Cause(block, f, np.array([v]), np.array([[(0.01 * v) ** 2]])) for f, v in shapes]
     changes = update(RobotChanges(), causes, [cause.values for cause in causes], np.eye(4), LINKS)
     found = describe_lag((*causes, joint_step(0, 5)), changes, timeline)
@@ -604,7 +604,7 @@ def test_a_session_applies_its_changes_to_its_samples():
     first, second = files_of(6, 6)
     timeline = order_samples((first,), (second,))
     step = joint_step(0, 9)
-    block = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    block = Block("lag", "", np.array([0]), np.ones(1), is_of_recording=True)
     lag = Cause(block, Constant(), np.array([0.5]), np.ones((1, 1)))
     rate = first.q[1] - first.q[0]
     before = [[-2e-3, 0.0]]

@@ -423,8 +423,8 @@ def test_changes_of_poses_are_those_of_camera_and_board(is_on_wrist):
     step, covariance = Step(5), np.eye(6)
     kinds: list[tuple[Any, bool]] = [("base", False), ("tool", False), ("joint", False), ("lag", True)]
     causes = tuple(
-        Cause(replace(block, kind=kind, is_constant=is_constant), step, np.full(6, 1e-3), covariance)
-        for kind, is_constant in kinds
+        Cause(replace(block, kind=kind, is_of_recording=is_of_recording), step, np.full(6, 1e-3), covariance)
+        for kind, is_of_recording in kinds
     )
     pose = images.image_poses()
     session = Session(order_samples([pose], ()), posed, True, causes=causes)

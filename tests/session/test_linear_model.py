@@ -51,9 +51,9 @@ def test_only_what_has_a_constant_error_changes(sets, kinds, joints):
     layout, n = Layout.of(problem), len(problem.weights)
     rows = whitened_rows(layout, np.zeros(n), problem.data, np.zeros((40, 6)))
     blocks = layout.restricted_to(rows).blocks
-    assert {b.kind for b in blocks if not b.is_constant} == {"joint", "payload", *kinds}
+    assert {b.kind for b in blocks if not b.is_of_recording} == {"joint", "payload", *kinds}
     assert [b.index for b in blocks if b.kind == "joint"] == list(joints)
-    assert {b.kind for b in blocks if b.is_constant} == {"scale", "range", "lag"}
+    assert {b.kind for b in blocks if b.is_of_recording} == {"scale", "range", "lag"}
 
 
 def test_torques_of_an_unstated_payload_are_the_largest_ones():
@@ -71,11 +71,12 @@ def test_torques_of_an_unstated_payload_are_the_largest_ones():
     np.testing.assert_array_equal(_largest_torques(problem_of(warm, simulation=simulation)), found)
 
 
-def test_scales_move_points_from_their_mean():
+def test_scales_move_points_from_their_mean_or_the_origin():
     points = np.array([[1.0, 3.0], [0.0, 4.0], [5.0, 5.0]])
     x, y, zero = [-1.0, 1.0], [-2.0, 2.0], [0.0, 0.0]
-    expected = np.zeros((4, 6, 2))
+    expected = np.zeros((5, 6, 2))
     expected[0, :3], expected[1, 0], expected[2, 1], expected[3, 2] = [x, y, zero], x, y, zero
+    expected[4, :3] = points
     np.testing.assert_array_equal(_scale_motions(points), expected)
 
 

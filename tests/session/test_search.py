@@ -1292,7 +1292,7 @@ def test_causes_have_the_sizes_that_move_the_tool_by_a_metre(kind):
         assert block.columns[0] == layout.joints[j]
     for i, axis in enumerate("xyz"):
         block = sizes["scale", axis, 1]
-        assert (block.columns[0], block.index, block.is_constant) == (layout.scale + 1 + i, i + 1, True)
+        assert (block.columns[0], block.index, block.is_of_recording) == (layout.scale + 1 + i, i + 1, True)
     assert sizes["lag", "", 1].columns[0] == layout.lag == layout.n_columns - 2
     # A payload bends the joint with the largest torque as if the tool moved by a metre.
     torques = np.abs(chain.loads.torques_per_kilogram(layout.problem.data[0].q.T)).max(1)

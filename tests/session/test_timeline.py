@@ -209,7 +209,7 @@ def test_increments_of_causes_add_up_to_the_motions_of_the_robot():
     joint = Block("joint", "x", np.array([0]), np.ones(1), 2)
     payload = Block("payload", "", np.arange(6), np.ones(6))
     own, every = Block("links", "", links[2:4], np.ones(2)), Block("links", "", np.array([9]), np.ones(1))
-    lag = Block("lag", "", np.array([0]), np.ones(1), is_constant=True)
+    lag = Block("lag", "", np.array([0]), np.ones(1), is_of_recording=True)
     pairs = [
         (base, late), (tool, early), (base, early), (tool, free), (base, drift), (joint, late),
         (joint, drift), (payload, late), (payload, Constant()), (own, early), (every, drift),

@@ -100,7 +100,7 @@ def find_image_session(
     causes = [
         replace(cause, block=replace(cause.block, **blocks.get(cause.block.kind, {})))
         for cause in found.causes
-        if not cause.block.is_constant
+        if not cause.block.is_of_recording
         and (cause.block.kind in motions if cause.block.kind in blocks else arm.shows_joint_changes)
     ]
     changes = found.changes.carried_to(base, tool).with_motions(motions)
