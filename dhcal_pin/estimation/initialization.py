@@ -161,19 +161,18 @@ def _aligned_frames(
         local = se3.inverse(chain.base @ tip)
         yield chain.base, np.mean((local[:, :3, :3] @ measured[..., None])[..., 0] + local[:, :3, 3], 0)
         return
-    grid = _offset_grid() if is_tool_unknown else chain.tool[None, :3, 3]
-    # A target near the tip is the usual one; the other offsets are rarely needed.
-    for offsets in (grid[:1], grid[1:]):
+    for offsets in _tool_offsets() if is_tool_unknown else [chain.tool[None, :3, 3]]:
         points = tip[:, :3, 3] + (tip[:, :3, :3] @ offsets.T).transpose(2, 0, 1)
         motions, distances = align(points, measured)
         for k in np.argsort(distances, kind="stable")[:_MAX_CANDIDATES]:
             yield motions[k], offsets[k]
 
 
-def _offset_grid() -> Array:
-    """Return the tool offsets (27, 3) that are tried, zero first."""
+def _tool_offsets() -> Iterator[Array]:
+    """Generate the tool offsets (·, 3) that are tried: zero, which is the usual one, and a grid around it."""
+    yield np.zeros((1, 3))
     steps = [0.0, -_TOOL_OFFSET, _TOOL_OFFSET]
-    return np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    yield np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)[1:]
 
 
 def relative_misfit(chain: Chain, data: Sequence[Measurement]) -> float:
@@ -344,7 +343,7 @@ def compare_tools(
         return started
     drawn = tuple(subsample(item) for item in data)
     costs, chain = [], frames.chain
-    offsets = se3.transform(np.eye(3), _offset_grid())
+    offsets = se3.transform(np.eye(3), np.concatenate([*_tool_offsets()]))
     chains = [chain.with_base_and_tool(chain.base, chain.tool @ offset) for offset in offsets]
     for each in chains:
         items = tuple(item.initialized(each) for item in drawn)

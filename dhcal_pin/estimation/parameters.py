@@ -67,7 +67,7 @@ AXIS_ALIGNMENT_TOL = 1e-5
 
 _FRAME_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 _FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
-_FRAME_TWISTS = np.eye(6)
+_FRAME_TWISTS = tuple(map(tuple, np.eye(6).tolist()))
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -135,7 +135,7 @@ def hayati(chain: Chain) -> list[ErrorParameter]:
 def _frame_parameters(prefix: str, error_frame: int, length: float, angle: float) -> list[ErrorParameter]:
     """Build three translations and three rotations of a frame, with prior standard deviations [m, rad]."""
     return [
-        ErrorParameter(f"{prefix}.{name}", unit, 0.0, error_frame, tuple(twist), prior)
+        ErrorParameter(f"{prefix}.{name}", unit, 0.0, error_frame, twist, prior)
         for name, unit, twist, prior in zip(
             _FRAME_NAMES, _FRAME_UNITS, _FRAME_TWISTS, (length,) * 3 + (angle,) * 3, strict=True
         )
