@@ -455,8 +455,11 @@ def _session(fit: Evidence) -> list[Finding]:
     """Advise caution if something happened during the measurement; refuse a robot of an impossible size."""
     if fit.session is None:
         return []
-    is_refused = any(scale.is_impossible for scale in fit.session.scales)
-    return [Finding("refused" if is_refused else "caution", text) for text in fit.session.sentences]
+    impossible = [scale for scale in fit.session.scales if scale.is_impossible]
+    return [
+        Finding("refused" if item in impossible else "caution", text)
+        for item, text in zip(fit.session.found, fit.session.sentences, strict=True)
+    ]
 
 
 def _convergence(fit: Evidence, causes: Sequence[Finding]) -> list[Finding]:
