@@ -156,6 +156,9 @@ MAX_ROWS_PER_DIRECTION = 4.0
 # positions with outliers were "ok" with up to 20 times the error of clean samples below this limit, and twice
 # above it.
 MIN_STATED_ROWS_PER_DIRECTION = 1.5
+# Standard deviation of the change of the parameters that leaves special positions, as of a target on an axis
+# [m or rad].
+GENERIC_CHANGE = 1e-3
 
 
 @frozen
@@ -1054,8 +1057,10 @@ def needed_poses(fit: Evidence) -> int:
     rows_per_direction = _min_rows_per_direction(fit)
     if fit.camera_stages or fit.hand_eye or fit.rows_per_direction >= rows_per_direction:
         return 0
-    # The present rows may be too few to determine all directions that many rows would determine.
-    factors = ObservabilityProbe(fit.problem, fit.x).full_range, fit.solution.system.r
+    # The present rows may be too few to determine all directions that many rows would determine. The
+    # parameters are moved: a target that is exactly on an axis hides directions that a fit would determine.
+    moved = fit.x + np.random.default_rng(0).normal(0.0, GENERIC_CHANGE, len(fit.x))
+    factors = ObservabilityProbe(fit.problem, moved).full_range, fit.solution.system.r
     many, present = (count_geometric_directions(fit, r) for r in factors)
     n_configurations = len(np.unique(configuration_groups(fit.data)))
     growth = max(many / present, 1.0)

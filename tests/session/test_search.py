@@ -139,8 +139,9 @@ def test_only_an_order_shows_lags_and_drifts(monkeypatch):
     assert (search._kinds(lag), search._kinds(links)) == ([Drift], [FreeDrift])
     unordered = searched(simulation, files_of(data.take(np.s_[:20]), data.take(np.s_[20:])), is_ordered=False)
     assert unordered.paths is None
-    kinds = {b.kind: unordered._kinds(b) for b in unordered.layout.blocks}
+    kinds = {b.kind: unordered._kinds(b) for b in unordered.layout.blocks if not b.changes_between_files}
     assert (kinds["lag"], kinds["base"], kinds["links"], kinds["scale"]) == ([], [Step], [], [Constant])
+    assert [unordered._kinds(b) for b in unordered.layout.blocks if b.changes_between_files] == [[Step]]
     assert unordered._shapes(Step, ()) == [Step(20)]
     monkeypatch.setattr(search_module, "MAX_PATH_SAMPLES", 59)
     assert searched(simulation, (data,)).paths is None
