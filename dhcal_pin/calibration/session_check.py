@@ -447,7 +447,7 @@ def without_changes(session: Session) -> Session:
     """Return a session in which nothing changed, and whose lag is not corrected."""
     kept = tuple(cause for cause in session.causes if cause.block.is_of_recording)
     lag = replace(session.lag, is_corrected=False) if session.lag else None
-    return replace(session, changes=RobotChanges(), causes=kept, events=(), drifts=(), lag=lag)
+    return replace(session, changes=RobotChanges(), causes=kept, events=(), lag=lag).described()
 
 
 def with_directions(begun: SessionFit, supported: Callable[[Fit], ExtendedFit]) -> SessionFit:

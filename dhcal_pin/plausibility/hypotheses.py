@@ -31,6 +31,7 @@ from ..measurements.euler_angles import (
     angles_to_matrix,
     matrix_to_angles,
 )
+from ..measurements.length import Wires
 from ..measurements.pose import Pose, PoseMeasurement
 from ..measurements.position import MultiTargetPosition, PointMeasurement, Position
 from ..robot.chain import Chain
@@ -200,6 +201,22 @@ class RangeChange:
             return None
         distances = np.maximum(np.linalg.norm(item.positions(), axis=1), _MIN_DISTANCE)
         return _with_positions(item, item.positions() * (1 - self.error / distances)[:, None])
+
+
+@frozen
+class WireChange:
+    """Constant error of the lengths of a wire."""
+
+    wire: int  # Number of the wire
+    error: float  # Measured less true length [m]
+
+    def apply(self, item: Measurement) -> Measurement | None:
+        """Return the measurements without this error."""
+        if not isinstance(item, Wires) or self.wire >= item.values.shape[1]:
+            return None
+        values = item.values.copy()
+        values[:, self.wire] -= self.error
+        return item.replace(values=values)
 
 
 @frozen
@@ -550,7 +567,7 @@ def mend_files(chain: Chain, data: Sequence[Measurement], key: str) -> list[Meas
                 if first in by_key or _change_of_joint(chain, first):
                     return mend_files(chain, mend_files(chain, data, first), rest)
             near = difflib.get_close_matches(key, by_key, 3, 0.0)
-            sizes = "ratio", "lag", "scale", "range"
+            sizes = "ratio", "lag", "scale", "range", "wire"
             kinds = dict.fromkeys([*(known.partition(":")[0] for known in by_key), *sizes])
             raise UnknownNameError(
                 f"--mend {key!r}: unknown change; choose one such as {', '.join(near)}; kinds of changes are "
@@ -582,26 +599,28 @@ def mend_lines(
 
 
 def _change_of_size(key: str) -> Change | None:
-    """Return the change `lag:TIME`, `range:LENGTH`, `scale:FACTOR` or `scale:AXIS:FACTOR`, or None."""
-    found = re.fullmatch(r"(lag|range|scale)(?::([xyz]))?:([-+0-9.e]+)", key)
-    if found is None or (found[2] and found[1] != "scale"):
-        return None
-    kind, axis, number = found.groups()
-    middle, limit, what = {
-        "lag": (0.0, MAX_LAG, "a time"),
-        "range": (0.0, MAX_RANGE_ERROR, "a length in m"),
-        "scale": (1.0, MAX_SCALE_CHANGE, "a factor"),
-    }[kind]
-    with suppress(ValueError):
-        value = float(number)
-        if abs(value - middle) <= limit:
-            if kind == "lag":
-                return LagChange(value)
-            if kind == "range":
-                return RangeChange(value)
-            return AxisScale("xyz".index(axis), value) if axis else LengthChange(1 / value)
-    expected = f"{what} from {middle - limit:g} to {middle + limit:g}"
-    raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
+    """Return the change of a key such as `lag:TIME` or `scale:AXIS:FACTOR`, or None."""
+    for pattern, middle, limit, what, change_of in _SIZES:
+        if found := re.fullmatch(f"{pattern}:([-+0-9.e]+)", key):
+            *of, number = found.groups()
+            with suppress(ValueError):
+                value = float(number)
+                if abs(value - middle) <= limit:
+                    return change_of(value, *of)
+            expected = f"{what} from {middle - limit:g} to {middle + limit:g}"
+            raise InvalidArgumentError(f"--mend {key!r}: {number} is not possible; expected {expected}")
+    return None
+
+
+# Changes of a size: pattern of the key, size without an effect, largest change of the size, what it is,
+# and the change.
+_SIZES: tuple[tuple[str, float, float, str, Callable[..., Change]], ...] = (
+    ("lag", 0.0, MAX_LAG, "a time", LagChange),
+    ("range", 0.0, MAX_RANGE_ERROR, "a length in m", RangeChange),
+    ("wire:([1-9])", 0.0, MAX_RANGE_ERROR, "a length in m", lambda x, of: WireChange(int(of) - 1, x)),
+    ("scale", 1.0, MAX_SCALE_CHANGE, "a factor", lambda x: LengthChange(1 / x)),
+    ("scale:([xyz])", 1.0, MAX_SCALE_CHANGE, "a factor", lambda x, of: AxisScale("xyz".index(of), x)),
+)
 
 
 def _change_of_joint(chain: Chain, key: str) -> Change | None:

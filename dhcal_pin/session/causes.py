@@ -9,7 +9,7 @@ A cause is a block of columns of the linear model, such as the six of the base, 
 - a constant: f = 1, for a lag of the joint values and a scale of one axis of the instrument; and for a
   payload that was never stated, beside a step of the payload.
 
-A scale of all axes is a step between two measurement files.
+A scale of all axes is a step between two measurement files, and the zero of a wire a step anywhere.
 
 Every f but the constant is 0 at the end, so that the robot of the fit is that at the end of the session.
 
@@ -33,34 +33,7 @@ HELD_SIZE = 1e-12
 # Number of functions of a free drift.
 N_FUNCTIONS = 8
 
-Kind = Literal["base", "tool", "joint", "links", "payload", "robot", "lag", "scale", "range"]
-
-
-@frozen(eq=False)
-class Block:
-    """Columns of the linear model that one cause uses."""
-
-    kind: Kind  # What changes
-    of: str  # Name of the joint, of the axis of a scale, or of what moved if not base or tool; else empty
-    columns: Array  # Indices of the columns, (c,)
-    sizes: Array  # Change of each column that moves the tool by about 1 m, (c,)
-    index: int = 0  # Number of the joint or of the axis of a scale; 0 for other blocks
-    is_of_recording: bool = False  # Whether it is an error of the recording, not a change of the robot
-    # Point whose motion is stated, in the frame of base or tool, (3,) [m].
-    origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
-    # Touched points in the frame of the base, (k, 3) [m], whose motion is stated in place of that of a point.
-    touched: Array | None = None
-
-    @property
-    def changes_between_files(self) -> bool:
-        """Whether it is a scale of all axes, which shows only where it differs between files."""
-        return self.kind == "scale" and not self.of
-
-    @property
-    def levers(self) -> Array:
-        """Motion of the tool per unit of each column, (c,); 0 for columns that are held at zero."""
-        is_free = self.sizes > HELD_SIZE
-        return np.where(is_free, 1 / np.where(is_free, self.sizes, 1.0), 0.0)
+Kind = Literal["base", "tool", "joint", "links", "payload", "robot", "lag", "scale", "range", "wire"]
 
 
 @frozen
@@ -121,6 +94,41 @@ def _elapsed(begin: float, end: float, times: Array) -> Array:
 
 Change = Step | Drift | FreeDrift
 Shape = Change | Constant
+
+
+@frozen(eq=False)
+class Block:
+    """Columns of the linear model that one cause uses."""
+
+    kind: Kind  # What changes
+    # Name of the joint, axis or wire, or of what moved if not base or tool; else empty.
+    of: str
+    columns: Array  # Indices of the columns, (c,)
+    sizes: Array  # Change of each column that moves the tool by about 1 m, (c,)
+    index: int = 0  # Number of the joint or of the axis of a scale; 0 for other blocks
+    # Types of functions of time that are looked for.
+    shapes: tuple[type[Shape], ...] = (Step, Drift, FreeDrift)
+    is_of_recording: bool = False  # Whether it is an error of the recording, not a change of the robot
+    # Point whose motion is stated, in the frame of base or tool, (3,) [m].
+    origin: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    # Touched points in the frame of the base, (k, 3) [m], whose motion is stated in place of that of a point.
+    touched: Array | None = None
+
+    @property
+    def is_of_values(self) -> bool:
+        """Whether it is an error of measured values, which the conditions of a sample do not contain."""
+        return self.is_of_recording and self.kind != "lag"
+
+    @property
+    def changes_between_files(self) -> bool:
+        """Whether it is a scale of all axes, which shows only where it differs between files."""
+        return self.kind == "scale" and not self.of
+
+    @property
+    def levers(self) -> Array:
+        """Motion of the tool per unit of each column, (c,); 0 for columns that are held at zero."""
+        is_free = self.sizes > HELD_SIZE
+        return np.where(is_free, 1 / np.where(is_free, self.sizes, 1.0), 0.0)
 
 
 @frozen(eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
@@ -32,6 +32,9 @@ MAX_INSTRUMENT_SCALE = 0.1
 MAX_SIZE_CHANGE = 0.03
 # Smallest lag that is stated, in standard deviations.
 MIN_STATED_LAG = 4.0
+# The zero of a wire is right if its error is at most the first number of standard deviations, and that of the
+# wrong one is more than the second one.
+MAX_RIGHT_ZERO, MIN_WRONG_ZERO = 3.0, 5.0
 # What a robot touches: its motion has the effect of one of the base.
 TOUCHED = "touched object"
 
@@ -40,14 +43,17 @@ TOUCHED = "touched object"
 class Event:
     """Sudden change between two samples."""
 
-    kind: str  # "base", "tool", "joint", "payload" or "robot"
-    of: str  # Name of the joint or parameter, or of what moved if not base or tool; else empty
+    kind: str  # "base", "tool", "joint", "payload", "wire" or "robot"
+    of: str  # Name of the joint, wire or parameter, or of what moved if not base or tool; else empty
     before: Place  # Place of the last sample before it
     after: Place  # Place of the first sample after it
     size: float  # Size of the change, in `unit`
     std: float  # Standard deviation of the size
     unit: str  # "m" or "rad"
     rivals: tuple[str, ...] = ()  # Parts whose motion has the same effect
+    # Options that undo a change of the zero of a wire, in the samples after it or before it, by the zero that
+    # is then right: "earlier" or "later"; one if the measurements show which.
+    mends: tuple[tuple[str, str], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the event for the JSON document."""
@@ -83,6 +89,8 @@ class Event:
             return f"Two robots were measured: from {where} on, {self.of} differs by {size}."
         if self.kind == "joint":
             return f"The zero of joint {self.of} changed by {size} {self.place}."
+        if self.kind == "wire":
+            return f"The zero of wire {self.of} changed by {size} {self.place}."
         if self.kind == "payload":
             return f"The load on the arm changed {self.place}, which moved the tool by {size}."
         verb = "turned" if self.unit == "rad" else "moved"
@@ -100,6 +108,13 @@ class Event:
                 "The result is the arm with the load after the change. State the mass at the tip in each "
                 "row, in a column payload[kg]."
             )
+        if self.kind == "wire":
+            known = f" The robot fits the {self.mends[0][0]} zero." if len(self.mends) == 1 else ""
+            choices = [
+                f", or add {option}{f' if the {right} zero is right' * (not known)}"
+                for right, option in self.mends
+            ]
+            return f"It is not corrected.{known} Check the sensor{''.join(choices)}."
         pose = f"{self.of or self.kind} pose"
         fitted = f"Both parts were fitted with their own {pose}; the result has that of the later part."
         return fitted + _same_effect(self.rivals)
@@ -406,14 +421,62 @@ def describe_events(
     causes: tuple[Cause, ...], changes: RobotChanges, chain: Chain, timeline: Timeline
 ) -> tuple[Event, ...]:
     """Describe the sudden changes, in the order of measurement."""
-    steps = [(c, c.shape) for c in causes if isinstance(c.shape, Step) and not c.block.is_of_recording]
+    steps = [
+        (c, c.shape)
+        for c in causes
+        if isinstance(c.shape, Step) and (c.block.kind == "wire" or not c.block.is_of_recording)
+    ]
     events = []
     for cause, shape in sorted(steps, key=lambda pair: pair[1].number):
         size, std, unit = cause_size(cause, changes, chain, timeline)
         before, after = (timeline.place(shape.number + i) for i in (-1, 0))
         rivals = _rivals(cause.block, chain, timeline)
-        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit, rivals))
+        mends = _mends_of_wire(cause, shape, causes, timeline) if cause.block.kind == "wire" else ()
+        events.append(Event(cause.block.kind, cause.block.of, before, after, size, std, unit, rivals, mends))
     return tuple(events)
+
+
+def _mends_of_wire(
+    cause: Cause, step: Step, causes: Sequence[Cause], timeline: Timeline
+) -> tuple[tuple[str, str], ...]:
+    """Return the options that undo a change of the zero of a wire, by the zero that is right."""
+    change = float(cause.values[0])
+    key = f"--mend wire:{cause.block.of}"
+    options = {
+        "earlier": _of_samples(f"{key}:{change:.6f}", timeline, lambda numbers: numbers >= step.number),
+        "later": _of_samples(f"{key}:{-change:.6f}", timeline, lambda numbers: numbers < step.number),
+    }
+    if not all(options.values()):
+        return ()
+    own = [each for each in causes if (each.block.kind, each.block.of) == (cause.block.kind, cause.block.of)]
+    # Error of the zero before and after the step, and its standard deviation.
+    numbers = np.array([step.number - 1, step.number])
+    errors = np.abs(sum(each.shape.values(numbers, numbers)[:, 0] * each.values[0] for each in own))
+    std = max(float(np.sqrt(each.covariance[0, 0])) for each in own)
+    if errors.min() <= MAX_RIGHT_ZERO * std < MIN_WRONG_ZERO * std <= errors.max():
+        right = ("earlier", "later")[int(np.argmin(errors))]
+        options = {right: options[right]}
+    return tuple(options.items())
+
+
+def _of_samples(option: str, timeline: Timeline, is_inside: Callable[[Array], Array]) -> str:
+    """Return an option for the files and lines of the samples with some numbers; empty if impossible."""
+    options = []
+    for source in dict.fromkeys(item.source for item in timeline.of_robot):
+        parts = [
+            (item.rows, is_inside(numbers))
+            for item, numbers in zip(timeline.data, timeline.numbers, strict=True)
+            if item.source == source
+        ]
+        rows, inside = (np.concatenate(each) for each in zip(*parts, strict=True))
+        if not inside.any():
+            continue
+        first, last = int(rows[inside].min()), int(rows[inside].max())
+        if not source or ((rows >= first) & (rows <= last) & ~inside).any():
+            return ""
+        lines = "" if inside.all() else f":{first}-{last}"
+        options.append(f"{option}@{source}{lines}")
+    return " ".join(options)
 
 
 def _step_size(cause: Cause, step: Step, changes: RobotChanges, chain: Chain) -> tuple[float, float, str]:
@@ -455,8 +518,8 @@ def cause_size(
     if isinstance(shape, Step) and block.kind in ("base", "tool"):
         return _step_size(cause, shape, changes, chain)
     values, covariance = _largest_change(cause, timeline)
-    if block.kind == "joint":
-        unit = "m" if chain.is_prismatic[block.index] else "rad"
+    if block.kind in ("joint", "wire"):
+        unit = "m" if block.kind == "wire" or chain.is_prismatic[block.index] else "rad"
         return abs(float(values[0])), float(np.sqrt(covariance[0, 0])), unit
     if block.kind == "links":
         return *_growth_size(values, covariance, chain, timeline), "m"

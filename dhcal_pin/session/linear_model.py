@@ -2,7 +2,7 @@
 
 The columns are those of the parameters of the robot and of the instruments, then of base and tool, of the
 joint zeros, of the growth of each link, of scales of the instrument, of a constant error of its distances
-from the origin of the measuring frame, of a payload and of a lag, and last the
+from the origin of the measuring frame, of a payload, of a lag and of the zero of each wire, and last the
 residual r. A payload turns each joint by its compliance times the gravity torque of the payload. The column
 of a joint is its motion per kilogram and unit of compliance.
 
@@ -24,8 +24,9 @@ from ..estimation.parameters import base, tool
 from ..estimation.problem import Problem
 from ..measurements.base import Measurement, instrument_values
 from ..measurements.groups import POSITION
+from ..measurements.length import Wires
 from ..robot.error_families import COMPLIANCE, JOINT_TERMS, MIN_TORQUE, growing_links
-from .causes import HELD_SIZE, Block
+from .causes import HELD_SIZE, Block, Constant, Drift, FreeDrift, Kind, Shape, Step
 
 # Factor to the prior standard deviations: the errors of an arm may be far larger than expected.
 PRIOR_FACTOR = 10.0
@@ -62,6 +63,7 @@ class Layout:
     range: int  # Column of a constant error of distances from the origin of the measuring frame
     payload: Array  # Columns of the motions of the joints by a payload, (n,)
     lag: int  # Column of the lag
+    wires: Array  # Columns of the zeros of the wires
     n_columns: int  # Number of columns, the residual included
 
     @classmethod
@@ -85,6 +87,8 @@ class Layout:
         range_error = int(scales[-1]) + 1
         payload = range_error + 1 + np.arange(n)
         lag = int(payload[-1]) + 1
+        counts = [item.values.shape[1] for item in problem.data if isinstance(item, Wires)]
+        wires = lag + 1 + np.arange(max(counts, default=0))
         grows = growing_links(chain.link_vectors)
         # A robot without lengths only turns.
         size = float(np.linalg.norm(chain.link_vectors, axis=1).sum()) or 1.0
@@ -100,23 +104,33 @@ class Layout:
             blocks.append(Block("joint", name, joints[j : j + 1], np.array([unit]), j))
         # All links by one factor, or each by its own.
         if has_joints and grows.any():
-            blocks.append(Block("links", "", np.array([all_links]), np.array([1 / size])))
-            blocks.append(Block("links", "", links[grows], np.full(grows.sum(), 1 / size)))
+            drifts = Drift, FreeDrift
+            blocks.append(Block("links", "", np.array([all_links]), np.array([1 / size]), shapes=drifts))
+            blocks.append(Block("links", "", links[grows], np.full(grows.sum(), 1 / size), shapes=drifts))
         # Robots without masses do not bend, and a payload that is stated has been taken into account.
         torque = _largest_torques(problem)
         if has_joints and torque.any():
             unit = 1 / (size * torque.max())
-            blocks.append(Block("payload", "", payload, np.where(torque > MIN_TORQUE, unit, HELD_SIZE)))
+            sizes = np.where(torque > MIN_TORQUE, unit, HELD_SIZE)
+            blocks.append(Block("payload", "", payload, sizes, shapes=(Step,)))
+
+        def add_error(
+            kind: Kind, of: str, column: int, unit: float, shape: type[Shape] = Constant, index: int = 0
+        ) -> None:
+            """Add an error of the recording with one coefficient."""
+            sizes = np.array([unit])
+            blocks.append(Block(kind, of, np.array([column]), sizes, index, (shape,), is_of_recording=True))
+
         if measures_positions(problem.data):
-            blocks += [
-                Block("scale", axis, scales[i : i + 1], np.array([1 / size]), i, is_of_recording=True)
-                for i, axis in enumerate(SCALE_AXES)
-                if axis  # the size of the robot imitates a scale of all axes in all files
-            ]
+            # The size of the robot imitates a scale of all axes in all files.
+            for i, axis in enumerate(SCALE_AXES[1:], 1):
+                add_error("scale", axis, int(scales[i]), 1 / size, index=i)
             if len(problem.data) > 1:
-                blocks.append(Block("scale", "", scales[-1:], np.array([1 / size]), is_of_recording=True))
-            blocks.append(Block("range", "", np.array([range_error]), np.array([1.0]), is_of_recording=True))
-        blocks.append(Block("lag", "", np.array([lag]), np.array([1.0]), is_of_recording=True))
+                add_error("scale", "", int(scales[-1]), 1 / size, Step)
+            add_error("range", "", range_error, 1.0)
+        for i, column in enumerate(wires.tolist()):
+            add_error("wire", str(i + 1), column, 1.0, Step, i)
+        add_error("lag", "", lag, 1.0)
         return cls(
             replace(problem, errors=extended),
             model,
@@ -128,7 +142,8 @@ class Layout:
             range_error,
             payload,
             lag,
-            lag + 2,
+            wires,
+            lag + len(wires) + 2,
         )
 
     def restricted_to(self, rows: Array) -> Layout:
@@ -217,6 +232,9 @@ def whitened_rows(layout: Layout, x: Array, data: Sequence[Measurement], rates: 
         for parameter, part in parts:
             if parameter.name in instrument_columns:
                 block[instrument_columns[parameter.name]] = part
+        if isinstance(item, Wires):
+            for i, weights in enumerate(1 / item.sigma.T):
+                block[layout.wires[i], i] = weights
         if gauge and not item.has_length_scale:
             for group in item.residual_groups.values():
                 if group.unit == "m":  # the size of a robot does not change angles

@@ -106,6 +106,8 @@ class RobotChanges:
 
     def with_step(self, kind: str, joint: int, old: int, new: int) -> RobotChanges:
         """Return the changes with a step of base, tool, payload, lag or a joint at another sample."""
+        if kind == "wire":
+            return self
         if kind == "lag":
             return replace(self, lag=tuple((Step(new) if f == Step(old) else f, v) for f, v in self.lag))
         if kind == "joint":

@@ -262,8 +262,7 @@ class _Search:
         rows = whitened_rows(self.layout, self.x, data, rates)[self.order]
         for cause in causes:
             # A constant payload is part of the model, and changes nothing over time.
-            is_constant = isinstance(cause.shape, Constant) and cause.block.kind != "lag"
-            if is_constant or cause.block.changes_between_files:
+            if cause.block.is_of_values or _is_part_of_model(cause):
                 rows[..., -1] -= cause.columns_of(rows, self.numbers, self.times) @ cause.values
         return rows
 
@@ -471,21 +470,25 @@ class _Search:
 
     def _kinds(self, block: Block) -> list[type[Shape]]:
         """Return the types of functions of time that are tested for a block."""
+        kinds = block.shapes
+        used = {type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)}
         if block.is_of_recording:
-            is_shown = self.has_different_rows and (block.kind != "lag" or self.paths is not None)
-            kinds: list[type[Shape]] = [Constant] if is_shown else []
-            if block.changes_between_files:
-                kinds = [Step] if is_shown and self.timeline.has_consecutive_files else []
-            if is_shown and any(cause.block is block for cause in self.causes) and block.kind == "lag":
-                kinds = [Step, Drift]
-        else:
-            used = {
-                type(c.shape) for c in self.causes if (c.block.kind, c.block.of) == (block.kind, block.of)
-            }
-            kinds = [Step] if block.kind != "links" else []
-            if self.is_ordered and block.kind != "payload" and FreeDrift not in used:
-                kinds += [FreeDrift] if Drift in used else [Drift, FreeDrift]
+            if not self._can_show_errors(block):
+                return []
+            if block.kind == "lag" and used:
+                kinds = Step, Drift
+        elif FreeDrift in used or not self.is_ordered:
+            kinds = tuple(kind for kind in kinds if kind is Step)
+        elif Drift in used:
+            kinds = tuple(kind for kind in kinds if kind is not Drift)
         return [kind for kind in kinds if (block, kind) not in self.rejected]
+
+    def _can_show_errors(self, block: Block) -> bool:
+        """Return whether the samples can show an error of the recording."""
+        if block.kind == "lag":
+            return self.has_different_rows and self.paths is not None
+        is_shown = self.timeline.has_consecutive_files or not block.changes_between_files
+        return self.has_different_rows and is_shown
 
     def _taken_steps(self, block: Block) -> tuple[int, ...]:
         """Return the numbers of the samples at which a block has steps."""
@@ -613,16 +616,21 @@ class _Search:
     def _remove(self, i: int) -> LinearFit:
         """Remove a cause, and fit without it."""
         del self.causes[i]
-        if not any(c.block.kind == "payload" and isinstance(c.shape, Step) for c in self.causes):
-            self.causes = [cause for cause in self.causes if not _is_part_of_model(cause)]
+        stepping = {(c.block.kind, c.block.of) for c in self.causes if isinstance(c.shape, Step)}
+        self.causes = [
+            c for c in self.causes if not _is_part_of_model(c) or (c.block.kind, c.block.of) in stepping
+        ]
         self._drop_others()
         return self._settle()
 
     def _add(self, cause: Cause) -> None:
         """Add a cause, with coefficients of zero."""
-        # A step of the payload would imitate a part of a constant one, such as that of wrong masses.
-        if cause.block.kind == "payload" and not any(_is_part_of_model(each) for each in self.causes):
-            self.causes.append(replace(cause, shape=Constant(), values=np.zeros_like(cause.values)))
+        # A step of the payload would imitate a part of a constant one, such as that of wrong masses, and a
+        # wire may have had the wrong zero before its step.
+        if cause.block.kind in ("payload", "wire"):
+            constant = replace(cause, shape=Constant(), values=np.zeros_like(cause.values))
+            if not any(each.block is cause.block and _is_part_of_model(each) for each in self.causes):
+                self.causes.append(constant)
         self.causes.append(replace(cause, values=np.zeros_like(cause.values)))
 
     def _settle(self) -> LinearFit:
@@ -938,8 +946,8 @@ def _evidence_of(block: Block, causes: Iterable[Cause]) -> float:
 
 
 def _is_part_of_model(cause: Cause) -> bool:
-    """Return whether a cause is a payload of all samples, which is fitted beside a step of it."""
-    return cause.block.kind == "payload" and isinstance(cause.shape, Constant)
+    """Return whether a cause is a payload or a zero of all samples, which is fitted beside a step of it."""
+    return cause.block.kind in ("payload", "wire") and isinstance(cause.shape, Constant)
 
 
 def _information(columns: Array, root: Array) -> Array:
@@ -1031,7 +1039,11 @@ def find_session(problem: Problem, x: Array, holdout: Sequence[Measurement], is_
         search = alone
     other_robot = search.other_robot()
     search.place_steps()
-    causes = tuple(search.stated(cause) for cause in search.causes if not _is_part_of_model(cause))
+    causes = tuple(
+        search.stated(cause)
+        for cause in search.causes
+        if cause.block.is_of_values or not _is_part_of_model(cause)
+    )
     constants = [
         (cause.block.kind, float(cause.values[0]), float(np.sqrt(cause.covariance[0, 0])), cause.block.of)
         for cause in causes

@@ -367,7 +367,8 @@ def test_zeros_of_any_angle_are_mended_beside_other_mistakes(ur10):
     mended = mend(ur10, wrong, "zero:elbow_joint:-12.5deg+sign:shoulder_pan_joint")
     np.testing.assert_allclose(mended.q, data.q, atol=1e-12)
     with pytest.raises(
-        UnknownNameError, match=r"unknown change.*kinds of changes are sign, zero, .*, lag, scale, range$"
+        UnknownNameError,
+        match=r"unknown change.*kinds of changes are sign, zero, .*, lag, scale, range, wire$",
     ):
         mend(ur10, wrong, "zero:elbow:-12.5deg")
 

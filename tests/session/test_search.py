@@ -415,7 +415,7 @@ def test_a_step_moves_to_its_place_with_its_change(kind):
 
 def test_a_payload_is_a_constant_beside_its_steps():
     search = search_of(Changes())
-    own = Block("payload", "", search.layout.payload, np.full(6, 1e-3))
+    own = Block("payload", "", search.layout.payload, np.full(6, 1e-3), shapes=(Step,))
     search.layout = replace(search.layout, blocks=(*search.layout.blocks, own))
     for number in (20, 40):
         search._add(Cause(own, Step(number), np.ones(6), np.zeros((6, 6))))
@@ -430,6 +430,19 @@ def test_a_payload_is_a_constant_beside_its_steps():
     assert search.causes == []
     search._add(cause_of(search, "tool", Step(20), 1.0))
     assert [cause.block.kind for cause in search.causes] == ["tool"]
+
+
+def test_each_wire_has_a_constant_beside_its_steps():
+    search = search_of(Changes())
+    one, other = (Block("wire", name, np.array([0]), np.ones(1), shapes=(Step,)) for name in "12")
+    search.layout = replace(search.layout, blocks=(*search.layout.blocks, one, other))
+    for block, number in ((one, 20), (other, 30), (one, 40)):
+        search._add(Cause(block, Step(number), np.ones(1), np.zeros((1, 1))))
+    shapes = [(cause.block.of, cause.shape) for cause in search.causes]
+    first = [("1", Constant()), ("1", Step(20)), ("2", Constant()), ("2", Step(30)), ("1", Step(40))]
+    assert shapes == first
+    search._remove(3)
+    assert {cause.block.of for cause in search.causes} == {"1"}
 
 
 @pytest.mark.parametrize(
