@@ -86,7 +86,8 @@ def test_the_zero_that_the_robot_fits_is_named_and_the_other_one_undone(wire, si
     assert again.session
     assert again.session.found == ()
     assert again.verdict.status == "ok"
-    assert device.error(again) < device.error(fit) / 4
+    # The samples before or after a large jump are outliers, so that the others alone were fitted.
+    assert device.error(again) < min(1e-4, device.error(fit) / (4 if abs(size) < 1e-3 else 1))
 
 
 @pytest.mark.parametrize("seed", some_slow(range(12), {0}))
