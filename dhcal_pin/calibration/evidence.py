@@ -27,6 +27,7 @@ from ..plausibility.drawn_samples import has_enough_rows
 from ..plausibility.evidence import usual_errors
 from ..plausibility.labels import WrongLabel, find_wrong_labels
 from ..plausibility.mixups import diagnose_images, diagnose_mixups
+from ..plausibility.mounting import Mounting, find_mounting
 from ..plausibility.rounding import find_rounding
 from ..session import Session
 from ..session.linear_model import measures_positions
@@ -281,6 +282,14 @@ class Evidence(FittedModel):
             if found:
                 notes.append(f"{item.source}: {found.sentence}" if len(self.data) > 1 else found.sentence)
         return notes
+
+    @cached_property
+    def mounting(self) -> Mounting | None:
+        """Direction of gravity that fits better than that of the URDF; None without one."""
+        if not self.errors.has_arm or self.camera_stages:
+            return None
+        items = zip(self.problem.data, self.is_counted, strict=True)
+        return find_mounting(self.problem, self.x, [item.take(mask) for item, mask in items if mask.any()])
 
     @property
     def hand_eye(self) -> cameras.HandEyeDiagnosis | None:

@@ -136,7 +136,8 @@ def position_error_beside(fit: Evidence) -> float | None:
 
 def accuracy_notes(fit: Evidence) -> list[str]:
     """Return sentences on errors that the stated accuracy does not contain, and on what would reduce it."""
-    return [*beside_notes(fit), *size_notes(fit), *sigma_notes(fit)]
+    mounting = [fit.mounting.sentence] if fit.mounting else []
+    return [*beside_notes(fit), *size_notes(fit), *sigma_notes(fit), *mounting]
 
 
 def beside_notes(fit: Evidence) -> list[str]:
