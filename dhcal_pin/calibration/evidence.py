@@ -286,7 +286,7 @@ class Evidence(FittedModel):
     @cached_property
     def mounting(self) -> Mounting | None:
         """Direction of gravity that fits better than that of the URDF; None without one."""
-        if not self.errors.has_arm or self.camera_stages:
+        if not self.errors.has_arm or cameras.has_images(self.data):
             return None
         items = zip(self.problem.data, self.is_counted, strict=True)
         return find_mounting(self.problem, self.x, [item.take(mask) for item, mask in items if mask.any()])

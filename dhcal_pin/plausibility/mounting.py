@@ -36,6 +36,8 @@ from ..session.linear_model import Layout, whitened_rows
 MAX_EXAMINED, MIN_ROWS_PER_UNKNOWN = 250, 2.0
 # Largest ratio of the RMS residuals with u and z, and smallest logarithm of the ratio of the likelihoods.
 MAX_RMS_RATIO, MIN_LOG_LIKELIHOOD_RATIO = 0.8, 20.0
+# Smaller residuals in standard deviations are rounding errors of simulated measurements without noise.
+MIN_RMS = 1e-3
 # Smallest angle between u and z [rad].
 MIN_TILT = np.deg2rad(15.0)
 # Number of times that u and the compliances are fitted in turns.
@@ -47,7 +49,6 @@ class Mounting:
     """Direction of gravity that fits measurements better than that of a URDF."""
 
     up: Array  # Unit vector that points up, in the axes of the root link, (3,)
-    ratio: float  # RMS residual with it, relative to that with the z axis
     root: str  # Name of the root link
 
     @property
@@ -57,6 +58,10 @@ class Mounting:
         sine, cosine = float(np.linalg.norm(axis)), float(self.up[2])
         rotation = se3.exp3(axis / max(sine, 1e-300) * np.arctan2(sine, cosine))
         return np.asarray(pin.rpy.matrixToRpy(rotation))
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """Return the direction and the angles for a JSON document."""
+        return {"up": self.up.tolist(), "rpy_rad": self.angles.tolist()}
 
     @property
     def sentence(self) -> str:
@@ -83,12 +88,14 @@ def find_mounting(problem: Problem, x: Array, data: Sequence[Measurement]) -> Mo
     if n_rows < MIN_ROWS_PER_UNKNOWN * (n_unknowns + effects[0].size):
         return None
     rms_z = _fit(effects, residual, np.array([0.0, 0.0, 1.0]))[1]
+    if rms_z < MIN_RMS:
+        return None
     up, rms = _fit_direction(effects, residual)
     if rms > MAX_RMS_RATIO * rms_z or n_rows * np.log(rms_z / rms) < MIN_LOG_LIKELIHOOD_RATIO:
         return None
     if abs(up[2]) > np.cos(MIN_TILT):
         return None
-    return Mounting(up, rms / rms_z, chain.root)
+    return Mounting(up, chain.root)
 
 
 def _unexplained(problem: Problem, x: Array) -> tuple[Array, Array, int]:

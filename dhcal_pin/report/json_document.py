@@ -89,6 +89,7 @@ def result_to_dict(
         "shrinkage_factor": fit.shrinkage_factor,
         "shrinkage_notes": fit.shrinkage_notes,
         "rounding_notes": fit.rounding_notes,
+        "mounting": fit.mounting.to_dict() if fit.mounting else None,
         "unobservable": fit.unobservable,
         "weakly_observable": fit.weakly_observable,
         "observability_indices": fit.observability_indices,
