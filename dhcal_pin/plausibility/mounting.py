@@ -71,7 +71,7 @@ class Mounting:
         return (
             f"The joints yield as if ({up}) in the axes of {self.root} pointed up, not z. If the arm "
             "is mounted like this, state it in the URDF: a new root link and a fixed joint from it to "
-            f'{self.root} with rpy="{angles}".'
+            f'{self.root} with the exact angles, which are about rpy="{angles}".'
         )
 
 
